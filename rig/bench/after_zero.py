@@ -1,4 +1,4 @@
-"""What is recorded after the outputs were zeroed: the proof that they were."""
+"""Recording after the outputs were zeroed, as proof that they are at zero."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def record_zero(
     clock: Callable[[], float],
     seconds: float = BENCH.zero_seconds,
 ) -> bool | None:
-    """Read and keep blocks until `seconds` of samples in a row have every command at zero.
+    """Record blocks until every command has been zero for `seconds` of consecutive samples.
 
-    To be called with the outputs zeroed. Returns True when they are there, False when the device
-    still reports a command, None when it or the disk failed before either was known. Ends after
-    `seconds + QUEUED` of device time, or that much wall time and two answer times.
+    Call with the outputs zeroed. Returns True for such samples, False if the device still reports
+    a command, None if the device or the disk failed first. Ends after `seconds + QUEUED` of device
+    time, or that much wall time plus two answer times.
     """
     wanted = round(seconds * rig.sample_rate)
     most = round((seconds + BENCH.queued_seconds) * rig.sample_rate)

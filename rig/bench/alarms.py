@@ -1,4 +1,4 @@
-"""The alarms of a session: what the guard finds, as a table of alarms and as events of the run."""
+"""The alarms of a session: violations found by the guard, in a table and as events of the run."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ OnEvent = Callable[[str, int | None, Mapping[str, Any]], None]
 
 
 class AlarmLog:
-    """Keeps the table of a session's alarms; every change of it is one event."""
+    """The table of a session's alarms; every change is one event."""
 
     def __init__(self, rig: Rig, on_event: OnEvent) -> None:
-        """`on_event` takes what happened, its tick and the alarm's data."""
+        """`on_event` takes the kind of change, its tick and the alarm's data."""
         self.table = AlarmTable()
         self._rig = rig
         self._on_event = on_event
@@ -48,7 +48,7 @@ class AlarmLog:
         )
 
     def update(self, warnings: Mapping[Key, Violation], tick: int) -> None:
-        """Take the warnings that stand at a tick: new ones are raised, missing ones return."""
+        """Update with the warnings active at a tick: raise new ones, end missing ones."""
         if not warnings and not self._standing:
             return
         for key in self._standing.keys() - warnings.keys():
@@ -60,7 +60,7 @@ class AlarmLog:
                 self._standing[key] = self._raise(self.alarm_of(violation, trips=False))
 
     def trip(self, violation: Violation) -> Alarm:
-        """Raise the alarm of a trip, which latches; returns it."""
+        """Raise and return the alarm of a trip, which latches."""
         alarm = self.alarm_of(violation, trips=True)
         self._raise(alarm)
         return alarm
@@ -68,7 +68,7 @@ class AlarmLog:
     def _raise(self, alarm: Alarm) -> str:
         self.table = states.raised(self.table, alarm)
         known = self.table.get(alarm.key) or alarm
-        # The table keeps when and with which value an alarm first came; the log says each time.
+        # The table keeps time and value of the first occurrence; the log has every occurrence.
         now = replace(
             alarm,
             state=known.state,
@@ -83,7 +83,7 @@ class AlarmLog:
         return alarm.key
 
     def acknowledge(self, key: str | None, tick: int) -> None:
-        """Note that a person has seen an alarm, or all (None); an unknown key is logged."""
+        """Acknowledge an alarm, or all (None), for a person; an unknown key is logged."""
         seen = [alarm.key for alarm in self.table.unacknowledged]
         try:
             self.table = states.acknowledged(self.table, key)

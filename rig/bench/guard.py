@@ -1,9 +1,9 @@
-"""The guard: every sample of every block against bands, rates, ranges and plausibility.
+"""The guard: checks every sample of every block against bands, rates, ranges and plausibility.
 
-Glossary: a *role* is what one joint does now (excited, moving freely, locked) and decides which
-piston limits hold; a *violation* is the first sample, in device time, that a check does not allow.
-What trips is returned, and the bench zeroes its outputs; what only warns stands in `warnings`
-until it has returned. The checks are modules of `rig.bench.checks`.
+Glossary: the *role* of a joint (excited, free, locked) determines its piston limits; a *violation*
+is the first sample, in device time, that a check does not allow. A violation that trips is
+returned, and the bench zeroes its outputs; one that only warns is in `warnings` while it lasts.
+The checks are modules of `rig.bench.checks`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# Where the rig file says what a check does (`rig.model.alarms.bands.CheckActions`).
+# Checks whose action the rig file sets (`rig.model.alarms.bands.CheckActions`).
 ACTIONS: Final = {
     FROZEN: "frozen_sensor",
     NOT_FOLLOWING: "spool_not_following",
@@ -66,7 +66,7 @@ ACTIONS: Final = {
 
 
 class Guard:
-    """Checks blocks in the order of `Rig.recorded`; the first violation is what it returns."""
+    """Checks blocks, with columns in the order of `Rig.recorded`; returns the first violation."""
 
     def __init__(self, rig: Rig, settings: GuardSettings | None = None) -> None:
         self.rig = rig
@@ -92,19 +92,19 @@ class Guard:
 
     @property
     def warnings(self) -> Mapping[Key, Violation]:
-        """What stands without tripping: the first violation of each, until it has returned."""
+        """The active warnings by key, each with its first violation."""
         return self._standing.warnings
 
     def forget(self) -> None:
-        """Drop the tail of the previous block: what comes next does not continue it."""
+        """Reset: the next block does not continue the previous one."""
         self._tail: Array = np.empty((0, len(self.rig.recorded)))
-        self._unbroken = 0  # rows at the end of the tail without a gap among them
+        self._unbroken = 0  # rows at the end of the tail without a gap
         for check in (self._saturation, self._outside_trip, self._outside_warning):
             check.forget()
         self._plausibility.forget()
 
     def set_roles(self, roles: Sequence[JointRole]) -> None:
-        """Say what each joint does from the next block on; raises ValueError for a wrong number."""
+        """Set the joints' roles from the next block on; raises ValueError for a wrong number."""
         joints = self.rig.joints
         if len(roles) != len(joints):
             raise ValueError(f"{len(roles)} roles given for {len(joints)} joints")
@@ -122,10 +122,10 @@ class Guard:
         self._plausibility.restart()
 
     def gap(self, lost: int, tick: int) -> Violation | None:
-        """Return the violation of `lost` missing samples before `tick`; rates start anew there.
+        """Return the violation of `lost` missing samples before `tick`; rates restart there.
 
-        Fewer than may be missing are a warning. What is judged over a window goes on across them:
-        a device polled by a busy host loses single samples all the time, and must not be blind.
+        A gap shorter than the limit is a warning, and windows continue across it: a polled device
+        often loses single samples when the host is busy, and must still be checked.
         """
         allowed = self.settings.max_gap
         seconds = lost / self.rig.sample_rate
@@ -142,7 +142,7 @@ class Guard:
         return None
 
     def stale(self, age: float, tick: int) -> Violation | None:
-        """Return the violation of data `age` [s] old by wall time (real-time mode only)."""
+        """Return the violation of data that are `age` [s] old by wall time (real time only)."""
         if age > self.stale_after:
             return Violation(STALE, age, (-math.inf, self.stale_after), "s", None, "", tick)
         near = self.settings.stale_warning * self.stale_after
@@ -157,21 +157,21 @@ class Guard:
         return Violation(DEVICE, math.nan, (math.nan, math.nan), "", None, "", tick)
 
     def check(self, block: SampleBlock) -> Violation | None:
-        """Return the first violation that trips in a block that continues the previous one.
+        """Check a block that continues the previous one; return the first violation that trips.
 
-        What warns is in `warnings` from here on.
+        Updates `warnings`.
         """
         data = block.data
         last = block.tick + len(data) - 1
         joined = np.concatenate((self._tail, data))
         recent = joined[-(len(data) + self._rate_window) :]
         least, most = np.minimum.reduce(recent, axis=0), np.maximum.reduce(recent, axis=0)
-        calm = self._tightest.contain(least, most)  # as almost every block is
+        calm = self._tightest.contain(least, most)  # true for almost every block
         trips = [self._band_trip(block, calm)]
         self._unbroken = min(self._unbroken, len(self._tail)) + len(data)
-        # No difference of two samples is larger than that of the largest and the smallest.
+        # The range of the samples bounds every difference.
         if not (calm and np.count_nonzero(most - least <= self._steady) == len(self._steady)):
-            with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
+            with np.errstate(invalid="ignore"):  # inf - inf; the check of bands reports the sample
                 trips += self._rate_trips(joined[-self._unbroken :], len(data), last)
         measured = data[:, : block.saturated.shape[1]]
         trips.append(self._saturation.find(block.saturated, measured, block.tick))
@@ -184,7 +184,7 @@ class Guard:
         return min(violations, key=lambda violation: violation.tick, default=None)
 
     def _rate_trips(self, rows: Array, new: int, last: int) -> list[Violation | None]:
-        """Return what trips by its rate in the last `new` of rows that end at tick `last`."""
+        """Return the trips by rate in the last `new` of `rows`, which end at tick `last`."""
         trips = []
         for rate in self._rates:
             first = last + 1 - len(rows)
@@ -194,7 +194,7 @@ class Guard:
         return trips
 
     def _act(self, violations: Sequence[Violation], last: int) -> list[Violation]:
-        """Do with each finding what the rig file wants; returns those that trip."""
+        """Warn or trip as the rig file says; return the violations that trip."""
         if not violations:
             return []
         self._standing.see([v for v in violations if self._actions[v.limit] == "warn"], last)
@@ -221,7 +221,7 @@ class Guard:
                 self._standing.keep(name, self._band_of(name), last)
 
     def _band_of(self, name: str) -> str:
-        """Name the band of a channel: its limit, by its joint's role."""
+        """Return the name of a channel's limit for its joint's role."""
         kind, joint = ch.kind_of(name)
         if kind == ch.PISTON and joint is not None:
             return piston_bounds(self.roles[joint - 1], self.rig, joint - 1)[0]
@@ -239,11 +239,11 @@ class Guard:
         return Violation(limit, value, bounds.of(column), ch.unit_of(name), joint, name, tick)
 
     def _frozen_sensors(self, window: Array, last: int) -> list[Violation]:
-        """Return the violation of an excited joint's channel that kept one value all the window."""
+        """Return the violation of an excited joint's channel that kept one value in the window."""
         if len(window) < self._window:
             return []
         if not np.count_nonzero((window[0] == window[-1]) & self._may_freeze):
-            return []  # most often: the ends differ, and the rest need not be looked at
+            return []  # mostly the first and last value differ, and no further check is needed
         for joint, (role, frozen) in enumerate(zip(self.roles, self._frozen, strict=True), 1):
             column = frozen.find(window) if role.excited else None
             if column is None:

@@ -1,4 +1,4 @@
-"""A record while it is taken: a tick range of the stream with its attributes."""
+"""A record in progress: a tick range of the stream with attributes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class RecordedBench(Protocol):
-    """What a record needs of the bench that takes it."""
+    """The part of a bench that a record uses."""
 
     @property
     def tick(self) -> int:
@@ -22,18 +22,18 @@ class RecordedBench(Protocol):
 
     @property
     def recorder(self) -> Recorder | None:
-        """The run's recorder, None where nothing is kept."""
+        """The run's recorder, None if nothing is recorded."""
 
     @property
     def observers(self) -> Observers:
-        """Who is told when a record begins and ends."""
+        """The observers to notify of a record's begin and end."""
 
     def zero_outputs(self) -> bool:
-        """Put all outputs to zero; whether the device confirmed it."""
+        """Set all outputs to zero; return whether the device confirmed it."""
 
 
 class RecordHandle:
-    """Opened by `with` (or `open`), closed at its end; left by an exception it is unfinished."""
+    """A record in progress: `with` (or `open`) begins it; an exception leaves it unfinished."""
 
     def __init__(
         self, bench: RecordedBench, meta: RecordMeta, start_tick: int, ticks: int | None
@@ -48,7 +48,7 @@ class RecordHandle:
 
     @property
     def ticks(self) -> int:
-        """Samples of the record: as fixed, or up to the newest one."""
+        """Length of the record [samples]: as fixed, or up to the newest sample."""
         return self._bench.tick - self.start_tick if self._ticks is None else self._ticks
 
     def note(self, **attributes: Attribute) -> None:
@@ -73,7 +73,7 @@ class RecordHandle:
         self._closed = True
 
     def discard(self, reason: str) -> None:
-        """End it as no record; its samples stay in the run, its name becomes free."""
+        """Discard the record: its samples stay in the run and its name can be used again."""
         self.note(discarded=reason)
         self.close("discarded")
 
@@ -88,7 +88,7 @@ class RecordHandle:
         if error is None:
             self.close()
             return
-        self._bench.zero_outputs()  # before anything is written, whoever raised
+        self._bench.zero_outputs()  # before anything is written, whatever the exception
         try:
             self.close("partial")
         except RecordingFailed as problem:

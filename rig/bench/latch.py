@@ -1,9 +1,9 @@
-"""What outlives a session with a bench: its latched trip, who cleared it, who runs it now.
+"""Stored state of a bench: its latched trip, cleared trips, and the process that runs it.
 
-A bench is what answers at an endpoint, whatever a rig file calls it. Its files stand in a folder of
-their own below `state_folder`: `trip.json` while a trip is latched, `resets.jsonl` with every trip
-that was cleared, `session.json` while a process of this computer has the bench. A bench that is
-reached under two addresses has two folders; the trip latched in the device covers that.
+A bench is identified by its endpoint, not by the rig's name. Each has a folder in `state_folder`:
+`trip.json` while a trip is latched, `resets.jsonl` with every cleared trip, `session.json` while
+a process of this computer uses the bench. A bench with two addresses has two folders; the trip
+latched in the device itself covers that case.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _UNREADABLE: Final = "unknown"
 
 @dataclass(frozen=True)
 class LatchedTrip:
-    """A trip that keeps a bench from running: what it was, when, in which run and on which rig."""
+    """A trip that blocks a bench: cause, time, run and rig."""
 
     trip: str
     time: str
@@ -47,7 +47,7 @@ class LatchedTrip:
 
 @dataclass(frozen=True)
 class Holder:
-    """The process of this computer that has a bench, and the run it writes ('' without one)."""
+    """The process of this computer that uses a bench, and the run it writes ('' without one)."""
 
     pid: int
     started: str
@@ -55,7 +55,7 @@ class Holder:
 
 
 def state_folder() -> Path:
-    """Return the folder for what outlives a session: `BRAMAH_STATE`, or this user's own."""
+    """Return the folder of stored state: `BRAMAH_STATE`, or the user's default."""
     named = os.environ.get(STATE_VARIABLE)
     if named:
         return Path(named).absolute()
@@ -73,7 +73,7 @@ def _folder_name(wire: Wire) -> str:
 
 
 class BenchState:
-    """The files of the bench behind one wire; `root` is `state_folder()` where not given."""
+    """The files of the bench at one wire; `root` is `state_folder()` by default."""
 
     def __init__(self, wire: Wire, root: Path | None = None) -> None:
         self.endpoint = wire.endpoint
@@ -81,22 +81,22 @@ class BenchState:
         self._taken = False
 
     def prepare(self) -> None:
-        """Make the folder; raises InputError where a trip could not be kept."""
+        """Create the folder; raises InputError if a trip could not be stored there."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             sync_to_disk(self.folder.parent)
             if not os.access(self.folder, os.W_OK | os.X_OK):
-                raise PermissionError(13, "may not be written")
+                raise PermissionError(13, "is not writable")
         except OSError as error:
             raise InputError(
-                f"{self.folder}: a safety trip could not be kept here ({error.strerror}); "
-                f"set {STATE_VARIABLE} to a folder that you may write"
+                f"{self.folder}: a safety trip could not be stored here ({error.strerror}); "
+                f"set {STATE_VARIABLE} to a folder that you can write to"
             ) from error
 
     # The trip
 
     def read_trip(self) -> LatchedTrip | None:
-        """Return the latched trip, None if there is none; a damaged file is a trip as well."""
+        """Return the latched trip, None if there is none; a damaged file counts as a trip."""
         path = self.folder / _TRIP
         try:
             stored = json.loads(path.read_text(encoding="utf-8"))
@@ -105,11 +105,11 @@ class BenchState:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning("%s: cannot be read: %s", path, error)
-            about = f"a trip whose note {path} cannot be read"
+            about = f"unknown: its file {path} cannot be read"
             return LatchedTrip(about, *[_UNREADABLE] * 5)
 
     def latch(self, trip: str, rig: Rig, run: Path | None) -> bool:
-        """Keep a trip until it is cleared; the first one stays. False (and logged) if it fails."""
+        """Store a trip until it is cleared, the first one only; log a failure and return False."""
         if self.read_trip() is not None:
             return True
         where = "" if run is None else str(run.absolute())
@@ -130,14 +130,14 @@ class BenchState:
             return
         run = f" in run {trip.run}" if trip.run else ""
         raise Latched(
-            f"the bench at {self.endpoint} tripped at {trip.time}{run} and stays so: {trip.trip}",
+            f"the bench at {self.endpoint} tripped at {trip.time}{run}, not yet reset: {trip.trip}",
             rig,
         )
 
     def clear(self, reason: str, device_cause: str | None) -> LatchedTrip | None:
-        """Clear the latched trip and keep who did, when and why; returns it. Raises OSError.
+        """Clear and return the latched trip; store who did it, when and why. Raises OSError.
 
-        The reason goes into `resets.jsonl` first, then into the events of the tripped run.
+        The reason is written to `resets.jsonl` first, then to the events of the tripped run.
         """
         trip = self.read_trip()
         entry = {
@@ -161,24 +161,24 @@ class BenchState:
     # The session
 
     def take(self, run: Path | None) -> None:
-        """Note this process as the one that has the bench; never raises."""
+        """Store this process as the user of the bench; never raises."""
         started = runstate.process_started(os.getpid()) or ""
         holder = Holder(os.getpid(), started, "" if run is None else str(run.absolute()))
         try:
             replace_text(self.folder / _SESSION, json.dumps(asdict(holder)) + "\n")
         except OSError as error:
-            log.warning("%s: cannot note who has the bench: %s", self.folder, error)
+            log.warning("%s: cannot store which process uses the bench: %s", self.folder, error)
         self._taken = True
 
     def release(self) -> None:
-        """Remove the note that `take` left; never raises."""
+        """Remove the entry made by `take`; never raises."""
         if self._taken:
             self._taken = False
             with suppress(OSError):
                 (self.folder / _SESSION).unlink(missing_ok=True)
 
     def holder(self) -> Holder | None:
-        """Return the living process of this computer that has the bench, None if none is known."""
+        """Return the running process of this computer that uses the bench, None if unknown."""
         try:
             owner = Holder(**json.loads((self.folder / _SESSION).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
@@ -186,10 +186,10 @@ class BenchState:
         return owner if runstate.process_alive(owner.pid, owner.started) else None
 
     def in_use(self, error: DeviceBusy) -> DeviceBusy:
-        """Return an error with the process of this computer that has the bench, if one is known."""
+        """Return the error with the process of this computer that uses the bench, if known."""
         holder = self.holder()
         if holder is None:
-            return DeviceBusy(f"{error}; no process of this computer is known to")
+            return DeviceBusy(f"{error}; no known process of this computer uses it")
         run = f", which writes {holder.run}" if holder.run else ""
         return DeviceBusy(f"{error}: process {holder.pid}{run}; wait for its end or stop it")
 
@@ -208,14 +208,14 @@ def _note_in_run(trip: LatchedTrip, entry: dict[str, Any]) -> None:
 
 
 def reset_bench(rig: Rig, driver: Driver, reason: str) -> str:
-    """Clear the trip of a bench, in its device and on this computer; returns what had tripped it.
+    """Clear the trip of a bench in its device and on this computer; return the cause.
 
-    Raises InputError without a reason, DeviceError if the device does not obey: the trip then
-    stays. Owns `driver`.
+    Raises InputError without a reason, DeviceError if the device refuses; the trip then stays.
+    Closes `driver`.
     """
     if not reason.strip():
         raise InputError(
-            "reset: --reason TEXT is missing; look at the bench, then say what was found and done, "
+            "reset: --reason TEXT is missing; inspect the bench, then say what was found and done, "
             'for example --reason "cap sensor of joint 2 replaced"'
         )
     bench = BenchState(rig.wire)
@@ -231,4 +231,4 @@ def reset_bench(rig: Rig, driver: Driver, reason: str) -> str:
     cleared = bench.clear(reason.strip(), cause)
     parts = [] if cleared is None else [cleared.trip]
     parts += [] if cause is None else [f"device: {cause}"]
-    return "; ".join(parts) or "nothing was latched"
+    return "; ".join(parts) or "no trip was latched"

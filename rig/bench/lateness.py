@@ -1,4 +1,4 @@
-"""How late blocks come, and how late the samples of a device that the host clocks are taken."""
+"""Lateness of blocks, and of the samples of a host-timed device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rig.bench.settings import BENCH
 
 
 class ArrivalClock:
-    """Lateness against the earliest arrival seen: late = arrival - device time - best offset."""
+    """Lateness relative to the earliest arrival: late = arrival - device time - least offset."""
 
     def __init__(self, sample_rate: float) -> None:
         self._sample_rate = sample_rate
@@ -17,7 +17,7 @@ class ArrivalClock:
         self._last = 0.0
 
     def late(self, block: SampleBlock, now: float) -> float:
-        """Return how late [s] a block came at host time `now` [s]; the first one defines zero."""
+        """Return the lateness [s] of a block that arrived at host time `now` [s]; first one: 0."""
         offset = now - (block.tick + len(block.data)) / self._sample_rate
         if self._best is None:
             self._best, self._last = offset, now
@@ -27,7 +27,7 @@ class ArrivalClock:
 
 
 class HostTiming:
-    """Counts what a host-timed device measured late, or not at all, by `SampleBlock.read_at`."""
+    """Counts late and missing samples of a host-timed device, by `SampleBlock.read_at`."""
 
     def __init__(self, sample_rate: float) -> None:
         self._sample_rate = sample_rate
@@ -35,7 +35,7 @@ class HostTiming:
         self._worst = 0.0
 
     def add(self, block: SampleBlock) -> None:
-        """Take a block; one of a device with a clock of its own says nothing here."""
+        """Add a block; blocks of a device with its own clock are ignored."""
         if block.read_at is None:
             return
         due = (block.tick + np.arange(len(block.data))) / self._sample_rate
@@ -47,7 +47,7 @@ class HostTiming:
         self._worst = max(self._worst, float(late[own].max(initial=0.0)))
 
     def summary(self) -> dict[str, float] | None:
-        """Return the counts and the worst lateness [s]; None where the device has the clock."""
+        """Return the counts and the largest lateness [s]; None for a device with its own clock."""
         if not self._samples:
             return None
         return {

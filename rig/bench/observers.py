@@ -1,7 +1,7 @@
-"""Who wants to see what a bench measures while it measures it, without a say in it.
+"""Observers of a bench: they receive its blocks and records and cannot influence it.
 
-An observer is called in the acquisition loop: it hands the data on (to another process) and
-returns at once. One that raises is dismissed, and the run goes on.
+An observer is called in the acquisition loop: it passes the data on (to another process) and
+returns at once. An observer that raises is removed, and the run continues.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ log = logging.getLogger(__name__)
 
 
 class Observer(Protocol):
-    """Is told every block and every record of a bench."""
+    """Receives every block and every record of a bench."""
 
     def block(self, block: SampleBlock) -> None:
-        """Take a block that was checked and journalled."""
+        """Receive a block that was checked and journalled."""
 
     def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
-        """Hear that a record begins at a tick, past or to come; `ticks` long if that is known."""
+        """A record begins at tick `start`, past or future; `ticks` is its length if known."""
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
-        """Hear which ticks a record holds, now that it is `complete`, `partial`, `discarded`."""
+        """A record of `ticks` samples from `start` has ended in `state`."""
 
 
 class Observers:
-    """The observers of one bench; itself an observer that never raises."""
+    """The observers of one bench, as one observer that never raises."""
 
     def __init__(self) -> None:
         self._all: list[Observer] = []
 
     def add(self, observer: Observer) -> None:
-        """Let an observer see from now on."""
+        """Add an observer."""
         self._all.append(observer)
 
     def _notify(self, call: Callable[[Observer], None]) -> None:
@@ -45,17 +45,19 @@ class Observers:
                 call(observer)
             except Exception:
                 self._all.remove(observer)
-                log.exception("%s failed and sees no more of this run", type(observer).__name__)
+                log.exception(
+                    "%s failed and is removed for the rest of this run", type(observer).__name__
+                )
 
     def block(self, block: SampleBlock) -> None:
-        """Show a block."""
+        """Pass a block on."""
         if self._all:
             self._notify(lambda observer: observer.block(block))
 
     def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
-        """Handle the beginning of a record."""
+        """Announce the begin of a record."""
         self._notify(lambda observer: observer.record_begins(meta, start, ticks))
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
-        """Handle the end of a record."""
+        """Announce the end of a record."""
         self._notify(lambda observer: observer.record_ends(meta, start, ticks, state))

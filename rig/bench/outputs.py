@@ -1,4 +1,4 @@
-"""A driver of which every failing call leaves the outputs at zero before the failure shows."""
+"""A driver whose outputs are zeroed before any error of a call is raised."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ UNSURE: Final = "outputs not confirmed at zero"
 
 
 class Outputs:
-    """The outputs of one device: the way to zero them, and a guard around every other call."""
+    """The outputs of one device: zeroing them, and a wrapper for every other call."""
 
     def __init__(self, rig: Rig, driver: Driver) -> None:
         self.driver = driver
         self._rig = rig
         self._connected = False
         self._silent = False
-        self._told = False  # that zero is not confirmed: once, until it is
-        self._armed_from: int | None = None  # tick from which a law may put out a voltage
+        self._told = False  # whether an unconfirmed zero has been logged
+        self._armed_from: int | None = None  # tick from which on a law may output a voltage
 
     @property
     def connected(self) -> bool:
-        """Whether the device has answered, and so may have outputs that are not zero."""
+        """Whether the device has answered, so that its outputs may not be zero."""
         return self._connected
 
     def connect(self) -> DeviceInfo:
-        """Open the wire, check that device and rig fit, zero the outputs; DeviceError if not."""
+        """Open the wire, compare device and rig, zero the outputs; raises DeviceError."""
         info = self.driver.connect()
         self._connected = True
         self.driver.zero_outputs()
@@ -56,12 +56,12 @@ class Outputs:
             if actual != wanted:
                 raise DeviceError(
                     f"the device {info.identity!r} has {actual:g} {what}, "
-                    f"rig {self._rig.name!r} has {wanted:g}; is it the right rig file?"
+                    f"rig {self._rig.name!r} has {wanted:g}; use the rig file of this device"
                 )
         return info
 
     def zero(self) -> bool:
-        """Put the outputs to zero now; False (and logged once) if the device does not answer."""
+        """Set the outputs to zero now; False (logged once) if the device does not confirm it."""
         self._armed_from = None
         if not self._connected:
             return False
@@ -87,12 +87,12 @@ class Outputs:
         return False
 
     def safely(self, call: Callable[[], Result]) -> Result:
-        """Do one thing; whatever goes wrong in it, outputs are at zero before that shows."""
+        """Return the result of `call`; on any error zero the outputs before raising it."""
         with self:
             return call()
 
     def __enter__(self) -> None:
-        """Begin what is done `safely`."""
+        """Enter a block of `safely`."""
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: object
@@ -101,23 +101,23 @@ class Outputs:
             return
         if isinstance(error, DeviceLost):
             self._silent = True
-        self.zero()  # says first what matters most: whether they are at zero
+        self.zero()  # stated first in the message: whether the outputs are at zero
         if isinstance(error, DeviceLost):
             log.error("%s", error)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool) -> int:
-        """Set the laws of all joints at one tick, which it returns; outputs at zero if it fails."""
+        """Set the laws of all joints at one tick and return it; zero the outputs on failure."""
         tick = self.safely(lambda: self.driver.apply(laws, restart=restart))
         self._armed_from = tick if any(law.limit > 0.0 for law in laws) else None
         return tick
 
     def zeroed_elsewhere(self, block: SampleBlock) -> bool:
-        """Return whether a block shows that another client has zeroed what `apply` set."""
+        """Return whether a block shows that another client has zeroed the outputs."""
         due = self._armed_from is not None and block.tick >= self._armed_from
         return due and not block.armed and not block.tripped
 
     def bounded(self, laws: Sequence[OutputLaw]) -> list[OutputLaw]:
-        """Return the laws with their limit no wider than each joint's; ValueError if unfit."""
+        """Return the laws limited to each joint's limits.command; raises ValueError."""
         joints = self._rig.joints
         if len(laws) != len(joints):
             raise ValueError(f"{len(laws)} output laws given for {len(joints)} joints")
@@ -126,9 +126,9 @@ class Outputs:
         ]
 
     def close(self, *, tripped: bool = False) -> bool:
-        """Zero once more, stop the stream, close the wire; says whether zero is sure; no raise.
+        """Zero again, stop the stream, close the wire; return whether zero is sure; never raise.
 
-        After a trip the wire is closed so that the device latches it too, where its driver can.
+        After a trip the driver, if it can, closes the wire so that the device latches the trip too.
         """
         zeroed = self.zero() or not self._connected
         if tripped and not self._silent and isinstance(self.driver, LatchesTrip):
@@ -145,5 +145,5 @@ class Outputs:
 def _bounded(law: OutputLaw, most: float) -> OutputLaw:
     numbers = (law.gain, law.bias, law.position_gain, law.setpoint, law.limit)
     if not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"an output law needs finite numbers, not {law}")
+        raise ValueError(f"expected finite numbers in an output law, found {law}")
     return replace(law, limit=min(max(law.limit, 0.0), most))

@@ -1,4 +1,4 @@
-"""One block read from a device that is left as it is found: what every channel says now."""
+"""One block of every channel, read without changing the device's outputs."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from rig.model.rig import Rig
 from rig.model.wire.codes import encode_input
 
 GOOD: Final = "ok"
-TIMED_SAMPLES: Final = 100  # of a host-timed device, whose lateness is measured
-MOST_BLOCKS: Final = 400  # read for that
+TIMED_SAMPLES: Final = 100  # samples of a host-timed device for measuring their lateness
+MOST_BLOCKS: Final = 400  # longest time [s] for reading them
 
 
 @dataclass(frozen=True)
 class Reading:
     """One channel over one block: mean, extremes [SI unit], converter codes, and a mark.
 
-    `mark` is ``ok`` or says what is not plausible.
+    `mark` is ``ok`` or the reason why the values are not plausible.
     """
 
     channel: str
@@ -37,7 +37,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late [s] a host-timed device's samples were taken: mean and standard deviation."""
+    """Lateness [s] of a host-timed device's samples: mean and standard deviation."""
 
     samples: int
     mean: float
@@ -50,9 +50,9 @@ def probe(driver: Driver, rig: Rig) -> list[Reading]:
 
 
 def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | None, str | None]:
-    """Read one block as `probe` does; of a host-timed device more, for the lateness of samples.
+    """Read one block as `probe` does; several of a host-timed device, to measure the lateness.
 
-    Also returns why the device has tripped, None if it has not.
+    Also returns the cause of the device's trip, None if it has not tripped.
     """
     late: list[NDArray[np.float64]] = []
     try:
@@ -82,13 +82,13 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
 
 
 def readings(block: SampleBlock, rig: Rig) -> list[Reading]:
-    """Return what each channel of a block says, in the order of the rig's channels."""
+    """Return the reading of each channel of a block, in the order of the rig's channels."""
     supply = _supply(block, rig)
     return [_reading(name, k, block, rig, supply) for k, name in enumerate(rig.channels)]
 
 
 def pressurised(readings: list[Reading]) -> list[str]:
-    """Name the chambers and the supply that are still under pressure: `joint 1 cap 3.50 MPa`."""
+    """Return the chambers and the supply still under pressure, as `joint 1 cap 3.50 MPa`."""
     out = []
     for reading in readings:
         kind, joint = ch.kind_of(reading.channel)
@@ -127,7 +127,7 @@ def _mark(
     if not np.isfinite(x).all():
         return "not a number"
     if saturated.any():
-        return "at the end of its converter's range: broken wire, or out of range?"
+        return "at the end of its converter's range: a broken wire, or a value out of range"
     if kind in (ch.CAP, ch.ROD) and x.mean() > supply + 5 * noise:
         return f"above the supply pressure of {supply / 1e6:.2f} MPa"
     if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and x.mean() < -5 * noise - BENCH.empty_pressure:

@@ -1,8 +1,8 @@
-"""The bench: one session with a device, in which every way out begins with outputs at zero.
+"""The bench: one session with a device; every exit sets the outputs to zero first.
 
-Order on any exit: outputs to zero, the wire closed, data flushed, then the report. Signals set a
-flag that the exchange loop honours; nothing interrupts the zeroing. A trip latches: no session with
-this bench begins until a person has cleared it (`rig.bench.latch`).
+Order on any exit: outputs to zero, wire closed, data flushed, then the report. Signals set a flag
+that the exchange loop reads, so that nothing interrupts the zeroing. A trip latches: no session
+with this bench begins until a person has cleared the trip (`rig.bench.latch`).
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ _CONTROLS = {TAKE: "taken", RELEASE: "released"}
 
 
 class Bench:
-    """A session with the device behind `driver`; a context manager that owns driver and publisher.
+    """A session with the device of `driver`; a context manager that closes driver and publisher.
 
-    Call `exchange` (or `run_for`) at least as often as the rig's watchdog: nothing may wait
+    Call `exchange` (or `run_for`) at intervals shorter than the rig's watchdog; do not wait
     elsewhere. Raises InputError, Latched, DeviceBusy, DeviceError, DeviceLost, RecordingFailed on
-    entry; SafetyTrip, OperatorStop and the same from then on, each with the outputs already at
-    zero. `state` is what outlives the session, by default of the bench at the rig's wire.
+    entry; later these, SafetyTrip and OperatorStop, each with the outputs already at zero. `state`
+    is the stored state of the bench, by default of the one at the rig's wire.
     """
 
     info: DeviceInfo
@@ -105,7 +105,9 @@ class Bench:
         self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
         self._judge: Judge | None = None
-        self.recorded_after = BENCH.zero_seconds  # [s] with the outputs at zero, after an early end
+        self.recorded_after = (
+            BENCH.zero_seconds
+        )  # [s] recorded with the outputs at zero after an early end
 
     # Entry and exit
 
@@ -119,7 +121,7 @@ class Bench:
             self.state.take(None if self.recorder is None else self.recorder.folder)
             cause = self._outputs.safely(self._driver.trip_cause)
             if cause is not None:
-                raise Latched(f"the device tripped earlier and stays so: {cause}", self.rig)
+                raise Latched(f"the device tripped earlier and is not reset: {cause}", self.rig)
             if self.recorder is not None:
                 self.recorder.open(self.info)
             self.restart()
@@ -135,7 +137,7 @@ class Bench:
             raise self.state.in_use(error) from error
 
     def restart(self) -> None:
-        """Start (again) the device's stream of blocks and its waveforms."""
+        """Start or restart the device's stream of blocks and its waveforms."""
         self._outputs.safely(self._driver.start)
         self._expected = None
         self._guard.forget()
@@ -144,9 +146,9 @@ class Bench:
             self.recorder.begin_stream()
 
     def reconnect(self, wait: float) -> None:
-        """Connect anew to a device that was lost, after `wait` seconds; outputs zeroed first.
+        """Connect again to a lost device after `wait` [s], and zero the outputs first.
 
-        Raises OperatorStop within the wait, DeviceError and its kin if the device is not back.
+        Raises OperatorStop during the wait, DeviceError or a subclass if the device is still lost.
         """
         self._outputs.close()
         until = self._clock() + wait
@@ -158,7 +160,7 @@ class Bench:
         self.info = self._connect()
         cause = self._outputs.safely(self._driver.trip_cause)
         if cause is not None:
-            raise Latched(f"the device tripped meanwhile and stays so: {cause}", self.rig)
+            raise Latched(f"the device tripped meanwhile and is not reset: {cause}", self.rig)
         self.status(device="")
         self.restart()
 
@@ -175,20 +177,20 @@ class Bench:
             raise DeviceLost(f"{UNSURE}; the run itself was complete")
 
     def _leave(self, error: BaseException | None) -> bool:
-        """Zero, prove it, close the wire, flush, report; says whether the outputs are at zero.
+        """Zero the outputs, prove it, close the wire, flush, report; return whether zero is sure.
 
-        The signals come back last.
+        The signal handlers are restored last.
         """
         state, message = _outcome(error)
         unsure = f"{message}; {UNSURE}".lstrip("; ")
         sure = False
         try:
             sure = not self._outputs.connected or self._outputs.zero()
-            # A screen waits for this, and what follows can take seconds.
+            # Published first because a screen waits for it, and writing the data can take seconds.
             lost = isinstance(error, DeviceLost)
             self._display.ended(state, message if sure else unsure, lost=lost)
             if sure and not self._ends_at_zero(error):
-                log.error("%s: it still reports a command", UNSURE, extra={"alarm": True})
+                log.error("%s: the device still reports a command", UNSURE, extra={"alarm": True})
                 sure = False
             if not self._outputs.close(tripped=self.trip is not None) or not sure:
                 sure, message = False, unsure
@@ -205,7 +207,7 @@ class Bench:
         return sure
 
     def _ends_at_zero(self, error: BaseException | None) -> bool:
-        """Record that an early end leaves the outputs at zero; False if the device says not."""
+        """Record the outputs at zero after an early end; False if the device reports a command."""
         early = error is not None or self._stop.reason is not None
         recording = self.recorder is not None and self.recorder.is_open
         if not early or not recording or self._expected is None:
@@ -232,34 +234,34 @@ class Bench:
         except RecordingFailed as problem:
             if error is None:
                 raise
-            log.error("%s", problem)  # what went wrong first is what the user is told
+            log.error("%s", problem)  # the user is told the first error
             return
         if self.trip is not None:
             from rig.runs.exchange.trip_window import write_trip_window  # noqa: PLC0415 - as h5py
 
             around = write_trip_window(self.recorder.folder)
             if around is not None:
-                self.trip.add_note(f"the 2 s before and after it are in {around}")
+                self.trip.add_note(f"the 2 s before and after the trip are in {around}")
 
     # Outputs
 
     def zero_outputs(self) -> bool:
-        """Put the outputs to zero now; False (and logged) if the device does not answer."""
+        """Set the outputs to zero now; False (and logged) if the device does not confirm it."""
         return self._outputs.zero()
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of the waveform [V] of joint `joint` (0-based), shape (period,)."""
         values = np.asarray(wave, dtype=np.float64)
         if values.ndim != 1 or len(values) == 0 or not np.isfinite(values).all():
-            raise ValueError("a waveform is one row of at least one finite number")
+            raise ValueError("expected a waveform of shape (n,), n > 0, of finite numbers")
         self._heed()
         self._outputs.safely(lambda: self._driver.upload(joint, values))
 
     def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
         """Set the laws of all joints at one tick, bounded by each joint's limits.command.
 
-        `restart` starts the waveforms there. Returns that tick; raises ValueError for a wrong
-        number of laws or one that is not finite.
+        `restart` starts the waveforms at that tick. Returns the tick; raises ValueError for a wrong
+        number of laws, or for values that are not finite.
         """
         bounded = self._outputs.bounded(laws)
         self._heed()
@@ -268,12 +270,12 @@ class Bench:
     # Samples
 
     def exchange(self, more: bool = False) -> SampleBlock:
-        """Take one block: check every sample, journal it, show it.
+        """Read one block, check every sample, journal it, publish it.
 
-        `more` says that another exchange follows, with no command before it unless something is
-        wrong: in virtual time the device then prepares that block while this one is checked.
-        Raises SafetyTrip, OperatorStop, DeviceLost, DeviceError or RecordingFailed, each with the
-        outputs zeroed before; a block that trips is journalled all the same.
+        `more`: another exchange follows without a command in between (unless an error occurs); in
+        virtual time the device then prepares the next block while this one is checked. Raises
+        SafetyTrip, OperatorStop, DeviceLost, DeviceError or RecordingFailed, each with the outputs
+        zeroed first; a block that trips is journalled as well.
         """
         self._heed()
         with self._outputs:
@@ -294,7 +296,7 @@ class Bench:
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
         if self._outputs.zeroed_elsewhere(block):
-            # The next law would move the joints again: whoever zeroed them does not expect it.
+            # The run's next law would move joints that another program has stopped.
             self._stop.request("stopped: another program has put the outputs to zero")
         if trip is not None:
             self._report(trip)
@@ -303,26 +305,26 @@ class Bench:
         return block
 
     def _note_alarms(self, trip: Violation | None) -> None:
-        """Write down what warns and what tripped, and let the screens see it."""
+        """Write warnings and the trip to the events of the run, and publish them."""
         try:
             self._alarms.update(self._guard.warnings, self.tick)
             if trip is not None:
                 self._alarms.trip(trip)
         except RecordingFailed:
-            if trip is None:  # else the trip is what the user must hear
+            if trip is None:  # otherwise the trip is the error to report
                 raise
         self._display.alarms = self._alarms.table
 
     def _continue(self, block: SampleBlock) -> int:
-        """Return how many samples are missing before a block; raises DeviceError if it is odd."""
+        """Return the count of samples missing before a block; raises DeviceError if invalid."""
         columns = self._columns
         if block.data.ndim != 2 or block.data.shape[1] != columns or len(block.data) == 0:
-            raise DeviceError(f"a block of shape {block.data.shape} came; expected (n, {columns})")
+            raise DeviceError(f"found a block of shape {block.data.shape}, expected (n, {columns})")
         lost = 0 if self._expected is None else block.tick - self._expected
         if lost < 0:
             raise DeviceError(
-                f"samples out of order: a block of tick {block.tick} came where {self._expected} "
-                "or later was due"
+                f"samples out of order: found a block of tick {block.tick}, expected "
+                f"{self._expected} or later"
             )
         self._expected = self.tick = block.tick + len(block.data)
         self.lost_samples += lost
@@ -350,17 +352,19 @@ class Bench:
         self._display.trip = str(self.trip)
         folder = None if self.recorder is None else self.recorder.folder
         if self.state.latch(str(self.trip), self.rig, folder):
-            self.trip.add_note(f"look at the bench, then clear it with `{reset_command(self.rig)}`")
+            self.trip.add_note(
+                f"inspect the bench, then clear the trip with `{reset_command(self.rig)}`"
+            )
         return self.trip
 
     def _report(self, trip: SafetyTrip) -> None:
         log.info("%s", trip)
         about = {k: v for k, v in asdict(trip.violation).items() if k != "tick"}
-        with suppress(RecordingFailed):  # the trip is what the user must hear
+        with suppress(RecordingFailed):  # the trip is the error to report
             self.event("trip", trip.tick, message=str(trip), **about)
 
     def _heed(self) -> None:
-        """Honour a wish to stop and a latched trip before anything else is done."""
+        """Raise a requested stop or a latched trip before anything else is done."""
         for command in self._display.commands(self._judge):
             if command.word == STOP:
                 self._stop.request("stopped by operator (from the screen)")
@@ -380,20 +384,21 @@ class Bench:
 
     @property
     def alarms(self) -> AlarmTable:
-        """The alarms that stand."""
+        """The active alarms."""
         return self._alarms.table
 
     def acknowledge(self, alarm: str | None = None) -> None:
-        """Note that a person has seen an alarm by its key, or all of them."""
+        """Acknowledge an alarm by its key, or all of them, for a person."""
         with suppress(RecordingFailed):  # the next block says so, with the outputs at zero
             self._alarms.acknowledge(alarm, self.tick)
         self._display.alarms = self._alarms.table
 
     def run_for(self, seconds: float, watch: Callable[[SampleBlock], None] | None = None) -> Array:
-        """Exchange until `seconds` of device time have passed; returns their samples.
+        """Exchange until `seconds` of device time have passed; return the samples.
 
-        Shape (n, channels) in the order of `Rig.recorded`, to the end of the last block; samples
-        lost on the wire are not in it. `watch` sees every block; if it raises, outputs are zeroed.
+        Shape (n, channels) in the order of `Rig.recorded`, to the end of the last block, without
+        the samples lost on the wire. `watch` is called with every block; if it raises, the outputs
+        are zeroed.
         """
         rate = self.rig.sample_rate
         passed, taken = 0, []
@@ -407,31 +412,31 @@ class Bench:
                 self._outputs.safely(lambda b=block: watch(b))  # type: ignore[misc]
         return np.concatenate(taken) if taken else np.empty((0, len(self.rig.recorded)))
 
-    # What the engine says
+    # Called by the engine
 
     def guard(self, roles: Sequence[JointRole]) -> None:
-        """Say what each joint does from the next block on: one role per joint."""
+        """Set the roles from the next block on, one per joint."""
         self._guard.set_roles(roles)
 
     def listen(self, judge: Judge) -> None:
-        """Let `judge` take or refuse the commands of screens, all but the stop."""
+        """Let `judge` accept or refuse the commands of screens, except stop."""
         self._judge = judge
 
     def describe(self, plan: Sequence[PlanLine]) -> None:
-        """Say which steps there will be."""
+        """Set the steps of the plan."""
         self._display.describe(plan)
 
     def status(self, **changes: Any) -> None:
-        """Say where the protocol stands: the fields of `rig.bench.screens.snapshot.Progress`."""
+        """Set the protocol's progress: fields of `rig.bench.screens.snapshot.Progress`."""
         self._display.progress = replace(self._display.progress, **changes)
 
     @property
     def expected(self) -> float:
-        """How long [s] the whole run is expected to take, as the protocol said last; 0: unknown."""
+        """The expected duration of the run [s], as last set by `status`; 0: unknown."""
         return self._display.progress.total_s
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
-        """Note one event in the run's log."""
+        """Write one event to the run's log."""
         if self.recorder is not None and self.recorder.is_open:
             self.recorder.event(event, tick, **fields)
 
@@ -445,14 +450,14 @@ class Bench:
     ) -> RecordHandle:
         """Mark a tick range as a record: ``with bench.record(step="step1", repeat=2) as record:``.
 
-        What the record is comes as a RecordMeta or as its fields. By default it spans the samples
-        taken within the `with` block; `start_tick` and `ticks` fix it in advance (as `apply`
-        returned it) or afterwards.
+        Give a RecordMeta or its fields. By default the record spans the samples exchanged within
+        the `with` block; `start_tick` and `ticks` fix it in advance (as returned by `apply`) or
+        afterwards.
         """
         what = RecordMeta(**fields) if meta is None else meta
         if start_tick is None:
             if self._expected is None:
-                raise ValueError("exchange a block first, or give start_tick: no tick is known yet")
+                raise ValueError("no tick is known yet: exchange a block first, or give start_tick")
             start_tick = self._expected
         return RecordHandle(self, what, start_tick, ticks)
 
@@ -462,18 +467,20 @@ def _nothing() -> None:
 
 
 def _place(recorder: Recorder | None) -> str:
-    """Return the run's folder, absolute: a screen may have been started elsewhere."""
+    """Return the absolute path of the run's folder, since a screen may run in another folder."""
     return "" if recorder is None else str(recorder.folder.absolute())
 
 
 def _outcome(error: BaseException | None) -> tuple[str, str]:
-    """Return the state a run ends in and the one line that says why."""
+    """Return the final state of a run and its reason in one line."""
     if error is None:
         return runstate.DONE, ""
     if isinstance(error, SafetyTrip):
         return runstate.TRIPPED, str(error)
     if isinstance(error, KeyboardInterrupt):
         return runstate.ABORTED, "stopped by operator (Ctrl-C)"
-    if isinstance(error, DeviceError):  # the folder alone then says that the device ended it
+    if isinstance(
+        error, DeviceError
+    ):  # the message tells a reader of the folder that the device was the cause
         return runstate.ABORTED, f"device: {error}"
     return runstate.ABORTED, str(error) or type(error).__name__

@@ -8,14 +8,14 @@ from typing import Final
 
 @dataclass(frozen=True)
 class BenchSettings:
-    """Times and attempts of stopping, and what a probe and the clocks are judged by."""
+    """Times and attempts of zeroing, and thresholds of the probe and of the clocks."""
 
-    zero_attempts: int = 2  # of zeroing the outputs: the second one opens the wire anew
+    zero_attempts: int = 2  # attempts to zero the outputs; the second one reopens the wire
     zero_seconds: float = 2.0  # of device time with every command at zero, recorded as proof
-    queued_seconds: float = 4.0  # of samples from before the zeroing that a device may still hold
+    queued_seconds: float = 4.0  # of older samples that a device may still hold in its queue
     empty_pressure: float = 0.1e6  # [Pa] gauge below which a chamber counts as without pressure
-    late_share: float = 0.5  # [periods] after its tick from which on a sample counts as late
-    # A crystal's error either way, doubled: the earliest arrival so far may age by as much.
+    late_share: float = 0.5  # [sample periods] after its tick from which on a sample counts as late
+    # Twice the error of a crystal, in either direction: the least offset may grow at this rate.
     clock_drift: float = 200e-6  # [s/s]
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a closed terminal as a flag that the exchange loop honours."""
+"""Ctrl-C, SIGTERM and a closed terminal as a flag that the exchange loop reads."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _REASONS = {
 
 
 class StopFlag:
-    """A wish to stop, from a signal or a command.
+    """A request to stop, from a signal or a command.
 
-    A signal sets the flag and interrupts nothing: an exception out of the handler could strike
-    while the outputs are being zeroed. The previous handlers return with `restore`.
+    A signal only sets the flag: an exception raised by the handler could interrupt the zeroing of
+    the outputs. `restore` puts the previous handlers back.
     """
 
     def __init__(self) -> None:
@@ -27,21 +27,21 @@ class StopFlag:
         self._previous: dict[signal.Signals, Any] = {}
 
     def request(self, reason: str) -> None:
-        """Wish to stop; the first reason stands."""
+        """Request a stop; the first reason is kept."""
         if self.reason is None:
             self.reason = reason
 
     def install(self) -> None:
-        """Take over the signals; only Python's main thread may, elsewhere nothing happens."""
+        """Install the handlers; does nothing outside Python's main thread, which alone can."""
         if threading.current_thread() is not threading.main_thread() or self._previous:
             return
         for number in _SIGNALS:
             self._previous[number] = signal.signal(number, self._heard)
 
     def restore(self) -> None:
-        """Give the signals back."""
+        """Restore the previous signal handlers."""
         for number, handler in self._previous.items():
-            # None: a handler that was not set from Python; the default is the nearest to it
+            # None: a handler that was not set from Python; replaced by the default
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         self._previous = {}
 

@@ -1,4 +1,4 @@
-"""What stands between a run and people: the terminal's answers, the tracker's estimates."""
+"""Answers typed at the terminal, and the tracker's estimates, for the engine of a run."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:
-    """Return what reads a typed line without waiting; None where nobody attends.
+    """Return a function that reads a typed line without waiting; None for an unattended run.
 
-    Attended is, by default, a run whose standard input and error are terminals.
+    By default a run is attended if its standard input and standard error are terminals.
     """
     if attended is None:
         attended = sys.stdin.isatty() and sys.stderr.isatty()
@@ -31,13 +31,13 @@ def _read_answer() -> str | None:
 
 
 class TrackedEstimates:
-    """The tracker's estimates as conditions see them (`protocols.engine.desk.Estimates`)."""
+    """The tracker's estimates for a protocol's conditions (`protocols.engine.desk.Estimates`)."""
 
     def __init__(self, tracking: Tracking) -> None:
         self._tracking = tracking
 
     def values(self) -> Mapping[str, float]:
-        """Return each estimate [SI] and, as NAME.rsd, its standard deviation over its value."""
+        """Return each finite estimate [SI] and its relative standard deviation, as NAME.rsd."""
         entered: dict[str, float] = {}
         for name, estimate in self._tracking.parameters.items():
             value, std = estimate["value"], estimate["std"]
@@ -49,5 +49,5 @@ class TrackedEstimates:
         return {name: value for name, value in entered.items() if math.isfinite(value)}
 
     def complete(self, record: str) -> bool:
-        """Say whether the tracker has taken in a record; True where it is gone."""
+        """Return whether the estimates include a record; True if the tracker has ended."""
         return not self._tracking.alive or record in self._tracking.recorded

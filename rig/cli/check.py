@@ -1,4 +1,4 @@
-"""The `check` verb: a protocol proved on the twin, and the errors it would leave."""
+"""The `check` verb: a protocol's limits checked on the twin, and its expected errors."""
 
 from __future__ import annotations
 
@@ -58,6 +58,10 @@ def check(
     used = {"model": proof.source.as_dict(), "warning": proof.warning}
     write_json(json, {**document, **used, "identification": proof.prediction})
     if json != Path("-"):
-        known = "\n\nunchanged since it was proved; the kept proof stands" if proof.reused else ""
+        known = (
+            "\n\nnothing has changed since the last proof; it is shown again"
+            if proof.reused
+            else ""
+        )
         typer.echo(f"{check_text(proof.report)}\n\n{proof.twin_text}\n\n{proof.text}{known}")
     proof.report.require()

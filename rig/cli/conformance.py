@@ -1,4 +1,4 @@
-"""The `conformance` verb: what every driver must do, tried on a device that is there."""
+"""The `conformance` verb: tests of a driver on a connected device."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from rig.cli.output import progress, table, write_json
 
 
 def conformance(
-    driver: Annotated[str, typer.Argument(help="The kind of wire, such as modbus-tcp.")],
+    driver: Annotated[str, typer.Argument(help="The driver's name, such as modbus-tcp.")],
     rig: RigOption = "shinshu-2dof",
     endpoint: EndpointOption = None,
     outputs: Annotated[
-        bool, typer.Option("--outputs", help="Also make the checks that put out voltages.")
+        bool, typer.Option("--outputs", help="Also run the checks that output voltages.")
     ] = False,
-    only: Annotated[list[str] | None, typer.Option(help="Only this check; repeatable.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Run only this check; repeatable.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """Check a device and its driver; nothing is put out without --outputs; exit 1 on a failure.
+    """Test a driver on a device; outputs stay zero without --outputs; exit 1 on a failure.
 
     Example: bramah conformance modbus-tcp --endpoint modbus-tcp://127.0.0.1:5020
     """
@@ -35,12 +35,12 @@ def conformance(
     described = reached_at(load_bench(rig), endpoint)
     if described.wire.kind != driver:
         raise InputError(
-            f"{driver}: rig {described.name!r} is reached by {described.wire.kind}; "
-            f"name that, or give --endpoint {driver}://..."
+            f"{driver}: the wire of rig {described.name!r} is {described.wire.kind}; "
+            f"expected that driver, or --endpoint {driver}://..."
         )
     subject = live_subject(described)
     if outputs:
-        progress(f"the outputs will reach {subject.volts:g} V and what they drive will move")
+        progress(f"the outputs will reach {subject.volts:g} V: the joints will move")
     try:
         report = run(subject, only=only or (), outputs=outputs)
     except ValueError as error:

@@ -11,7 +11,7 @@ from rig.cli.options import RigOption
 
 def dbc(
     rig: RigOption,
-    fd: Annotated[bool, typer.Option("--fd", help="With frames of CAN FD.")] = False,
+    fd: Annotated[bool, typer.Option("--fd", help="Use CAN FD frames.")] = False,
 ) -> None:
     """Print the DBC file of a rig: the messages of its bench on a CAN bus.
 

@@ -9,11 +9,13 @@ import typer
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Each demo makes a folder of its own in here.")] = Path(
-        "demo-out"
-    ),
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulated bench.")] = 0,
-    repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the protocol's.")] = None,
+    out: Annotated[
+        Path, typer.Option(help="Parent folder; each demo makes a new folder in it.")
+    ] = Path("demo-out"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated bench.")] = 0,
+    repeats: Annotated[
+        int | None, typer.Option(min=1, help="Repeats per step, instead of the protocol's.")
+    ] = None,
 ) -> None:
     """Run the whole loop on a simulated bench: protocol, records, parameters, trace, report.
 

@@ -1,4 +1,4 @@
-"""The `depressurise` verb: the pressure let out where the rig can."""
+"""The `depressurise` verb: pressures released, if the rig describes how."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rig.cli.stop import stop
 
 
 def depressurise(rig: RigOption, endpoint: EndpointOption = None) -> None:
-    """Let the pressure out where the rig can; zeroes the outputs first.
+    """Zero the outputs, then release the pressures, if the rig file describes how.
 
     Example: bramah depressurise --rig shinshu-2dof
     """
@@ -20,6 +20,6 @@ def depressurise(rig: RigOption, endpoint: EndpointOption = None) -> None:
     pressurised = bench.pressurised(bench.probe(driver, described))
     if pressurised:
         raise WorkError(
-            f"rig {described.name!r} describes no way to let the pressure out: stop the pump and "
-            f"open the relief by hand; still under pressure: {', '.join(pressurised)}"
+            f"rig {described.name!r} describes no way to release the pressure: stop the pump and "
+            f"open the relief valve by hand; still under pressure: {', '.join(pressurised)}"
         )

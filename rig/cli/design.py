@@ -25,14 +25,16 @@ def design(
         str, typer.Option(help="D, E, or the name of the parameter to improve.")
     ] = "E",
     budget: Annotated[
-        int, typer.Option(min=1, max=5000, help="Simulations of a step on the twin.")
+        int, typer.Option(min=1, max=5000, help="Number of simulations per step on the twin.")
     ] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Of the search; the same gives the same.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the search; the same seed gives the same result.")
+    ] = 0,
     model: ModelOption = None,
     nominal: NominalOption = False,
     json: JsonOption = None,
 ) -> None:
-    """Improve a protocol's multisines for what it identifies worst, within the rig's limits.
+    """Improve a protocol's multisines for better estimates, within the rig's limits.
 
     Example: bramah design lock-and-excite-multisine --rig shinshu-2dof --criterion b --out b.yaml
     """

@@ -1,4 +1,4 @@
-"""The device that a verb talks to, and what it leaves under pressure."""
+"""The device of a verb, and the list of places under pressure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def reached_at(rig: Rig, endpoint: str | None) -> Rig:
-    """Return a rig with the wire of an endpoint; without one, as it is."""
+    """Return the rig with the wire of `endpoint`; unchanged without one."""
     from drivers import wire_at
 
     if endpoint is None:
@@ -21,7 +21,7 @@ def reached_at(rig: Rig, endpoint: str | None) -> Rig:
 
 
 def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
-    """Return a rig, reached at an endpoint if one is given, and its unconnected driver."""
+    """Return a rig, with the wire of `endpoint` if given, and its unconnected driver."""
     from drivers import make_driver
     from rig.runs.rigs import load_bench
 
@@ -30,6 +30,6 @@ def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
 
 
 def print_pressure(places: list[str], *, aside: bool = False) -> None:
-    """Print what is still under pressure, if anything is; `aside`: to standard error."""
+    """Print the places still under pressure, if any; `aside`: to standard error."""
     if places:
         typer.echo(f"still under pressure: {', '.join(places)}", err=aside)

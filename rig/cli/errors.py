@@ -1,4 +1,4 @@
-"""Exit codes and what a person reads when something went wrong: a line for each problem."""
+"""Exit codes and error messages, one line each."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class WorkError(Exception):
 
 
 def coloured() -> bool:
-    """Return whether standard error is a terminal on which the person wants colour."""
+    """Return whether standard error is a terminal and NO_COLOR is not set."""
     return sys.stderr.isatty() and not os.environ.get("NO_COLOR")
 
 
 def alarm(text: str) -> str:
-    """Return a text in white on red where standard error has colour."""
+    """Return a text in white on red if standard error shows colour."""
     return f"\033[1;37;41m{text}\033[0m" if coloured() else text
 
 
 class LogFormatter(logging.Formatter):
-    """Writes a log line; one that carries `alarm` is shown as `alarm` shows a text."""
+    """Formats a log record; one with the attribute `alarm` is shown in white on red."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
@@ -58,7 +58,7 @@ def _os_error(error: OSError) -> str:
 def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., str]], ...]:
     """Return error types with their exit code and message; the first match wins.
 
-    Imported when something went wrong: a `--help` needs none of these packages.
+    Imports inside the function keep `--help` quick.
     """
     from drivers.base import DeviceBusy, DeviceError
     from protocols.engine.states import ProtocolAborted
@@ -77,7 +77,7 @@ def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., 
 
 
 def _code_and_message(error: BaseException) -> tuple[int, str]:
-    # An error not listed is a fault of ours, and says so.
+    # An error that is not listed is a bug; its type is shown.
     for kinds, code, text in _codes():
         if isinstance(error, kinds):
             return code, _with_notes(error, text(error))
@@ -85,7 +85,7 @@ def _code_and_message(error: BaseException) -> tuple[int, str]:
 
 
 def _with_notes(error: BaseException, message: str) -> str:
-    """Return the message with what the bench added; outputs that may not be zero come first."""
+    """Return the message with the bench's notes; outputs that may not be zero are stated first."""
     from rig.bench.outputs import UNSURE
 
     notes = list(getattr(error, "__notes__", ()))
@@ -94,7 +94,7 @@ def _with_notes(error: BaseException, message: str) -> str:
 
 
 def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
-    """Run `work` and return the process's exit code; no traceback leaves without `debug`."""
+    """Run `work` and return the exit code; print a traceback only with `debug`."""
     try:
         code = work() or OK
         if code == INTERRUPTED:
@@ -109,7 +109,7 @@ def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
         _say(f"{error.format_message().rstrip('.')}; see --help")
         return BAD_INPUT
     except BrokenPipeError:
-        # The reader of our output went away (`| head`): not an error, and nothing more to say.
+        # The reader of standard output has closed it (`| head`), which is not an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except (Exception, KeyboardInterrupt) as error:

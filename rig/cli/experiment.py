@@ -1,4 +1,4 @@
-"""The whole loop on a simulated bench: run, record, identify, validate, trace, report."""
+"""All stages on a simulated bench: run, record, identify, validate, trace, report."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ IDENTIFY = "lock-and-excite-multisine"
 VALIDATE = "validate"
 RIG = "shinshu-2dof"
 HELD_OUT = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
-HIDDEN = "worn-seal"  # what the demo's bench hides; the analysis does not know
+HIDDEN = "worn-seal"  # effects of the demo's bench, unknown to the analysis
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Runs of one simulated bench and what they say; `truth` is the bench's own.
+    """Runs of one simulated bench and their analysis; `truth` are the bench's true parameters.
 
-    `judged` are those that the model is validated on, `unseen` others that the fit does not see.
+    `judged` are the runs for validation, `unseen` further hold-out runs for the trace.
     """
 
     runs: tuple[Run, ...]
@@ -56,16 +56,16 @@ class Experiment:
 def experiment(
     folder: Path, seed: int, overrides: Overrides, say: Say, scenario: str | None = None
 ) -> Experiment:
-    """Run the demo's protocols on a simulated bench of `seed` into `folder`, and analyse them.
+    """Run the demo's protocols on a simulated bench of `seed` into `folder`; analyse the runs.
 
-    `scenario` is what the bench hides, told to the bench alone; with one there is a third run, of
-    another wave and size, to judge by what is traced.
+    `scenario` (a bench's hidden effects) is passed to the bench alone; with one, a third run of
+    another waveform and amplitude is taken as a hold-out for the trace.
     """
     folder.mkdir(parents=True)
     truth = folder / "truth.json"
     say(f"starting the simulated bench {RIG}, seed {seed}")
     with simulated_bench(RIG, seed=seed, truth=truth, scenario=scenario) as endpoint:
-        say(f"it listens on {endpoint}")
+        say(f"the simulated bench listens on {endpoint}")
         first = run_protocol(
             ProtocolJob(IDENTIFY, RIG, folder / "identify", endpoint, overrides), say
         )
@@ -75,9 +75,9 @@ def experiment(
             third = ProtocolJob(IDENTIFY, RIG, folder / "other-wave", endpoint, HELD_OUT)
             unseen = (run_protocol(third, say),)
     runs, judged = (load_run(first),), (load_run(second),)
-    say("identifying from the first run")
+    say("identifying the parameters from the first run")
     identification = identify(runs)
-    say("validating on the second, which is held out")
+    say("validating the model on the second run, which is held out")
     results = validate(identification.model, judged)
     return Experiment(
         runs, judged, tuple(map(load_run, unseen)), identification, results, read_truth(truth)
@@ -109,7 +109,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     print()
     print(f"trace: {traced.verdict}. {traced.sentence}")
     print()
-    print("parameters, identified again with what was found:")
+    print("parameters, identified again with the effects found:")
     print(parameter_table(traced.model_after.parameters, done.truth))
     print()
     print(f"runs, model and results: {folder}")

@@ -1,8 +1,8 @@
-"""The `loop` verb's work: run, trace, design the next experiment, run it, until nothing is left.
+"""The `loop` verb's work: run, trace, design the next experiment and run it, repeatedly.
 
-Every run is a folder of its own under one: `run-1`, `holdout-1`, then `run-2` from the protocol
-`next-2.yaml`, and so on; each could be traced again without this. What ends a run (a trip, a lost
-device, Ctrl-C) ends the loop as well, with what it knew until then written down.
+Every run has a folder under the loop's: `run-1`, `holdout-1`, then `run-2` from the protocol
+`next-2.yaml`, and so on; `bramah trace` can trace each again. A trip, a lost device or Ctrl-C ends
+the run and the loop; the results so far are kept.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 PROTOCOL: Final = "lock-and-excite-multisine"
 HELD_OUT: Final = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
-SMALLER = 0.8  # an experiment that the bench or its twin refuses is tried again so much smaller
+SMALLER = 0.8  # scale of each further attempt after the bench or its twin refused
 TRIES = 4
 
 FLOOR: Final = "the remaining residual is within the noise"
@@ -48,9 +48,9 @@ REFUSED: Final = "the bench refused the next experiment"
 
 @dataclass(frozen=True)
 class LoopRequest:
-    """What to do: `rounds` counts designed experiments, `ask` is given each before it runs.
+    """Settings of a loop: `rounds`, number of designed experiments; `ask`, called before each.
 
-    `until_visible` goes on after `clean` while an effect of interesting size could not have shown.
+    `until_visible` continues after `clean` while a relevant effect could be below the noise.
     """
 
     rig: str
@@ -66,14 +66,14 @@ class LoopRequest:
 
 
 def refuse_taken(out: Path) -> None:
-    """Raise InputError where a loop has been in this folder before."""
+    """Raise InputError if the folder holds the runs of an earlier loop."""
     taken = out / "run-1"
     if taken.exists():
-        raise InputError(f"--out {out}: {taken} is there already; name another folder")
+        raise InputError(f"--out {out}: {taken} exists already; expected a folder without runs")
 
 
 class Loop:
-    """A running loop: `rounds` so far, `stopped` why it ended ('' while it runs)."""
+    """A running loop: finished `rounds`; `stopped`, the reason of its end ('' while it runs)."""
 
     def __init__(self, request: LoopRequest, say: Callable[[str], None]) -> None:
         refuse_taken(request.out)
@@ -85,7 +85,7 @@ class Loop:
         self.judge: list[Run] = []
 
     def close(self) -> None:
-        """Go round until there is nothing more to learn; raises what ends a run."""
+        """Run rounds until an ending condition holds; raises the error that ends a run."""
         self._take(1, self.request.protocol, self.request.overrides, HELD_OUT)
         self._trace(1, None)
         while not self.stopped:
@@ -102,7 +102,7 @@ class Loop:
                 self._trace(number, experiment)
 
     def _next(self) -> Mapping[str, Any] | None:
-        """Return the experiment to run now; None, and why in `stopped`, where there is none."""
+        """Return the next experiment; None if there is none, with the reason in `stopped`."""
         last = self.rounds[-1].result
         if last.verdict == EXPLAINED or (last.verdict == CLEAN and not self.request.until_visible):
             self.stopped = FLOOR
@@ -126,12 +126,12 @@ class Loop:
         self.say(f"round {number}: {result.verdict}: {result.sentence}")
 
     def _perform(self, number: int, experiment: Mapping[str, Any]) -> bool:
-        """Run an experiment and its held-out variant; False where the bench refuses both sizes."""
+        """Run an experiment and its hold-out variant; False if every amplitude is refused."""
         files = {kind: self.request.out / f"{kind}-{number}.yaml" for kind in ("next", "judge")}
         for path, key in ((files["next"], "protocol"), (files["judge"], "holdout")):
             text = yaml.safe_dump(dict(experiment[key]), sort_keys=False, allow_unicode=True)
             replace_text(path, text)
-        # A twin that lacks something does not know how far the bench will go: leave it room.
+        # The twin of an incomplete model predicts the range of motion badly: leave a margin.
         scale = SMALLER if self.rounds[-1].result.verdict == UNEXPLAINED else 1.0
         for _ in range(TRIES):
             sizes = Overrides(amplitude_scale=scale)
@@ -143,7 +143,7 @@ class Loop:
                     self.say(f"round {number}: {error}")
                     self._set_aside(number)
             scale *= SMALLER
-            self.say(f"round {number}: tried again {scale:.2f} times as large")
+            self.say(f"round {number}: trying again at {scale:.2f} times the amplitude")
         return False
 
     def _within(self, path: Path, sizes: Overrides) -> bool:
@@ -159,7 +159,7 @@ class Loop:
         self, number: int, protocol: str, sizes: Overrides, held_out: Overrides,
         other: str | None = None,
     ) -> None:  # fmt: skip
-        """Take the records of a round, then those that will only judge."""
+        """Run the training records of a round, then its hold-out records."""
         first = self._run(f"run-{number}", protocol, sizes)
         second = self._run(f"holdout-{number}", other or protocol, held_out)
         self.train.append(first)
@@ -175,7 +175,7 @@ class Loop:
         )
 
     def _set_aside(self, number: int) -> None:
-        """Keep an aborted run under another name, so that the next try has its own."""
+        """Rename an aborted run, so that the next attempt can use the name."""
         for kind in ("run", "holdout"):
             folder = self.request.out / f"{kind}-{number}"
             if folder.exists():

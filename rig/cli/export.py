@@ -20,7 +20,7 @@ RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 ModelOption = Annotated[
     Path | None,
     typer.Option(
-        help="A model file: what it simulates stands beside the measured channels; with fmu, the "
+        help="A model file: adds its simulated channels beside the measured ones; with fmu, the "
         "model to write [default: identified from the run]."
     ),
 ]
@@ -36,14 +36,14 @@ def export(
     ] = None,
     model: ModelOption = None,
     licence: Annotated[
-        str, typer.Option("--license", help="Of ro-crate: the URL of the data's licence.")
+        str, typer.Option("--license", help="URL of the data's licence, for ro-crate.")
     ] = "",
 ) -> None:
-    """Write a run for other programs, a file per record; csv and mat can be imported again.
+    """Write a run for other programs, one file per record; csv and mat can be imported again.
 
-    `--format fmu` writes the identified model instead, with its effects, as functional mock-up
-    units (FMI 2 and 3, co-simulation, for 64-bit Linux and Windows); ro-crate is the run's own
-    files with a description for archives and repositories.
+    `--format fmu` writes the identified model with its effects instead, as functional mock-up
+    units (FMI 2 and 3, co-simulation, for 64-bit Linux and Windows); ro-crate contains the run's
+    files and a description for archives and repositories.
 
     Example: bramah export runs/monday --format mat
     """
@@ -67,7 +67,7 @@ def export(
     if kind == CRATE:
         if model is not None:
             raise InputError(
-                "--model does not go with --format ro-crate: it holds the run as it is"
+                "--model cannot be used with --format ro-crate, which contains the run unchanged"
             )
         from rig.runs.exchange.ro_crate import export_crate
 

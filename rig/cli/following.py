@@ -1,4 +1,4 @@
-"""From a bench's blocks and record marks to a tracker: samples and records meet by tick."""
+"""Feeds a tracker with the samples of records, matched to a bench's blocks by tick."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Follower:
         self._names = rig.recorded
         self._kept = round(KEPT * rig.sample_rate)
         self._recent: deque[tuple[int, Array]] = deque()
-        self._next: int | None = None  # the tick due in the record that runs
-        self._last: int | None = None  # the tick after its last, where known
+        self._next: int | None = None  # first tick of the current record not yet fed
+        self._last: int | None = None  # end of the current record, exclusive, if known
 
     def block(self, tick: int, data: Array) -> bool:
-        """Take a block (n, channels) from `tick`; says whether the estimates are new."""
+        """Take a block (n, channels) from `tick` on; return whether the estimates have changed."""
         self._recent.append((tick, data))
         newest = tick + len(data)
         while self._recent[0][0] + len(self._recent[0][1]) < newest - self._kept:
@@ -36,9 +36,9 @@ class Follower:
         return self._next is not None and self._feed(newest)
 
     def begins(self, head: RecordHead, start: int, ticks: int | None = None) -> None:
-        """Begin a record at a tick; what is here of it already is fed.
+        """Begin a record at tick `start`; feed its samples that have arrived already.
 
-        Blocks may reach beyond its end, so `ticks` must be given where it is fixed in advance.
+        Give the length `ticks` if it is fixed in advance, because blocks may reach beyond the end.
         """
         self._tracker.begin(head)
         self._next, self._last = start, None if ticks is None else start + ticks
@@ -47,7 +47,7 @@ class Follower:
             self._feed(tick + len(data))
 
     def ends(self, start: int, ticks: int, complete: bool) -> None:
-        """End the record that runs after `ticks` samples; only a complete one counts."""
+        """End the current record after `ticks` samples; discard it if it is not complete."""
         if self._next is None:
             return
         self._last = start + ticks
@@ -59,7 +59,7 @@ class Follower:
         self._next = None
 
     def _feed(self, last: int) -> bool:
-        """Feed the ticks from the one due up to `last`, NaN where no block has them."""
+        """Feed the samples from the next tick up to `last`; NaN for missing samples."""
         first = self._next
         last = last if self._last is None else min(last, self._last)
         if first is None or last <= first:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def load_runs(folders: Sequence[Path]) -> list[Run]:
-    """Load run folders, none of them twice, with the time left where it takes long."""
+    """Load run folders, each once; report progress if it takes long."""
     from rig.runs.store import load_run, refuse_repeated
 
     refuse_repeated(folders)
@@ -35,7 +35,7 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstrap: int) -> None:
-    """Raise InputError for what needs the rows of all records in memory."""
+    """Raise InputError for settings that need the rows of all records in memory."""
     from rig.model.parse import InputError
 
     for name, asked, wanted in (
@@ -45,7 +45,7 @@ def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstra
     ):
         if asked != wanted:
             raise InputError(
-                f"{name} {asked} needs every row in memory and does not go with {option}: "
+                f"{name} {asked} needs all rows in memory and cannot be used with {option}: "
                 f"expected {name} {wanted}, or no {option}"
             )
 
@@ -65,7 +65,7 @@ def _streamed(
 
     refuse_repeated(runs)
     model = None if like is None else load_model(like)
-    # What the folders hold is read by who works on them: they need not exist here.
+    # The workers read the folders, which need not exist on this computer.
     with Serial() if cluster is None else DaskCluster(cluster) as pool:
         return identify_folders(
             [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects,
@@ -74,7 +74,7 @@ def _streamed(
 
 
 def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Sequence[Used] | None:
-    """Return the terms asked for, shapes found where none are given; None: the rig's own."""
+    """Return the terms of the options, with unset shapes fitted; None for the rig file's terms."""
     from analysis.simulation.model import terms_like
     from analysis.terms import with_effects
     from analysis.terms.base import Used
@@ -110,21 +110,25 @@ def identify(
     ] = None,
     like: Annotated[
         Path | None,
-        typer.Option(help="A model file whose terms, effects with their shapes, are taken over."),
+        typer.Option(help="Use the terms of this model file: its effects and their shapes."),
     ] = None,
     estimator: Annotated[
         str | None,
         typer.Option(
             help="ls, wls, iv, robust, output-error; auto: ls, or iv where noise in the "
-            "regressors biases ls and it matters; plain: the bare solution.  "
+            "regressors biases ls significantly; plain: least squares alone.  "
             "[default: auto; plain with --stream or --cluster]"
         ),
     ] = None,
     bootstrap: Annotated[
-        int, typer.Option(min=0, help="Draws of whole repeats for the intervals; 0: by repeat.")
+        int,
+        typer.Option(
+            min=0,
+            help="Bootstrap draws of whole repeats for the intervals; 0: from their scatter.",
+        ),
     ] = 0,
     filtering: Annotated[
-        str, typer.Option(help="default, moving-average (the paper's) or butterworth.")
+        str, typer.Option(help="Filter: default, moving-average (the paper's) or butterworth.")
     ] = "default",
     json: JsonOption = None,
     model: Annotated[
@@ -134,31 +138,31 @@ def identify(
         Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="Compare with this file of `bramah sim --truth`.")
+        Path | None,
+        typer.Option(help="Compare with the true parameters in this file of `bramah sim --truth`."),
     ] = None,
     physical: Annotated[
-        bool, typer.Option("--physical", help="Only parameters that real bodies can have.")
+        bool,
+        typer.Option("--physical", help="Constrain the parameters to physically consistent ones."),
     ] = False,
     evaluations: Annotated[
-        int, typer.Option(min=4, help="Candidates that pso or ga may simulate.")
+        int, typer.Option(min=4, help="Number of candidates that pso or ga simulates.")
     ] = 2000,
-    seed: Annotated[int, typer.Option(min=0, help="Of pso, ga and the bootstrap.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of pso, ga and the bootstrap.")] = 0,
     stream: Annotated[
         bool,
         typer.Option(
             "--stream",
-            help="One record in memory at a time, for runs that do not fit: coupled and plain "
+            help="Keep one record in memory at a time, for large runs; coupled and plain "
             "only (an --estimator's refinements need all rows in memory).",
         ),
     ] = False,
     cluster: Annotated[
         str | None,
-        typer.Option(
-            help="tcp://HOST:PORT of a Dask scheduler: the work goes to its workers, as --stream."
-        ),
+        typer.Option(help="Stream on the workers of the Dask scheduler at tcp://HOST:PORT."),
     ] = None,
 ) -> None:
-    """Identify every parameter from all records of the runs at once, or as others would.
+    """Identify every parameter from all records of the runs, by --method.
 
     Example: bramah identify runs/monday --json parameters.json --model model.json
     """
@@ -178,7 +182,7 @@ def identify(
     filters = FILTERINGS[filtering]
     known = None if truth is None else read_truth(truth)
     if like is not None and effects:
-        raise InputError("--like takes a model's terms as they are: leave --with away")
+        raise InputError("--like uses the terms of a model unchanged: expected no --with beside it")
     if stream or cluster is not None:
         _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
         result = _streamed(runs, filters, effects or (), like, cluster)

@@ -1,4 +1,4 @@
-"""The `import` verb: records of another system as a run folder."""
+"""The `import` verb: records of another system imported as a run folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def import_(
     manifest: Annotated[Path, typer.Argument(help="A YAML file that lists CSV or MAT files.")],
     out: Annotated[Path, typer.Option(help="The run folder to make.")],
 ) -> None:
-    """Bring records of another system into a run folder.
+    """Import records of another system into a run folder.
 
     Example: bramah import manifest.yaml --out runs/foreign
     """

@@ -1,4 +1,4 @@
-"""The `loop` verb: run, identify, trace, design the next excitation, run it, until only noise."""
+"""The `loop` verb: run, identify, trace, design and run the next experiment, repeatedly."""
 
 from __future__ import annotations
 
@@ -30,22 +30,25 @@ def loop(
     unattended: Annotated[
         bool, typer.Option("--unattended", help="Run designed experiments without asking.")
     ] = False,
-    rounds: Annotated[int, typer.Option(min=0, help="Designed experiments at most.")] = 4,
-    protocol: Annotated[str, typer.Option(help="Of the first run.")] = "lock-and-excite-multisine",
+    rounds: Annotated[int, typer.Option(min=0, help="Largest number of designed experiments.")] = 4,
+    protocol: Annotated[
+        str, typer.Option(help="Repeats per step of the first run.")
+    ] = "lock-and-excite-multisine",
     repeats: RepeatsOption = None,
     amplitude_scale: ScaleOption = 1.0,
     until_visible: Annotated[
         bool,
         typer.Option(
-            "--until-visible", help="Go on after clean while a small effect could not have shown."
+            "--until-visible",
+            help="Continue after clean while a relevant effect could be below the noise.",
         ),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the trace, and of --simulate.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the trace and of --simulate.")] = 0,
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Start a simulated bench for it.")
+        bool, typer.Option("--simulate", help="Start a simulated bench and use it.")
     ] = False,
     scenario: Annotated[
-        str | None, typer.Option(help="Of --simulate: as of sim, for example random.")
+        str | None, typer.Option(help="Scenario of --simulate, as for sim, such as random.")
     ] = None,
     json: JsonOption = None,
     report: Annotated[
@@ -55,7 +58,7 @@ def loop(
         ),
     ] = None,
     operator: Annotated[
-        str | None, typer.Option(help="Written into the runs.  [default: you]")
+        str | None, typer.Option(help="Name written into the runs.  [default: the user]")
     ] = None,
 ) -> None:
     """Close the loop: run, trace, design the experiment that separates, run it, trace again.
@@ -67,15 +70,15 @@ def loop(
     from rig.model.parse import InputError
 
     if simulate and endpoint is not None:
-        raise InputError("--simulate starts a bench of its own: leave --endpoint away, or it")
+        raise InputError("--simulate starts a new bench: expected either --simulate or --endpoint")
     if scenario is not None and not simulate:
-        raise InputError("--scenario is of --simulate: a bench that runs already has its own")
+        raise InputError("--scenario needs --simulate: it cannot change a bench that runs already")
     if not unattended and not sys.stdin.isatty():
         raise InputError(
             "loop asks before each experiment that it designs; give --unattended where nobody "
             "can answer"
         )
-    # What loads the analysis comes after what can be refused without it.
+    # The analysis loads slowly: options are checked before it is imported.
     from protocols.files.plan import Overrides
     from rig.cli.experiment_loop import Loop, LoopRequest, refuse_taken
     from rig.cli.simulated_bench import simulated_bench
@@ -83,7 +86,7 @@ def loop(
     refuse_taken(out)
     with ExitStack() as stack:
         if simulate:
-            # The truth stays with the simulator: the loop does not look at it.
+            # The loop must not read the truth, so none is written.
             endpoint = stack.enter_context(simulated_bench(rig, seed=seed, scenario=scenario))
         ask = (lambda experiment: True) if unattended else _confirmed
         sizes = Overrides(repeats=repeats, amplitude_scale=amplitude_scale)
@@ -111,7 +114,7 @@ def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
     from rig.cli.twin_choice import save_identified
 
     if not experiments.rounds and not experiments.request.out.is_dir():
-        return  # ended before anything was taken
+        return  # the loop ended before its first record
     document = rounds_json(experiments.rounds, experiments.stopped)
     write_json(experiments.request.out / "loop.json", document)
     write_json(json, document)

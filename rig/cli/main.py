@@ -1,4 +1,4 @@
-"""The `bramah` command: which verbs there are; a verb's module is imported when it is called."""
+"""The `bramah` command and its verbs; the module of a verb is imported when the verb is called."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ import typer
 
 from rig.cli.errors import LogFormatter, guarded
 
-# Matrices here are tall and narrow, and there are many: BLAS threads get in each other's way.
+# For the many tall, narrow matrices of the analysis, BLAS threads slow each other down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 NAME: Final = "bramah"
 COMPLETING: Final = "_BRAMAH_COMPLETE"  # set by the shell's completion, which Typer installs
-# In the order of `bramah --help`: a verb, and the module with the function or group of its name.
+# Verb and module with the function or group of that name, in the order of `bramah --help`.
 VERBS: Final = {
     "demo": "rig.cli.demo",
     "sim": "rig.cli.sim",
@@ -53,7 +53,7 @@ VERBS: Final = {
     "schema": "rig.cli.schema",
     "bench": "rig.cli.bench.command",
 }
-GUIDE: Final = """Run a hydraulic robot's test bench, identify it, say what the model lacks.
+GUIDE: Final = """Run a hydraulic robot's test bench, identify its model, find what the model lacks.
 
 Begin with `bramah demo`, which needs no hardware. At a bench: `bramah probe` reads it and moves
 nothing, `bramah check` proves a protocol, `bramah run` runs it; then come `bramah identify`,
@@ -62,7 +62,7 @@ nothing, `bramah check` proves a protocol, `bramah run` runs it; then come `bram
 
 
 def command_line(verbs: Sequence[str]) -> typer.Typer:
-    """Return the command line with these verbs in full, the others by name and summary only."""
+    """Return the command line with `verbs` complete and all others by name and summary only."""
     app = typer.Typer(
         name=NAME,
         help=GUIDE,
@@ -102,11 +102,11 @@ def _bramah(
 
 
 def _not_imported() -> None:
-    raise AssertionError("a verb was called that the command line was not made for")
+    raise AssertionError("the verb called was not passed to command_line()")
 
 
 def _summary(module: str) -> str:
-    """Return the first line of a verb's docstring, read from its source and not imported."""
+    """Return the first line of a verb's docstring, read from its source without importing it."""
     parent, _, leaf = module.rpartition(".")
     spec = find_spec(parent)
     assert spec is not None
@@ -120,16 +120,16 @@ def _summary(module: str) -> str:
 
 
 def _typed(words: Sequence[str]) -> Sequence[str]:
-    """Return the words of a call; where a shell asks for a completion, those typed so far."""
+    """Return the words of a call, or those typed so far if a shell asks for a completion."""
     if COMPLETING not in os.environ:
         return words
-    # Bash hands on its own list of words, the other shells theirs.
+    # bash passes the words in COMP_WORDS, other shells in _TYPER_COMPLETE_ARGS
     line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
     return line.split()[1:]
 
 
 def __getattr__(name: str) -> Any:
-    # The whole command line, for whoever asks for it; a call imports its own verb alone.
+    # `app` has all verbs, for importers; a call of `run` imports one verb.
     if name == "app":
         return command_line(list(VERBS))
     raise AttributeError(name)
@@ -140,14 +140,14 @@ def _as_ctrl_c(number: int, frame: FrameType | None) -> None:
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with the contract's code; `--debug` may stand anywhere."""
+    """Run the command line and exit with its exit code; `--debug` may stand anywhere."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"] or ["--help"]
     handler = logging.StreamHandler()
     handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
-    # What a verb has begun it then takes away; a bench has handlers of its own while it is driven.
+    # Verbs then clean up as after Ctrl-C; while driving, a bench installs its own handlers.
     signal.signal(signal.SIGTERM, _as_ctrl_c)
     verb = next((word for word in _typed(words) if not word.startswith("-")), "")
 

@@ -18,13 +18,13 @@ def manual(
         Path | None, typer.Option(help="Record the session into this run folder.")
     ] = None,
     volts: Annotated[
-        float, typer.Option(min=0.01, help="Of a jog at most [V]; more where the valve overlaps.")
+        float, typer.Option(min=0.01, help="Largest jog voltage [V]; more in a valve's dead band.")
     ] = 0.15,
     idle: Annotated[
-        float, typer.Option(min=1.0, help="End after so many seconds without a command.")
+        float, typer.Option(min=1.0, help="End after this many seconds without a command.")
     ] = 300.0,
 ) -> None:
-    """Let a screen jog, lock and unlock joints within their limits; refused while a run goes on.
+    """Let a screen jog, lock and unlock joints within their limits; refused during a run.
 
     Example: bramah manual --rig shinshu-2dof
     """

@@ -16,21 +16,24 @@ from rig.cli.output import progress
 
 
 def monitor(
-    rig: Annotated[str | None, typer.Option("--rig", help="Only runs of this rig.")] = None,
+    rig: Annotated[str | None, typer.Option("--rig", help="Show only runs of this rig.")] = None,
     plain: Annotated[
-        bool, typer.Option("--plain", help="One line a second, for screen readers and logs.")
+        bool,
+        typer.Option("--plain", help="Print one line per second, for screen readers and logs."),
     ] = False,
     web: Annotated[
         bool,
-        typer.Option("--web", help="In a browser of this machine: prints the address to open."),
+        typer.Option(
+            "--web", help="Show the screen in a browser of this machine; prints its address."
+        ),
     ] = False,
     port: Annotated[
         int | None,
-        typer.Option(help="With --web; 0 takes a free one.  [default: 0]", min=0, max=65535),
+        typer.Option(help="Port of --web; 0 takes a free one.  [default: 0]", min=0, max=65535),
     ] = None,
     runs: Annotated[
         Path,
-        typer.Option("--runs", help="Where runs are listed, and new ones go."),
+        typer.Option("--runs", help="Folder of the listed runs and of new ones."),
     ] = Path(),
     endpoint: EndpointOption = None,
 ) -> None:
@@ -45,11 +48,11 @@ def monitor(
     from rig.runs.rigs import load_rig, shipped_rigs
 
     if web and plain:
-        raise InputError("--web does not go with --plain: one is a page, the other lines of text")
+        raise InputError("--web cannot be used with --plain: expected one of them")
     if port is not None and not web:
         raise InputError(f"--port {port}: expected with --web only")
 
-    # Sessions are known by the rig's name, whatever its file is called.
+    # Sessions are listed by the rig's name, not by the name of its file.
     is_file = rig is not None and rig not in shipped_rigs() and Path(rig).is_file()
     name = load_rig(rig).name if rig is not None and is_file else rig
     if plain:
@@ -59,10 +62,12 @@ def monitor(
         return
     if web:
         raise typer.Exit(_serve(rig, runs, endpoint, port or 0))
-    if not sys.stdin.isatty() and "TEXTUAL_DRIVER" not in os.environ:  # the browser's page has one
+    if (
+        not sys.stdin.isatty() and "TEXTUAL_DRIVER" not in os.environ
+    ):  # the browser's page is the terminal
         raise InputError(
-            "the screen needs a terminal, and standard input is none: use --plain for lines of "
-            "text, or --web for a page"
+            "the screen needs a terminal, but standard input is none: expected --plain (lines of "
+            "text) or --web (a browser)"
         )
     from rig.tui.app import main
     from rig.tui.browse import BrowserState
@@ -92,8 +97,8 @@ def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:
     def ready(address: str) -> None:
         typer.echo(address)
         progress(
-            "open this address in a browser of this machine; it lets whoever has it command a run. "
-            "Ctrl-C closes the pages, and no run ends by it"
+            "open this address in a browser of this machine; keep it secret, it gives control "
+            "of runs. Ctrl-C closes the pages and ends no run"
         )
 
     return serve([*BRAMAH, "monitor", *given], listening, ready)

@@ -1,4 +1,4 @@
-"""From a queue and its run folders to the page of the night."""
+"""The page of the night: results of a queue's items and their run folders."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rig.runs.store import is_run
 
 
 def night_of(store: QueueStore, since: datetime | None) -> Night:
-    """Return the night of a queue: items over or started since a time, and those that wait."""
+    """Return the page's data: items ended or started since a time, and waiting ones."""
     items = [item for item in store.items() if since is None or _recent(item, since)]
     order = sorted(items, key=lambda item: (item.started or "9", item.id))
     notes = [
@@ -73,5 +73,5 @@ def _number(value: object) -> float:
 
 
 def write_page(path: Path, store: QueueStore, since: datetime | None = None) -> None:
-    """Write the page of a queue's night; raises InputError where it cannot be written."""
+    """Write the page of the night; raises InputError if the file cannot be written."""
     write_night(path, night_of(store, since))

@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 def _rigs(incomplete: str) -> list[str]:
-    """Return the shipped rigs that a shell may complete a word to; files it completes itself."""
+    """Return the shipped rigs that complete a word; the shell completes files."""
     from rig.runs.rigs import shipped_rigs
 
     return [name for name in shipped_rigs() if name.startswith(incomplete)]
 
 
 def _protocols(incomplete: str) -> list[str]:
-    """Return the shipped protocols that a shell may complete a word to."""
+    """Return the shipped protocols that complete a word."""
     from protocols.files.library import shipped_names
 
     return [name for name in shipped_names() if name.startswith(incomplete)]
@@ -66,23 +66,30 @@ RigOption = Annotated[
 ]
 ProtocolArgument = Annotated[
     str,
-    typer.Argument(help="A shipped protocol's name, or a file.", autocompletion=_protocols),
+    typer.Argument(
+        help="A shipped protocol's name, or the path of a protocol file.", autocompletion=_protocols
+    ),
 ]
-RepeatsOption = Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")]
+RepeatsOption = Annotated[
+    int | None, typer.Option(min=1, help="Repeats per step, instead of the file's.")
+]
 DurationOption = Annotated[
     float | None, typer.Option(min=0.01, help="Seconds per record, instead of the file's.")
 ]
-ScaleOption = Annotated[float, typer.Option(help="Multiplies every amplitude of the file.")]
+ScaleOption = Annotated[float, typer.Option(help="Factor on every amplitude of the file.")]
 WaveSeedOption = Annotated[
-    int | None, typer.Option("--wave-seed", min=0, help="Of the multisines' phases.")
+    int | None, typer.Option("--wave-seed", min=0, help="Seed of the multisines' phases.")
 ]
-StepOption = Annotated[list[str] | None, typer.Option("--step", help="Only this step; repeatable.")]
+StepOption = Annotated[
+    list[str] | None, typer.Option("--step", help="Run only this step; repeatable.")
+]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="NAME=VALUE of a parameter of the file; repeatable."),
+    typer.Option("--set", help="NAME=VALUE sets a parameter of the file; repeatable."),
 ]
 EndpointOption = Annotated[
-    str | None, typer.Option(help="KIND://..., such as modbus-tcp://HOST:PORT, not the rig's wire.")
+    str | None,
+    typer.Option(help="KIND://..., such as modbus-tcp://HOST:PORT, instead of the rig's wire."),
 ]
 JsonOption = Annotated[
     Path | None,
@@ -96,12 +103,12 @@ ModelOption = Annotated[
     Path | None,
     typer.Option(
         "--model",
-        help="A model file that the twin takes its parameters from.  "
+        help="A model file with the twin's parameters.  "
         "[default: the last identified one of the rig]",
     ),
 ]
 NominalOption = Annotated[
-    bool, typer.Option("--nominal", help="Prove on the rig file's nominal values instead.")
+    bool, typer.Option("--nominal", help="Use the rig file's nominal values for the twin instead.")
 ]
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
 
@@ -114,7 +121,7 @@ def overridden(
     steps: Sequence[str] | None,
     settings: Sequence[str] | None = None,
 ) -> Overrides:
-    """Return what a person changed of a protocol on the command line."""
+    """Return the changes of a protocol given on the command line."""
     from protocols.files import library
     from protocols.files.plan import Overrides
 

@@ -1,4 +1,4 @@
-"""What leaves the program: results to standard output, progress to standard error."""
+"""Output of the program: results to standard output, progress to standard error."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-LINE_SECONDS: Final = 3.0  # [s] between two lines of a countdown, and before its first
+LINE_SECONDS: Final = 3.0  # [s] between the lines of a countdown, and before the first
 
 
 def progress(message: str) -> None:
-    """Report how far the work is, on standard error."""
+    """Print a progress message to standard error."""
     print(message, file=sys.stderr, flush=True)
 
 
@@ -26,9 +26,9 @@ def clock_text(seconds: float) -> str:
 
 
 class Countdown:
-    """Tells how far a work is and how long it will still take; called with the share done, 0 to 1.
+    """Reports progress and remaining time; called with the share done, 0 to 1.
 
-    Nothing is said within the first seconds: short work stays quiet.
+    Reports nothing within the first LINE_SECONDS, so not at all for short work.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Countdown:
         self._began = self._last_line = clock()
 
     def __call__(self, share: float) -> None:
-        """Take the share that is done by now."""
+        """Report the share done so far, at most once every LINE_SECONDS."""
         now = self._clock()
         if now - self._last_line < LINE_SECONDS or not 0.0 < share < 1.0:
             return
@@ -51,7 +51,7 @@ class Countdown:
 
 
 def _plain(value: Any) -> Any:
-    # JSON knows no NaN; a reader in another language would choke on Python's.
+    # JSON has no NaN; other languages cannot read Python's.
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -78,7 +78,7 @@ def write_json(path: Path | None, data: Any) -> None:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[str] = ()) -> str:
-    """Lay out a plain table: the first column and those of `left` to the left, the others right."""
+    """Return a table as text: the first column and those in `left` left-aligned, others right."""
     widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
     lines = [
         "  ".join(

@@ -1,4 +1,4 @@
-"""`identify --physical`: the consistent parameters beside the free ones, and their price."""
+"""`identify --physical`: physically consistent parameters compared with unconstrained ones."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rig.cli.output import table
 
 
 def make_physical(result: Identification) -> tuple[Identification, dict[str, Any], str]:
-    """Return the identification with consistent parameters, its JSON, and the comparison as text.
+    """Return the identification with consistent parameters, its JSON and the comparison as text.
 
-    Raises InputError where a parameter is not identified.
+    Raises InputError if a parameter is not identified.
     """
     projection = physical(result)
     given = with_physics(result, projection)
@@ -23,7 +23,7 @@ def make_physical(result: Identification) -> tuple[Identification, dict[str, Any
 
 
 def physical_text(physical: Physical) -> str:
-    """Return every parameter free and at each level, and which level was given out."""
+    """Return every parameter, unconstrained and at each level, and the level of the result."""
     header = ["parameter [SI]", "free", *(f"{level.name}" for level in physical.levels)]
     rows = []
     for name, free in physical.free.items():
@@ -35,4 +35,4 @@ def physical_text(physical: Physical) -> str:
     level = physical.levels[physical.given]
     more = physical.levels[physical.given + 1 :]
     why = f"; '{more[0].name}' is rejected by the data" if more else ""
-    return f"{table(header, rows)}\ngiven out: '{level.name}'{why}"
+    return f"{table(header, rows)}\nresult: '{level.name}'{why}"

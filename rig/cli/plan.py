@@ -1,4 +1,4 @@
-"""The `plan` verb: a rig's lock-and-excite steps with the proof that they determine everything."""
+"""The `plan` verb: a rig's lock-and-excite steps, with proof that they determine all parameters."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ def plan(
     ] = None,
     validation: Annotated[
         Path | None,
-        typer.Option(
-            help="Write a protocol of new data to validate on here.", callback=writable_file
-        ),
+        typer.Option(help="Write a protocol for validation data here.", callback=writable_file),
     ] = None,
     prove: Annotated[
-        str | None, typer.Option(help="Prove this protocol (a name or a file) and generate none.")
+        str | None,
+        typer.Option(help="Prove this protocol (a name or a file) instead of generating one."),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Generate the lock-and-excite steps of a rig, and prove that they determine everything.
+    """Generate a rig's lock-and-excite steps and prove that they determine all parameters.
 
     Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
     """

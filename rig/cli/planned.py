@@ -1,4 +1,4 @@
-"""From a protocol's plan to what the analysis predicts from: the two packages do not meet."""
+"""Conversion between a protocol's plan and the steps that the analysis predicts from."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from protocols.steps.plans import StepPlan
 def planned_steps(
     plan: Plan, biases: Mapping[str, Mapping[int, float]] | None = None
 ) -> list[TwinStep]:
-    """Return a plan's steps in device terms; `biases` [V] by step and 1-based joint, if known."""
+    """Return a plan's steps for the twin; `biases` [V] by step and 1-based joint, if known."""
     return [planned_step(step, (biases or {}).get(step.name, {})) for step in plan.steps]
 
 
 def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
-    """Return one step: waveforms repeated to the step's common period."""
+    """Return one step, its waveforms repeated to the step's common period."""
     return TwinStep(
         name=step.name,
         waves={e.joint: np.resize(e.wave.samples, step.period) for e in step.excite},
@@ -54,7 +54,7 @@ def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
 
 
 def designed_step(plan: Plan, planned: TwinStep, tones: Mapping[int, Tone]) -> Step:
-    """Return a protocol's step with the designed lines in place of its signals."""
+    """Return a protocol's step with the designed spectral lines instead of its signals."""
     step = next(s for s in plan.steps if s.name == planned.name)
     source = next(s for s in plan.protocol.excitations if s.name == planned.name)
     excite = []
@@ -63,7 +63,7 @@ def designed_step(plan: Plan, planned: TwinStep, tones: Mapping[int, Tone]) -> S
         wave = Waveform(planned.waves[part.joint - 1], tone.chosen, tone.empty)
         signal = chosen_lines(wave, plan.sample_rate / step.period)
         excite.append(part.model_copy(update={"signal": signal}))
-    # A record was one common period or several; written out, it stays so.
+    # A record of one or several common periods keeps that length.
     seconds = step.record / plan.sample_rate
     return source.model_copy(update={"excite": tuple(excite), "duration": seconds})
 

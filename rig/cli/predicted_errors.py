@@ -1,4 +1,4 @@
-"""What an experiment will determine: the work of `check`'s second half and of `design`."""
+"""Predicted errors of a protocol's estimates, for the verbs `check` and `design`."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 
-CHECKED = 0.4  # of the time of a check with its prediction, spent on the limits
+CHECKED = 0.4  # share of the total time that the check of the limits takes
 
 
 @dataclass(frozen=True)
 class CheckedForecast:
-    """A protocol's limits on the twin, and its expected errors (None, and why, where unknown)."""
+    """Limits of a protocol on the twin, and its predicted errors; None for the reason `why`."""
 
     limits: CheckReport
     prediction: Prediction | None
@@ -44,7 +44,7 @@ class CheckedForecast:
 
 @dataclass(frozen=True)
 class ForecastText:
-    """A foresight as plain data and as a person reads it."""
+    """A forecast as plain data and as text."""
 
     limits: CheckReport
     plain: Mapping[str, Any]
@@ -54,7 +54,7 @@ class ForecastText:
 def forecast_text(
     plan: Plan, parameters: TwinParameters, report: Callable[[float], None] | None = None
 ) -> ForecastText:
-    """Check and predict a plan; InputError where the twin cannot follow it."""
+    """Check a plan and predict its errors; raises InputError if the twin cannot follow it."""
     forecast = of_plan(plan, parameters.rig, report, parameters.twin, parameters.draws)
     return ForecastText(
         forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
@@ -62,20 +62,20 @@ def forecast_text(
 
 
 def jitter_of(rig: Rig) -> float | None:
-    """Return the spread [s] of a host-timed device's sample times, None where it has the clock."""
+    """Return the standard deviation [s] of host-timed samples' times; None for a device's clock."""
     if not driver_class(rig.wire.kind).host_timed:
         return None
     return DESIGN.jitter if rig.wire.jitter is None else rig.wire.jitter
 
 
 def lateness_text(forecast: CheckedForecast) -> str:
-    """Return in one line what late samples cost b, and by which assumption."""
+    """Return the effect of late samples on the estimate of b, and its assumption, in one line."""
     p, wire = forecast.prediction, forecast.stated
     if p is None or p.lateness is None or wire is None:
         return ""
     cost = p.lateness
     origin = (
-        "assumed, for wire.jitter is not stated; `bramah probe` measures it"
+        "assumed, since the rig file states no wire.jitter; `bramah probe` measures it"
         if wire.jitter is None
         else "wire.jitter"
     )
@@ -84,11 +84,11 @@ def lateness_text(forecast: CheckedForecast) -> str:
         f"move b by {100 * cost.shift:+.3g} % and scatter it by {percent(cost.scatter)} %; its "
         "interval includes that"
         if math.isfinite(cost.shift)
-        else "leave no b; lower the rig's sample_rate"
+        else "make b unidentifiable; lower the rig's sample_rate"
     )
     return (
-        f"host-timed ({wire.kind}): samples {1e3 * cost.jitter:.3g} ms late ({origin}) and put "
-        f"onto even ticks{missing} {moved}"
+        f"host-timed ({wire.kind}): samples {1e3 * cost.jitter:.3g} ms late ({origin}), "
+        f"assigned to equidistant ticks{missing} {moved}"
     )
 
 
@@ -99,9 +99,9 @@ def of_plan(
     twin: Twin = simulate_commands,
     draws: Sequence[Twin] = (),
 ) -> CheckedForecast:
-    """Check and predict a plan; what cannot be predicted is said, the limits stand without it.
+    """Check a plan's limits and predict its errors, or state why they cannot be predicted.
 
-    Errors are predicted from the rig's nominal values, for the terms that every model has.
+    Errors are predicted with the rig's nominal values, for the terms common to all models.
     """
 
     def part(begin: float, end: float) -> Callable[[float], None] | None:
@@ -120,7 +120,7 @@ def of_plan(
 
 
 def as_dict(forecast: CheckedForecast) -> dict[str, Any]:
-    """Return the check as plain data, with the prediction, or why there is none."""
+    """Return the check and the prediction, or the reason for its absence, as plain data."""
     document: dict[str, Any] = {"impossible": forecast.why}
     if forecast.prediction is not None:
         document = to_json(forecast.prediction)
@@ -133,7 +133,7 @@ def percent(value: float) -> str:
 
 
 def prediction_text(forecast: CheckedForecast) -> str:
-    """Return each parameter's predicted error, conditioning, and what is not determined."""
+    """Return predicted errors, conditioning and undetermined parameters as text."""
     p = forecast.prediction
     if p is None:
         return f"standard errors cannot be predicted: {forecast.why}"
@@ -157,7 +157,7 @@ def prediction_text(forecast: CheckedForecast) -> str:
 
 @dataclass(frozen=True)
 class DesignedProtocol:
-    """A designed protocol: its file's text, what was found, and both predictions of it."""
+    """A designed protocol: its file's text, the design, and the predictions before and after."""
 
     text: str
     plan: Plan
@@ -169,7 +169,7 @@ class DesignedProtocol:
 def _checker(
     plan: Plan, parameters: TwinParameters
 ) -> Callable[[TwinStep, Mapping[int, Tone]], bool]:
-    """Return the test that `check` will make of a step in the end, centring from nothing."""
+    """Return the test of a step that `check` makes, with centring from zero bias."""
 
     def passes(planned: TwinStep, tones: Mapping[int, Tone]) -> bool:
         alone = {"steps": (designed_step(plan, planned, tones),)}
@@ -185,9 +185,9 @@ def _checker(
 def design_protocol(
     protocol: str, rig: str, criterion: str, budget: int, seed: int, parameters: TwinParameters
 ) -> DesignedProtocol:
-    """Improve a protocol's multisines; raises InputError where that cannot be done.
+    """Improve a protocol's multisines; raises InputError if that is impossible.
 
-    Limits and errors are predicted on the twin that `parameters` hold.
+    Limits and errors are predicted on the twin of `parameters`.
     """
     bench = parameters.rig
     plan = resolve(library.load(protocol), bench)
@@ -211,9 +211,9 @@ def design_protocol(
 
 
 def design_text(designed: DesignedProtocol, out: Path) -> str:
-    """Return the parameters before and after, and the limits that each step fills."""
+    """Return the predicted errors before and after, and each step's share of its limits."""
     before, after = designed.before.prediction, designed.after.prediction
-    assert before is not None  # the design itself needed it
+    assert before is not None  # the design needed the prediction, so it exists
     assert after is not None
     rows = []
     for name, e in before.parameters.items():

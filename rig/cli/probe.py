@@ -1,4 +1,4 @@
-"""The `probe` verb: one block of every channel, and nothing moved."""
+"""The `probe` verb: one block of every channel, without moving anything."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = None) -> None:
-    """Read one block of every channel and move nothing; exit 1 where a channel is not plausible.
+    """Read one block of every channel without moving anything; exit 1 on implausible values.
 
-    Where the host takes the samples, their lateness is measured as well.
+    If the host times the samples, their lateness is measured as well.
 
     Example: bramah probe --rig shinshu-2dof
     """
@@ -57,7 +57,7 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
     print_pressure(bench.pressurised(readings), aside=json == Path("-"))
     odd = [reading.channel for reading in readings if reading.mark != bench.GOOD]
     if odd:
-        raise WorkError(f"not plausible: {', '.join(odd)}; look at the last column")
+        raise WorkError(f"not plausible: {', '.join(odd)}; the last column says why")
 
 
 def _row(reading: Reading) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
-"""Proofs of plans on the twin, kept so that what did not change is not proved again.
+"""Proofs of plans on the twin, cached so that an unchanged plan is not simulated again.
 
-A proof is known by the hash of everything that it depends on: the resolved protocol, the rig, the
-model whose parameters the twin has, the source of the twin and of the check, and the versions of
-the libraries that compute them. It is kept in the user's cache folder and with each run.
+The key of a proof is the hash of everything that it depends on: the resolved protocol, the rig, the
+model with the twin's parameters, the source code of the twin and of the check, and the versions of
+their libraries. A proof is kept in the user's cache folder and with each run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from rig.runs.files import cache_folder
 
 Progress = Callable[[float], None]
 NAME = "proof.json"
-KEPT = 200  # proofs in the cache; the oldest go
+KEPT = 200  # largest number of proofs in the cache; the oldest are removed
 _ROOT = Path(__file__).parents[2]
 _SOURCES = (
     "analysis/signals", "analysis/simulation", "analysis/terms", "analysis/regression",
@@ -48,9 +48,9 @@ _LIBRARIES = ("numpy", "scipy", "numba")
 
 @dataclass(frozen=True)
 class PlanProof:
-    """What the twin said of a plan; `prediction` and its `text` are those of the analysis.
+    """Result of a plan's check on the twin; `prediction` and its `text` are from the analysis.
 
-    `source` is where the twin's parameters were to come from, `warning` why they did not.
+    `source`: intended source of the twin's parameters. `warning`: why it was not used.
     """
 
     key: str
@@ -74,13 +74,13 @@ class PlanProof:
 
     @property
     def twin_text(self) -> str:
-        """Say whose parameters the twin had, or why not the last identified ones."""
+        """Return the source of the twin's parameters, or why it uses nominal values instead."""
         if self.warning:
             return f"WARNING: {self.warning}"
         drawn = (
             "" if self.source.path is None else "; limits hold at the edge of its 95 % intervals"
         )
-        return f"the twin has {source_text(self.source)}{drawn}"
+        return f"the twin uses {source_text(self.source)}{drawn}"
 
     def keep(self, folder: Path) -> None:
         """Write the proof into a run's folder."""
@@ -95,11 +95,11 @@ def proved(
     progress: Progress | None = None,
     source: TwinSource | None = None,
 ) -> PlanProof:
-    """Return the proof of a plan, from the cache where nothing changed.
+    """Return the proof of a plan, from the cache if nothing changed.
 
-    With `predict` also the standard errors to expect; `progress` receives the share done. `source`
-    is where the twin's parameters come from (default: the last identified model of the rig). Raises
-    InputError where the twin cannot follow; whether limits are kept is in the report.
+    `predict` adds the predicted standard errors; `progress` receives the share done; `source` is
+    the source of the twin's parameters (default: the last identified model of the rig). Raises
+    InputError if the twin cannot follow the plan. The report says whether limits are kept.
     """
     source = twin_source(rig) if source is None else source
     key = proof_key(plan, rig, source)
@@ -154,7 +154,7 @@ def proof_key(plan: Plan, rig: Rig, source: TwinSource) -> str:
     parts = (
         plan.protocol.model_dump_json(),
         rig.model_dump_json(exclude={"wire"}),
-        f"{rig.wire.kind} {rig.wire.jitter}",  # whether the host keeps the time, and how well
+        f"{rig.wire.kind} {rig.wire.jitter}",  # whether the host times the samples, and its jitter
         source.key,
         _source_digest(),
     )
@@ -188,7 +188,7 @@ def _from_cache(key: str) -> PlanProof | None:
 
 def _to_cache(proof: PlanProof) -> None:
     folder = cache_folder() / "proofs"
-    with suppress(OSError):  # a cache that cannot be written costs time, nothing else
+    with suppress(OSError):  # without the cache the plan is proved again next time
         write_json(folder / f"{proof.key}.json", proof.as_dict())
         kept = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
         for old in kept[:-KEPT]:

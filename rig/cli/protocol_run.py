@@ -1,4 +1,4 @@
-"""The `run` and `check` verbs' work: protocol, twin check, bench, run folder."""
+"""The work of the verbs `run` and `reset`: protocol, check on the twin, bench, run folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class ProtocolJob:
-    """One unattended run: what, where, into which folder.
+    """One unattended run: protocol, bench and run folder.
 
     It is proved on the twin with the parameters of `model`, of the last identified one, or nominal.
     """
@@ -64,7 +64,7 @@ def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
 
 
 class _PhaseReport:
-    """Reports the phases of a run to the person, the run's log and any screen."""
+    """Reports the phases of a run to the terminal, the run's log and attached screens."""
 
     def __init__(self, bench: Bench, say: Say) -> None:
         self._bench, self._say = bench, say
@@ -74,7 +74,7 @@ class _PhaseReport:
         recorder = self._bench.recorder
         at = 0.0 if recorder is None else recorder.elapsed
         left = self._bench.expected - at
-        # The time was estimated: what has ended early has none left.
+        # The estimate counts the whole phase, which may have ended early.
         more = f"  ({clock_text(left)} left)" if left > 0.0 and phase != "done" else ""
         self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{more}")
         self._message = message
@@ -88,14 +88,14 @@ class _PhaseReport:
         )
 
     def tracked(self, estimate: str, tracking: Tracking) -> None:
-        """Show an estimate beside what the run does, all with their intervals, and residuals."""
+        """Publish an estimate, all estimates with their intervals, and the residuals."""
         tracked_values = tracking.parameters.items()
         known = {name: [interval["value"], *interval["ci95"]] for name, interval in tracked_values}
         message = f"{self._message}; {estimate}"
         self._bench.status(message=message, estimates=known, residuals=tracking.residuals)
 
     def note(self, entry: dict[str, Any]) -> None:
-        """Keep the estimates at a record's end in the run's log."""
+        """Write the estimates at a record's end to the run's log."""
         self._bench.event("tracked", self._bench.tick, **entry)
 
 
@@ -119,7 +119,7 @@ def _tracking(
 
 
 def run_protocol(job: ProtocolJob, say: Say) -> Path:
-    """Run a protocol into its folder and return that; raises what ended it, outputs at zero."""
+    """Run a protocol and return its run folder; raises the error that ended it, outputs at zero."""
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
     rig = reached_at(rig, job.endpoint)
     refuse_occupied(job.out)
@@ -152,7 +152,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         bench.describe([PlanLine(part.name, part.title, part.seconds) for part in plan.sequence])
         desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
-            followed = tracking  # for the closure: it is not None
+            followed = tracking  # for mypy: not None in the closure
             tracking.subscribe(report.note, lambda text: report.tracked(text, followed))
             bench.observers.add(tracking)
             desk = replace(desk, estimates=TrackedEstimates(tracking))
@@ -161,6 +161,6 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
 
 
 def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
-    """Clear a bench's latched trip on a person's word; returns what had tripped it."""
+    """Clear a bench's latched trip for a person's `reason`; return the cause of the trip."""
     described, driver = device_of(rig, endpoint)
     return reset_bench(described, driver, reason)

@@ -1,4 +1,4 @@
-"""What it takes to take a run again: command, files with checksums, overrides, seeds."""
+"""Provenance for repeating a run: command, files with checksums, overrides, seeds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _protocol_text(name: str) -> tuple[str, str]:
 
 
 def _seeds(plan: Plan) -> dict[str, int]:
-    """Return the seeds of the signals as they were played, by step and joint."""
+    """Return the seeds of the played signals by step and joint."""
     return {
         f"{step.name} joint {excited.joint}": int(seed)
         for step in plan.protocol.excitations

@@ -1,4 +1,4 @@
-"""The `queue` verbs: a night's work on disk, and the process that runs it."""
+"""The `queue` verbs: a queue of runs on disk, and the process that runs them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QueueOption = Annotated[
     Path | None,
     typer.Option("--queue", help="The queue's file.  [default: queue.sqlite in BRAMAH_STATE]"),
 ]
-WAIT_HOURS = 12  # for a condition of the bench, where no --not-after says how long
+WAIT_HOURS = 12  # longest wait [h] for --when without --not-after
 ItemArgument = Annotated[int, typer.Argument(help="The item's number.")]
 
 
@@ -65,7 +65,7 @@ def _show(item: Item, json: Path | None, said: str) -> None:
 
 
 def _absolute(name: str, shipped: tuple[str, ...]) -> str:
-    """Return a shipped name as it is and a file's path from the root: a runner starts elsewhere."""
+    """Return a shipped name, or a file's absolute path: the runner starts in another folder."""
     return name if name in shipped else str(Path(name).expanduser().absolute())
 
 
@@ -76,7 +76,7 @@ def _arguments(*options: tuple[str, object]) -> tuple[str, ...]:
 
 
 def queue_group() -> None:
-    """Keep a night's work on disk and run it, one item at a time.
+    """Keep a queue of runs on disk and run it, one item at a time.
 
     Example: bramah queue list
     """
@@ -95,37 +95,42 @@ def add(
     amplitude_scale: ScaleOption = 1.0,
     wave_seed: WaveSeedOption = None,
     step: StepOption = None,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher starts first.")] = 0,
+    priority: Annotated[
+        int, typer.Option(min=-100, max=100, help="Items of higher priority start first.")
+    ] = 0,
     not_before: Annotated[
-        str | None, typer.Option(help="22:30 (the next one) or 2026-03-01T22:30.")
+        str | None, typer.Option(help="Earliest start: 22:30 (the next one) or 2026-03-01T22:30.")
     ] = None,
     not_after: Annotated[
         str | None,
         typer.Option(
-            help=f"Not started later: it expires.  [default: with --when, {WAIT_HOURS} h later]"
+            help=f"Latest start; then it expires.  [default: with --when, {WAIT_HOURS} h later]"
         ),
     ] = None,
-    after: Annotated[int | None, typer.Option(help="Only once this earlier item is over.")] = None,
+    after: Annotated[
+        int | None, typer.Option(help="Start only after this earlier item has ended.")
+    ] = None,
     wanted: Annotated[
         str | None,
         typer.Option(
             "--if",
-            help="Of --after: its state (done, failed, ..., ended: whichever) or what was "
-            "identified from it, as 'b.rsd < 0.5 %'.  [default: done]",
+            help="Condition on the item of --after: a state (done, failed, ..., ended: any) or an "
+            "identified value, such as 'b.rsd < 0.5 %'.  [default: done]",
         ),
     ] = None,
     when: Annotated[
-        str | None, typer.Option(help="Wait until the bench reads 'oil_temperature > 40 degC'.")
+        str | None,
+        typer.Option(help="Wait for a measured condition, such as 'oil_temperature > 40 degC'."),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="As lists show it.")] = None,
-    operator: Annotated[str | None, typer.Option(help="Written into the run.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the item in lists.")] = None,
+    operator: Annotated[str | None, typer.Option(help="Name written into the run.")] = None,
     model: ModelOption = None,
     nominal: NominalOption = False,
     identify: Annotated[bool, typer.Option(help="Identify from the run when it is done.")] = True,
     queue: QueueOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Prove an item on the twin and append it; after `--` stand further options of `bramah check`.
+    """Prove an item on the twin and queue it; further options of `bramah check` follow after `--`.
 
     Example: bramah queue add lock-and-excite --rig shinshu-2dof --repeats 2 --not-before 22:00
     """
@@ -145,7 +150,9 @@ def add(
     )  # fmt: skip
     changed += ("--nominal",) if nominal else ()
     if wanted is not None and after is None:
-        raise InputError("--if says what is wanted of an earlier item: name it with --after NUMBER")
+        raise InputError(
+            "--if is a condition on an earlier item: expected --after NUMBER beside it"
+        )
     if when is not None:
         channel_condition(when)
     times = {
@@ -154,7 +161,7 @@ def add(
         else parse_time(text, now, f"--{option.replace('_', '-')}").isoformat()
         for option, text in (("not_before", not_before), ("not_after", not_after))
     }
-    if when is not None and not_after is None:  # a condition that never comes ends too
+    if when is not None and not_after is None:  # an item whose condition is never met expires
         begin = datetime.fromisoformat(times["not_before"]) if not_before else now
         times["not_after"] = (begin + timedelta(hours=WAIT_HOURS)).isoformat()
     with _opened(queue, create=True) as store:
@@ -256,9 +263,9 @@ def list_items(
         )
     pending = [item for item in items if not item.over]
     minutes = sum(item.proof.get("seconds") or 0.0 for item in pending) / 60.0
-    runner = f"run by process {pid}" if pid else "nobody runs the queue"
+    runner = f"run by process {pid}" if pid else "no process runs the queue"
     typer.echo(
-        f"{len(pending)} of {len(items)} items are not over, about {minutes:.0f} min of the "
+        f"{len(pending)} of {len(items)} items have not ended, about {minutes:.0f} min of the "
         f"device's time; {paused or runner}"
     )
 
@@ -303,11 +310,13 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
 
 def run(
     serve: Annotated[
-        bool, typer.Option("--serve", help="Stay and wait for further items, as a service does.")
+        bool, typer.Option("--serve", help="Keep waiting for further items, as a service.")
     ] = False,
     notify: Annotated[
         str | None,
-        typer.Option(help="A command that gets JSON on its standard input: trip, failure, end."),
+        typer.Option(
+            help="Command that receives JSON on standard input at a trip, a failure and the end."
+        ),
     ] = None,
     page: Annotated[
         Path | None,
@@ -318,9 +327,9 @@ def run(
     queue: QueueOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Run the queue, one item at a time; Ctrl-C ends the item that runs, outputs zeroed first.
+    """Run the queue, one item at a time; Ctrl-C zeroes the outputs, then ends the current item.
 
-    Exits 0 when all items it ran are done, 1 when one is not, 3 on a trip, 4 on a lost device.
+    Exits 0 when all items are done, 1 when one has failed, 3 on a trip, 4 on a lost device.
 
     Example: bramah queue run --notify 'mail -s bench me@example.org'
     """
@@ -332,7 +341,7 @@ def run(
     with _opened(queue, create=serve) as store:
         if store.paused and not serve:
             raise InputError(
-                f"the queue is {store.paused}; lift it with `bramah queue pause --off`"
+                f"the queue is {store.paused}; continue it with `bramah queue pause --off`"
             )
         hook = Hook(command, folder_of(store.path) / "hook.log")
         began = datetime.now(UTC)
@@ -368,7 +377,7 @@ def write_night_page(
     ] = None,
     queue: QueueOption = None,
 ) -> None:
-    """Write the page of the night: what ran, what was found, what tripped, what drifted.
+    """Write a report of the queue: items run, parameters identified, trips, drift of parameters.
 
     Example: bramah queue page --out night.html --since 12h
     """
@@ -382,11 +391,11 @@ def write_night_page(
 
 
 def pause(
-    off: Annotated[bool, typer.Option("--off", help="Lift the pause.")] = False,
+    off: Annotated[bool, typer.Option("--off", help="Continue the queue.")] = False,
     queue: QueueOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Let nothing more start: the present item runs to its end; with --off go on.
+    """Start no further item; the current one runs to its end. --off continues the queue.
 
     Example: bramah queue pause
     """
@@ -399,11 +408,11 @@ def pause(
     write_json(json, {"paused": not off, "active": active})
     if json != Path("-"):
         still = f"; item {active[0]} runs to its end" if active and not off else ""
-        typer.echo("the pause is lifted" if off else f"paused{still}")
+        typer.echo("the queue continues" if off else f"paused{still}")
 
 
 def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
-    """Cancel an item; one that runs is ended safely, its outputs zeroed first.
+    """Cancel an item; a running one is ended safely, its outputs zeroed first.
 
     Example: bramah queue cancel 3
     """
@@ -419,10 +428,10 @@ def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = Non
 
 def move(
     item: ItemArgument,
-    before: Annotated[int | None, typer.Option(help="Before this item.")] = None,
-    last: Annotated[bool, typer.Option("--last", help="Behind those of its priority.")] = False,
+    before: Annotated[int | None, typer.Option(help="Place it before this item.")] = None,
+    last: Annotated[bool, typer.Option("--last", help="Place it last of its priority.")] = False,
     priority: Annotated[
-        int | None, typer.Option(min=-100, max=100, help="To this priority.")
+        int | None, typer.Option(min=-100, max=100, help="Change its priority to this.")
     ] = None,
     queue: QueueOption = None,
     json: JsonOption = None,
@@ -434,14 +443,16 @@ def move(
     from rig.model.parse import InputError
 
     if before is not None and (last or priority is not None):
-        raise InputError("--before stands alone: the item takes the other's priority")
+        raise InputError(
+            "--before sets the priority too: expected no --last or --priority beside it"
+        )
     with _opened(queue) as store:
         moved = store.move(item, before=before, last=last, priority=priority)
     _show(moved, json, f"priority {moved.priority}, place {moved.place:g}")
 
 
 def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
-    """Queue an item again that is over; it keeps its place and runs into a new folder.
+    """Queue an ended item again; it keeps its place and runs into a new folder.
 
     Example: bramah queue retry 3
     """

@@ -1,4 +1,4 @@
-"""The proof of an item on the twin, as a process of its own, when it is queued."""
+"""Proof of a queued item on the twin, in a separate process."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _KEPT = (
     "twin",
     "model",
     "warning",
-)  # of the proof; its pictures belong to `check`
+)  # keys of the proof that the queue keeps; the pictures are omitted
 
 
 def prove(job: QueueJob) -> dict[str, Any]:
-    """Run `bramah check` on an item; raises InputError where it is refused, WorkError otherwise."""
+    """Run `bramah check` on an item; raises InputError if refused, WorkError if check fails."""
     answer = call(BRAMAH, job.check_words(), QueueSettings().check_seconds)
     if answer.code == BAD_INPUT:
         raise InputError(f"not queued: {answer.reason}")

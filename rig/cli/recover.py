@@ -13,10 +13,13 @@ from rig.cli.errors import WorkError
 def recover(
     run: Annotated[Path, typer.Argument(help="The run folder of an interrupted run.")],
     force: Annotated[
-        bool, typer.Option("--force", help="Also a run of another computer that looks alive.")
+        bool,
+        typer.Option(
+            "--force", help="Also finalise a run that another computer may still be writing."
+        ),
     ] = False,
 ) -> None:
-    """Finalise an interrupted run from its journal; what was recorded becomes readable.
+    """Finalise an interrupted run from its journal, so that its records can be read.
 
     Example: bramah recover runs/monday
     """
@@ -26,5 +29,5 @@ def recover(
     typer.echo(report.message)
     if report.damaged is not None:
         raise WorkError(
-            f"{run}: {report.missing} samples are known to be lost; {report.damaged.name} is kept"
+            f"{run}: {report.missing} samples are lost; the damaged {report.damaged.name} is kept"
         )

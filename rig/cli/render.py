@@ -23,7 +23,7 @@ def _shown(estimate: Estimate) -> tuple[float, str]:
 
 
 def _share(percent: float) -> str:
-    text = column_percent(percent).replace(MINUS, "-")  # as everywhere in a terminal
+    text = column_percent(percent).replace(MINUS, "-")  # three digits, as in all tables
     return f"{text} %" if math.isfinite(percent) else "—"
 
 
@@ -60,7 +60,7 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     lines = [parameter_table(result.estimates, truth), ""]
     for family, solution in result.solutions.items():
         if not result.rows[family]:
-            continue  # a search has no rows
+            continue  # a search solves no regression
         lines.append(
             f"{family}: {result.rows[family]} rows, condition number "
             f"{solution.condition_number:.1f}"
@@ -77,13 +77,13 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
 
 
 def shapes_text(shapes: Mapping[str, tuple[float, Shape]]) -> str:
-    """Return the effects' shapes as a line each, '' where the model has none."""
+    """Return the effects' shape parameters, one per line; '' if there are none."""
     lines = [f"shape: {name} = {value:.4g} {s.unit}" for name, (value, s) in shapes.items()]
     return "".join(f"\n{line}" for line in lines)
 
 
 def validation_text(results: Sequence[RecordValidation]) -> str:
-    """Return FIT of the free run and RMSE of restarted windows, a row per record and channel."""
+    """Return FIT of the free run and RMSE of restarted windows, one row per record and channel."""
     rows = []
     for result in results:
         for name, fit in result.fit.items():
@@ -109,7 +109,7 @@ def validation_text(results: Sequence[RecordValidation]) -> str:
 
 
 def method_text(result: Identification) -> str:
-    """Return the method's own figures as tables, '' where it has none."""
+    """Return the figures specific to the method as tables, '' if there are none."""
     parts = []
     if "sequential" in result.extra:
         parts.append(_sequential(result.extra["sequential"]))
@@ -123,7 +123,7 @@ def _number(entry: Mapping[str, Any] | None) -> str:
 
 
 def _sequential(data: Mapping[str, Any]) -> str:
-    """Return every step's own value of every parameter beside E1 and E2, in SI."""
+    """Return each parameter's estimate from every single step and from E1 and E2, in SI."""
     steps = data["steps"]
     rows = []
     for name, estimates in data["per_step"].items():
@@ -143,7 +143,7 @@ def _sequential(data: Mapping[str, Any]) -> str:
 
 
 def _search(data: Mapping[str, Any]) -> str:
-    """Return what became of the candidates."""
+    """Return the search's counts of candidates and its errors."""
     rows = [
         ["candidates", str(data["evaluations"])],
         *([f"lost: {fate}", str(count)] for fate, count in data["lost"].items()),

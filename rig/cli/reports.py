@@ -1,4 +1,4 @@
-"""Reports with what only the command line knows: the date, the command, the versions."""
+"""Reports with date, command and software versions."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from rig.runs.versions import versions
 def provenance(
     command: str | None = None, seeds: Mapping[str, str | int] | None = None
 ) -> Provenance:
-    """Return date, command (default: this process's own), software versions and seeds."""
+    """Return date, command (default: of this process), software versions and seeds."""
     line = shlex.join(["bramah", *sys.argv[1:]]) if command is None else command
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
     return Provenance(date=date, commands=(line,), versions=versions(), seeds=dict(seeds or {}))
 
 
 def write_identification(path: Path, runs: Sequence[Run], result: Identification) -> None:
-    """Write the report of an identification alone."""
+    """Write the report of an identification."""
     text = render_report(
         runs=runs,
         identification=result,
@@ -40,12 +40,12 @@ def write_identification(path: Path, runs: Sequence[Run], result: Identification
 
 
 def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:
-    """Write the trace's report."""
+    """Write the report of a trace."""
     write_trace_report(path, holdout, result, provenance())
 
 
 def write_loop(
     path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str
 ) -> None:
-    """Write the report of a whole loop."""
+    """Write the report of a loop."""
     write_loop_report(path, train, holdout, rounds, stopped, provenance())

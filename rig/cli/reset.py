@@ -1,4 +1,4 @@
-"""The `reset` verb: a latched trip cleared by a person, with a reason."""
+"""The `reset` verb: a person clears a latched trip and gives a reason."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def reset(
     rig: RigOption,
     endpoint: EndpointOption = None,
     reason: Annotated[
-        str, typer.Option(help="What was found and done; kept with the trip.  [required]")
+        str, typer.Option(help="Cause found and action taken; stored with the trip.  [required]")
     ] = "",
 ) -> None:
-    """Clear a latched trip, in the device and on this computer, after a look at the bench.
+    """Clear a latched trip in the device and on this computer, after inspecting the bench.
 
     Example: bramah reset --rig shinshu-2dof --reason "pressure sensor 2 replaced"
     """

@@ -44,22 +44,22 @@ def run(
     step: StepOption = None,
     set_: SetOption = None,
     operator: Annotated[
-        str | None, typer.Option(help="Written into the run.  [default: you]")
+        str | None, typer.Option(help="Name written into the run.  [default: the user]")
     ] = None,
     model: ModelOption = None,
     nominal: NominalOption = False,
     track: Annotated[
-        bool, typer.Option("--track", help="Follow b and the flow gains while it runs.")
+        bool, typer.Option("--track", help="Estimate b and the flow gains during the run.")
     ] = False,
     memory: Annotated[
         float,
-        typer.Option(help="Of --track: forget with this time constant [s].", callback=_above_zero),
+        typer.Option(help="Forgetting time constant of --track [s].", callback=_above_zero),
     ] = float("inf"),
     attended: Annotated[
         bool | None,
         typer.Option(
             "--attended/--unattended",
-            help="Whether a person answers prompts here.  [default: at a terminal]",
+            help="Whether a person answers prompts.  [default: yes at a terminal]",
         ),
     ] = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The `runs` verb: run folders with their state, what they hold, and filters."""
+"""The `runs` verb: a filtered list of run folders with state and contents."""
 
 from __future__ import annotations
 
@@ -24,21 +24,24 @@ Names = list[str] | None
 def runs(
     folder: Annotated[Path, typer.Argument(help="A folder that holds run folders.")] = Path(),
     state: Annotated[
-        Names, typer.Option("--state", help="running, done, aborted, tripped, interrupted.")
+        Names, typer.Option("--state", help="State: running, done, aborted, tripped, interrupted.")
     ] = None,
     since: Annotated[
         str | None, typer.Option(help="Begun since 2026-03-01, 2026-03-01T22:00, or 12h, 7d ago.")
     ] = None,
-    rig: Annotated[Names, typer.Option("--rig", help="Only of this rig; * stands for any.")] = None,
+    rig: Annotated[
+        Names, typer.Option("--rig", help="Only runs of this rig; * matches any characters.")
+    ] = None,
     protocol: Annotated[
-        Names, typer.Option("--protocol", help="Only of this protocol; * stands for any.")
+        Names,
+        typer.Option("--protocol", help="Only runs of this protocol; * matches any characters."),
     ] = None,
     rebuild: Annotated[
-        bool, typer.Option("--rebuild", help="Make the folder's index from the run folders anew.")
+        bool, typer.Option("--rebuild", help="Rebuild the folder's index from the run folders.")
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """List runs with their state and what they hold; options that repeat name alternatives.
+    """List runs with their state and contents; values of a repeated option are alternatives.
 
     Example: bramah runs runs/ --state interrupted --since 12h
     """

@@ -13,10 +13,10 @@ from rig.cli.options import writable_file
 def schema(
     out: Annotated[
         Path | None,
-        typer.Option(help="Write it here.  [default: stdout]", callback=writable_file),
+        typer.Option(help="Write the schema here.  [default: stdout]", callback=writable_file),
     ] = None,
 ) -> None:
-    """Print the JSON schema of protocol files, with which editors complete and check them.
+    """Print the JSON schema of protocol files, for completion and checks in editors.
 
     Example: bramah schema --out protocol.schema.json
     """

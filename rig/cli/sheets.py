@@ -1,4 +1,4 @@
-"""A check of a protocol as a test sheet, and a proof as a table of its steps."""
+"""Text of a protocol's check, as a test sheet, and of a proof, as a table of steps."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from protocols.files.plan import Plan
 from rig.cli.output import clock_text, table
 from rig.model.units import LIMITS, display_unit
 
-_BAR = 40  # characters of the timeline
-_PICTURE = 30  # characters between the two limits
+_BAR = 40  # width of the timeline [characters]
+_PICTURE = 30  # width between the two limits [characters]
 
 
 def _cells(step: str, line: MotionPrediction) -> list[str]:
@@ -34,7 +34,7 @@ def _cells(step: str, line: MotionPrediction) -> list[str]:
 
 
 def check_text(report: CheckReport) -> str:
-    """Return one row per prediction of the twin, and how long the run will take."""
+    """Return one row per prediction of the twin, and the duration of the run."""
     rows = [_cells(step.step, line) for step in report.steps for line in step.predictions]
     header = ["step, place, quantity", "predicted", "allowed", "margin", "unit", ""]
     minutes = report.seconds / 60.0
@@ -46,7 +46,7 @@ def check_text(report: CheckReport) -> str:
 
 
 def plan_text(plan: Plan) -> str:
-    """Return the steps of a plan in order, with their times, before anything runs."""
+    """Return the steps of a plan in order, with their durations."""
     lines = [f"plan of {plan.protocol.name} on {plan.rig}:"]
     for number, part in enumerate(plan.sequence, start=1):
         lines.append(f"  {number:3d}. {part.name}: {part.title} (about {part.seconds:.0f} s)")
@@ -57,7 +57,7 @@ def plan_text(plan: Plan) -> str:
 
 
 def timeline_text(moments: Sequence[Moment]) -> str:
-    """Return the run's course: when each step begins, how long it takes, a bar of its place."""
+    """Return begin and duration of each step, with a bar on a time axis."""
     end = max((m.begins + m.seconds for m in moments), default=0.0) or 1.0
     rows = []
     for moment in moments:
@@ -71,9 +71,9 @@ def timeline_text(moments: Sequence[Moment]) -> str:
 
 
 def envelope_text(report: CheckReport) -> str:
-    """Return each predicted range as a picture within its limits, and its margin in words.
+    """Return each predicted range as a bar within its limits, and its margin in words.
 
-    What the uncertainty of the twin's parameters adds to a range is drawn lighter.
+    The part of a range due to the uncertainty of the twin's parameters is drawn lighter.
     """
     drawn = any(any(line.spread) for step in report.steps for line in step.predictions)
     of = f", on {report.twin}; within its intervals ---" if drawn else ""
@@ -88,7 +88,7 @@ def envelope_text(report: CheckReport) -> str:
 
 
 def margin_text(line: MotionPrediction) -> str:
-    """Say how far a prediction stays from its nearer limit, and on which side."""
+    """Return the distance of a prediction from its nearer limit, and the side."""
     shown = display_unit(line.unit, LIMITS)
     scale, unit = shown.scale, shown.text
     below, above = line.low - line.allowed_low, line.allowed_high - line.high
@@ -105,7 +105,7 @@ def margin_text(line: MotionPrediction) -> str:
 
 
 def _picture(line: MotionPrediction) -> str:
-    """Return the predicted range between the limits; `<` and `>` where it leaves them."""
+    """Return the bar of a predicted range between the limits; `<` and `>` mark violations."""
     span = line.allowed_high - line.allowed_low
     below, above = line.spread
     edges = (line.low, line.low + below, line.high - above, line.high)
@@ -123,7 +123,7 @@ def _place(line: MotionPrediction) -> str:
 
 
 def proof_text(proof: Proof) -> str:
-    """Return one row per step (what it does, rank and condition so far, why), then the verdict."""
+    """Return one row per step (actions, rank and condition so far, reason), then the verdict."""
     families = list(proof.verdicts)
     rows = [
         [f"{r.step}: {r.description}", *(_so_far(r.verdicts, family) for family in families), r.why]

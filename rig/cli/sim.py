@@ -1,4 +1,4 @@
-"""The `sim` verb: the simulated bench as a process of its own."""
+"""The `sim` verb: the simulated bench as a separate process."""
 
 from __future__ import annotations
 
@@ -25,34 +25,37 @@ def sim(
     ] = "modbus-tcp",
     scenario: Annotated[
         str | None,
-        typer.Option(help="A file of hidden effects, worn-seal, or random: drawn by the seed."),
+        typer.Option(help="Hidden effects: a file, worn-seal, or random (drawn by the seed)."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of noise, temperature, and what is drawn.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of noise, temperature and random scenarios.", min=0)
+    ] = 0,
     wire_faults: Annotated[
         str | None,
-        typer.Option(help="Faults of the wire: a file, or a name such as frame_lost (1 % of all)."),
+        typer.Option(
+            help="Faults of the wire: a file, or a name such as frame_lost (1 % of all frames)."
+        ),
     ] = None,
     port: Annotated[
-        int | None, typer.Option(help="0 takes a free one.  [default: the rig's]", min=0, max=65535)
+        int | None,
+        typer.Option(help="TCP port; 0 takes a free one.  [default: the rig's]", min=0, max=65535),
     ] = None,
-    real_time: Annotated[
-        bool, typer.Option("--real-time", help="Keep pace with the clock on the wall.")
-    ] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time.")] = False,
     truth: Annotated[
         Path | None,
         typer.Option(
-            help="Write true parameters and what is hidden to this JSON file.",
+            help="Write true parameters and hidden effects to this JSON file.",
             callback=writable_file,
         ),
     ] = None,
     parent: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
-    """Run the simulated bench as a process of its own; its endpoint is the first line printed.
+    """Run the simulated bench as a process; it prints its endpoint on the first line.
 
     Example: bramah sim --rig shinshu-2dof --wire modbus-tcp --seed 1
     """
-    # pymodbus's server would load aiohttp, where it is installed, for a web page of its own; none
-    # is served here, and without it the bench starts a quarter sooner.
+    # pymodbus's server loads aiohttp, if installed, for a web page that is not used here; without
+    # it the bench starts in three quarters of the time.
     if "aiohttp" not in sys.modules:
         sys.modules["aiohttp"] = None  # type: ignore[assignment]
     from rig.cli.simulator import BenchRequest, serve_bench

@@ -1,4 +1,4 @@
-"""The `simulate` verb: the run that a model would have given."""
+"""The `simulate` verb: a run simulated by a model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 ModelOption = Annotated[
     Path | None,
-    typer.Option(help="A model file: what it simulates stands beside the measured channels."),
+    typer.Option(help="A model file: adds its simulated channels beside the measured ones."),
 ]
 
 
@@ -28,7 +28,7 @@ def simulate(
     run: RunArgument,
     out: Annotated[Path, typer.Option(help="The run folder to make.")],
 ) -> None:
-    """Write the run that the model would have given: the measured spool drives it.
+    """Simulate a run with a model driven by the measured spool signals.
 
     Pistons and chamber pressures of the excited joints are simulated from the record's first
     state; the other channels are the measured ones.
@@ -47,9 +47,9 @@ def simulate(
 
 
 def channel_simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], Mapping[str, Any]]:
-    """Return what simulates a record's excited joints: channels (n,) by name.
+    """Return a function that simulates a record's excited joints: channels (n,) by name.
 
-    Raises InputError for a model of another rig, WorkError where a simulation fails.
+    Raises InputError for a model of another rig, WorkError if a simulation fails.
     """
     from analysis.simulation.model import load_model, refuse_other_rig
     from analysis.simulation.validate import validate_record

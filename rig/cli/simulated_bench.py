@@ -1,4 +1,4 @@
-"""A simulated bench as a child process, for the demo and the figures."""
+"""A simulated bench as a child process."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _END_SECONDS = 10.0
 
 @contextmanager
 def _state_of_its_own() -> Iterator[None]:
-    """Keep what a bench leaves behind (`rig.bench.latch`) in a folder that goes with it.
+    """Keep a bench's stored state (`rig.bench.latch`) in a temporary folder.
 
-    A simulated bench on a free port is a new one: no trip of another that had this port is its.
+    A trip latched by an earlier simulated bench on the same port must not block a new one.
     """
     before = os.environ.get(STATE_VARIABLE)
     with TemporaryDirectory(prefix="bramah-") as folder:
@@ -46,7 +46,7 @@ def simulated_bench(
 ) -> Iterator[str]:
     """Start `bramah sim` on a wire and a free port, yield its endpoint, end it; or raise WorkError.
 
-    The child also ends by itself when this process is gone.
+    The child also ends by itself when this process ends.
     """
     words = ["sim", "--rig", rig, "--port", "0", "--seed", str(seed), "--parent", str(os.getpid())]
     words += ["--wire", wire]
@@ -60,7 +60,7 @@ def simulated_bench(
             stdout=subprocess.PIPE,
             stdin=subprocess.DEVNULL,
             text=True,
-            # A Ctrl-C at the terminal is for us; the bench must live until its outputs are zeroed.
+            # Ctrl-C must not reach the bench, which has to run until its outputs are zeroed.
             start_new_session=True,
         ) as child,
     ):
@@ -69,7 +69,7 @@ def simulated_bench(
             endpoint = child.stdout.readline().strip()
             if not endpoint:
                 child.wait(_END_SECONDS)
-                raise WorkError("the simulated bench did not start; its reason stands above")
+                raise WorkError("the simulated bench did not start; its error message is above")
             yield endpoint
         finally:
             child.terminate()

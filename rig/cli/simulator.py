@@ -1,4 +1,4 @@
-"""The `sim` verb's work: build the plant, warm it up, serve it until told to end."""
+"""The `sim` verb's work: build the plant, compile it, serve it until a signal."""
 
 from __future__ import annotations
 
@@ -28,17 +28,19 @@ from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.rigs import load_bench
 
-USUAL_SHARE: Final = 0.01  # of the frames that a fault given by its name strikes
-VALVES_RATE: Final = 1000.0  # [Hz] of the plant behind valves that the host samples when it likes
+USUAL_SHARE: Final = 0.01  # share of the frames that a fault given by its name affects
+VALVES_RATE: Final = (
+    1000.0  # [Hz], rate of the plant behind valves that the host samples at any time
+)
 
 
 @dataclass(frozen=True)
 class BenchRequest:
-    """What to serve and where.
+    """Plant to simulate, and its wire.
 
-    `scenario` is a file of hidden effects, a shipped one's name, or ``random``: drawn here, by
-    `seed`; `truth` is a file for the plant's true parameters and what it hides. `wire_faults` is a
-    file of faults or the name of a fault of the wire, which then strikes one frame in a hundred.
+    `scenario`: a file of hidden effects, the name of a shipped one, or ``random``, drawn by
+    `seed`. `truth`: a file for the true parameters and hidden effects. `wire_faults`: a file of
+    faults, or the name of a fault of the wire that then affects one frame in a hundred.
     """
 
     rig: str
@@ -53,12 +55,12 @@ class BenchRequest:
 
 
 def _endpoint_first(endpoint: str) -> None:
-    # A script that starts the bench reads this line to know where it is.
+    # A script that starts the bench reads its endpoint from this line.
     print(endpoint, flush=True)
 
 
 def hidden(what: BenchRequest, rig: Rig) -> Scenario:
-    """Return the scenario that a bench hides; raises InputError for a bad file."""
+    """Return the scenario of a bench's hidden effects; raises InputError for a bad file."""
     if what.scenario is None:
         return Scenario()
     if what.scenario == RANDOM:
@@ -69,7 +71,7 @@ def hidden(what: BenchRequest, rig: Rig) -> Scenario:
 
 
 def wire_faults(name: str | None) -> tuple[WireFault, ...]:
-    """Return the faults of the wire that a file holds or a name stands for; raises InputError."""
+    """Return the faults of the wire of a file or a name; raises InputError for others."""
     if name is None:
         return ()
     known = {kind.fault_name(): kind for kind in CLASSES if issubclass(kind, WireFault)}
@@ -95,12 +97,12 @@ def serve_bench(what: BenchRequest) -> None:
         raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
     rig = load_bench(what.rig)
     if what.wire == VALVES:
-        # The rig's rate is the host's; a sensor is converted when SYNC comes, not at its ticks.
+        # The rig's rate is the host's; the valves sample when SYNC arrives, not at fixed ticks.
         rig = rig.model_copy(update={"sample_rate": max(VALVES_RATE, rig.sample_rate)})
     scenario = hidden(what, rig)
     faults = (*scenario.wire_faults, *wire_faults(what.wire_faults))
     plant = FaultyPlant(rig, scenario, what.seed)
-    # Compiled before anybody waits for an answer, on a spare so that this one starts at rest.
+    # Compiles before the first request, on a second plant so that the served one starts at rest.
     warm_up(rig, Plant(rig, scenario, what.seed))
     write_truth(what.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
     place = _place(what, rig)
@@ -139,7 +141,7 @@ def serve_bench(what: BenchRequest) -> None:
 
 
 def _place(what: BenchRequest, rig: Rig) -> dict[str, Any]:
-    """Return where to serve, as keywords of `serve`; raises InputError for a wire it cannot be."""
+    """Return the wire's keywords for `serve`; raises InputError for options it does not have."""
     if what.wire == VALVES:
         return {"port": what.port or 0}
     if what.wire in (CAN, SLCAN):

@@ -1,4 +1,4 @@
-"""The disk that a run will need, estimated before anything moves."""
+"""Disk space of a run, estimated before it starts."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from protocols.files.plan import Plan
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-# A sample is 8 bytes a channel in the journal, and once more in the records that are written from
-# it before it goes; the journal's write-ahead log adds its share.
+# A sample takes 8 bytes per channel in the journal, the same in records.h5, which is written before
+# the journal is removed, and some more in the journal's write-ahead log.
 COPIES = 2.5
-SPARE = 200e6  # [bytes] left to everything else on the disk
+SPARE = 200e6  # [bytes] to leave free on the disk
 
 
 def needed_bytes(plan: Plan, rig: Rig) -> float:
-    """Return the bytes a run may take while it is finished, every condition at its time-out."""
+    """Return the largest size [bytes] of a run, if every condition reaches its time-out."""
     return COPIES * 8.0 * len(rig.recorded) * rig.sample_rate * plan.longest
 
 
 def require_space(plan: Plan, rig: Rig, out: Path) -> None:
-    """Raise InputError where the disk under `out` will not hold the run."""
+    """Raise InputError if the disk of `out` has too little free space for the run."""
     folder = out.absolute()
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -31,5 +31,5 @@ def require_space(plan: Plan, rig: Rig, out: Path) -> None:
         raise InputError(
             f"{out}: the run needs up to {needed / 1e6:.0f} MB ({plan.longest:.0f} s at "
             f"{rig.sample_rate:g} Hz) and {SPARE / 1e6:.0f} MB to spare, "
-            f"the disk has {free / 1e6:.0f} MB; free some, or write elsewhere"
+            f"the disk has {free / 1e6:.0f} MB; free space, or choose a folder on another disk"
         )

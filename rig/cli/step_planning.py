@@ -1,4 +1,4 @@
-"""The `plan` verb's work: candidates on the twin, the proof, protocol files."""
+"""The `plan` verb's work: candidate steps on the twin, proof, protocol files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """What to plan: for which rig, where to write, or which protocol to prove instead."""
+    """Rig to plan for, files to write, or the protocol to prove instead."""
 
     rig: str
     out: Path | None = None
@@ -30,7 +30,7 @@ class PlanRequest:
 
 
 def predictor() -> Predictor:
-    """Return the twin with the analysis' view of its motion."""
+    """Return the predictor of motion and rank: the twin and the analysis."""
     from analysis.regression.identifiability import judge, predicted_rows
     from analysis.simulation.twin import simulate_commands
 
@@ -38,11 +38,11 @@ def predictor() -> Predictor:
 
 
 def plan_steps(request: PlanRequest, say: Say) -> Proof:
-    """Generate or prove; returns the proof. Raises InputError for what does not fit together."""
+    """Generate or prove a protocol; return the proof. Raises InputError for conflicting options."""
     rig, tools = load_bench(request.rig), predictor()
     if request.prove is not None:
         if request.out is not None:
-            raise InputError("--prove generates nothing to write: leave --out away, or --prove")
+            raise InputError("--prove generates no protocol: expected either --prove or --out")
         proof = prove(library.load(request.prove), rig, tools)
     else:
         say(f"trying every lock-and-excite step of {rig.name} on its twin")

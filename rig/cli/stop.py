@@ -1,4 +1,4 @@
-"""The `stop` verb: outputs to zero now."""
+"""The `stop` verb: outputs set to zero at once."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from rig.bench.latch import Holder
     from rig.model.parts import Wire
 
-# A run that was told to stop records its outputs at zero, for 6 s and two answer times at most.
+# A stopped run records its outputs at zero, for at most 6 s and two answer times.
 RECORDS_ZERO: Final = 15.0  # [s]
-# A run of another computer that is about to put out its next law does not see one zero.
+# The next law of another computer's run may overwrite a single zero command.
 ZEROS: Final = 6
 BETWEEN_ZEROS: Final = 0.2  # [s]
 
 
 def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
-    """Put all outputs to zero now, whoever is in control, and end the run that put them out.
+    """Set all outputs to zero now, whoever is in control, and end the run that drives them.
 
     Example: bramah stop --rig shinshu-2dof
     """
@@ -36,7 +36,7 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
 
     described, driver = device_of(rig, endpoint)
     try:
-        driver.zero_outputs()  # before anything else is looked at
+        driver.zero_outputs()  # before anything else
         elsewhere = _holder(described.wire) is None
         for _ in range(ZEROS - 1 if elsewhere else 0):
             time.sleep(BETWEEN_ZEROS)
@@ -44,8 +44,8 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
     except DeviceError as error:
         watchdog = described.wire.watchdog
         raise type(error)(
-            f"{UNSURE}: {error}; use the emergency stop (the device's "
-            f"watchdog zeroes them {watchdog:g} s after its host has fallen silent)"
+            f"{UNSURE}: {error}; use the emergency stop (the device's watchdog "
+            f"zeroes the outputs {watchdog:g} s after the host's last message)"
         ) from error
     finally:
         driver.close()
@@ -58,9 +58,9 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
 
 
 def _end_run(wire: Wire) -> None:
-    """End what drives the bench from this computer: its next law would move the joints again.
+    """End the process of this computer that drives the bench, or its next law moves joints again.
 
-    Raises DeviceBusy where it goes on.
+    Raises DeviceBusy if the process does not end.
     """
     from drivers.base import DeviceBusy
     from rig.bench.outputs import UNSURE
@@ -70,20 +70,20 @@ def _end_run(wire: Wire) -> None:
         return
     run = f", which writes {holder.run}," if holder.run else ""
     progress(f"stopping process {holder.pid}{run} as well")
-    with suppress(ProcessLookupError):  # it ended by itself
+    with suppress(ProcessLookupError):  # the process has ended by itself
         os.kill(holder.pid, signal.SIGTERM)
     deadline = time.monotonic() + RECORDS_ZERO
     while _holder(wire) == holder:
         if time.monotonic() > deadline:
             raise DeviceBusy(
-                f"{UNSURE}: process {holder.pid}{run or ','} was told to stop and goes on; use the "
+                f"{UNSURE}: process {holder.pid}{run or ','} was told to stop but runs on; use the "
                 "emergency stop"
             )
         time.sleep(0.05)
 
 
 def _holder(wire: Wire) -> Holder | None:
-    """Return the other process of this computer that has the bench, None where there is none."""
+    """Return the other process of this computer that holds the bench, None if there is none."""
     from rig.bench.latch import BenchState
 
     holder = BenchState(wire).holder()

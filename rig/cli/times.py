@@ -1,4 +1,4 @@
-"""Times as people write them on the command line."""
+"""Times on the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rig.model.parse import InputError
 
 
 def since(text: str, now: datetime) -> datetime:
-    """Read a date, a time, or a length before `now` (12h, 7d, 30m); raises InputError."""
+    """Read a date, a time, or a duration before `now` (12h, 7d, 30m); raises InputError."""
     units = {"h": "hours", "d": "days", "m": "minutes"}
     if text[:-1].isdigit() and text[-1] in units:
         return now - timedelta(**{units[text[-1]]: int(text[:-1])})
@@ -16,6 +16,6 @@ def since(text: str, now: datetime) -> datetime:
         return datetime.fromisoformat(text).astimezone(UTC)
     except ValueError:
         raise InputError(
-            f"--since {text!r}: expected a date as 2026-03-01, a time as 2026-03-01T22:00, or a "
-            "length as 12h or 7d"
+            f"--since {text!r}: expected a date (2026-03-01), a time (2026-03-01T22:00) or a "
+            "duration (12h or 7d)"
         ) from None

@@ -1,4 +1,4 @@
-"""The `trace` verb: what the model lacks, named or refused, and the error before and after."""
+"""The `trace` verb: effects missing in the model, and the error without and with them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def trace(
     judge: Annotated[
         list[Path] | None,
         typer.Option(
-            "--judge", help="A run folder read once, at the end: it only judges; repeatable."
+            "--judge", help="A run folder used only once, for the final judgement; repeatable."
         ),
     ] = None,
     json: JsonOption = None,
@@ -34,7 +34,7 @@ def trace(
     ] = None,
     like: Annotated[
         Path | None,
-        typer.Option(help="Start from this model file, its effects taken as known."),
+        typer.Option(help="Start from this model file and take its effects as known."),
     ] = None,
     report: Annotated[
         Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
@@ -42,11 +42,11 @@ def trace(
     equations: Annotated[
         str, typer.Option(help="Equations to trace: all, torque or flow.")
     ] = "all",
-    seed: Annotated[int, typer.Option(min=0, help="Of the sign flips.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sign-flip test.")] = 0,
 ) -> None:
-    """Say what the model lacks: effect, place, size, and the held-out error before and after.
+    """Find effects that the model lacks: name, place, size, held-out error before and after.
 
-    The verdict is clean, explained, confounded or unexplained; the last two are answers as well.
+    The verdict is clean, explained, confounded or unexplained; each verdict exits with 0.
 
     Example: bramah trace runs/monday --holdout runs/tuesday --report trace.html
     """
@@ -61,7 +61,7 @@ def trace(
     if not holdout:
         raise InputError(
             "trace needs --holdout RUN: records of another excitation, not used for the fit; an "
-            "effect is named only if it explains those too"
+            "effect is named only if it also explains them"
         )
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")

@@ -15,7 +15,7 @@ from rig.model.units import RESIDUALS, display_unit, plain
 
 
 def trace_text(result: Trace) -> str:
-    """Return verdict, effects with their gates, errors, clues, and the next experiment."""
+    """Return verdict, effects with their tests, errors, clues and the next experiment as text."""
     lines = [f"verdict: {result.verdict}", "", result.sentence, ""]
     for effect in result.effects:
         lines += _effect(effect)
@@ -64,10 +64,10 @@ def trace_text(result: Trace) -> str:
     ]
     if result.depends_on:
         moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
-        lines.append(f"the remaining residual depends on: {moves} (a clue, not a name)")
+        lines.append(f"the remaining residual depends on: {moves} (a clue, not a named effect)")
     lines += [
         f"a sparse fit of the remaining residual of {f.equation}: {f.text} "
-        f"({100 * f.share:.0f} % of its energy on held-out records; a clue, not a name)"
+        f"({100 * f.share:.0f} % of its energy on held-out records; a clue, not a named effect)"
         for f in result.formulas
     ]
     if result.next_experiment:
@@ -78,7 +78,7 @@ def trace_text(result: Trace) -> str:
 
 
 def _share(error: float | None, size: float | None) -> str:
-    """Return an error in percent of the equation's right side."""
+    """Return an error in percent of the rms of the equation's right side."""
     return f"{100 * error / size:.1f} %" if error is not None and size else ""
 
 
@@ -113,7 +113,7 @@ def _percent(value: float, sign: str = "") -> str:
 
 
 def _free_run(result: Trace, channel: str) -> list[str]:
-    """Return a channel's row: FIT and errors of the model before and after, and their unit."""
+    """Return a channel's row: FIT and errors of the model before and after, and the unit."""
     unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
     errors = (
         result.rmse_before, result.rmse_after, result.window_before, result.window_after,
@@ -131,7 +131,7 @@ def _number(value: float, digits: int = 3) -> str:
 
 
 def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
-    """Return a loop's rounds as a table, the last trace, and why it stopped."""
+    """Return a loop's rounds as a table, the last trace, and why the loop stopped."""
     rows = [
         [
             str(r.number), r.result.verdict, named(r.result), _figure(r.predicted),
@@ -147,7 +147,7 @@ def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
 
 
 def named(result: Trace) -> str:
-    """Return the effects of a trace in a few words, the tied ones too."""
+    """Return the effects of a trace in a few words, with those that cannot be separated."""
     names = [f"{e.name} at {e.location}" for e in result.effects]
     tied = ", ".join(f"{name} at {place_in_words(at)}" for name, at in result.tied_at)
     return (", ".join(names) or "nothing") + (f" (or {tied})" if tied else "")

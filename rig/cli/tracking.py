@@ -1,8 +1,8 @@
-"""`bramah run --track`: a process beside the run that follows b and the gains.
+"""`bramah run --track`: a separate process that estimates b and the flow gains during the run.
 
-The acquisition only hands blocks to a socket that never blocks (zmq, about 20 us a block); the
-estimates come back the same way. A tracker that falls behind, hangs or dies costs the run nothing:
-blocks it has no room for are lost samples to it.
+The acquisition only writes blocks to a non-blocking socket (zmq, about 20 us per block), and reads
+the estimates from it. A tracker that is slow, hangs or dies does not affect the run: blocks that
+do not fit into the tracker's queue are lost samples for the tracker alone.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 
 NAME = "tracked.json"
-WAITING = 30_000  # messages that may wait for the tracker: five minutes of blocks, about 40 MB
+WAITING = 30_000  # length of the tracker's queue in messages: five minutes of blocks, about 40 MB
 SAY_EVERY = 2.0  # [s] of wall time
-FINISH = 20.0  # [s] that the tracker may take to finish after the run
+FINISH = 20.0  # [s] allowed for the tracker to finish after the run
 NICE = 5
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """What the tracker is told at its start: `memory` [s], infinite for none."""
+    """Settings of the tracker; `memory`: forgetting time constant [s], infinite for none."""
 
     rig: Rig
     memory: float
@@ -57,7 +57,7 @@ class TrackingSettings:
 
 
 def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the bulk modulus and the gains in one line, '?' where nothing is known yet."""
+    """Return bulk modulus and flow gains in one line, '?' for values not yet known."""
     parts = []
     for name, estimate in parameters.items():
         value, (low, high) = estimate["value"], estimate["ci95"]
@@ -71,16 +71,18 @@ def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 class Tracking:
-    """The run's side of the tracker: an observer of the bench, a context manager around it.
+    """The tracker as the run uses it: an observer of the bench, and a context manager.
 
-    Enter it before the bench and leave it after, so that nothing waits while outputs are on.
+    Enter it before the bench and leave it after, so that no run waits with its outputs on.
     """
 
     def __init__(self, rig: Rig, out: Path, say: Say, memory: float = math.inf) -> None:
         if not memory > 0.0:
             raise InputError(f"--memory {memory:g}: expected more than 0 s")
         self.parameters: dict[str, Any] = {}
-        self.residuals: dict[str, list[float]] = {}  # by family: rms left of new rows, and theirs
+        self.residuals: dict[
+            str, list[float]
+        ] = {}  # by family: rms of the residual of new rows, and of their right side
         self.worst_handover = 0.0
         self._rig, self._out, self._say, self._memory = rig, out, say, memory
         self._history: list[dict[str, Any]] = []
@@ -92,18 +94,18 @@ class Tracking:
     def subscribe(
         self, note: Callable[[dict[str, Any]], None], show: Callable[[str], None]
     ) -> None:
-        """Say who notes the estimates at each record's end, and who shows the running ones."""
+        """Add functions called with the estimates: at each record's end, and in between."""
         self._notes.append(note)
         self._shows.append(show)
 
     def __enter__(self) -> Self:
-        self._folder = tempfile.TemporaryDirectory(prefix="bramah-")  # only its owner may enter
+        self._folder = tempfile.TemporaryDirectory(prefix="bramah-")  # accessible to this user only
         endpoint = f"ipc://{self._folder.name}/track"
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
         self._socket.set(zmq.SNDHWM, WAITING)
         self._socket.set(zmq.LINGER, 0)
-        # The end that connects queues what it sends before the other is there.
+        # This end connects, so that it queues messages sent before the tracker is ready.
         self._socket.connect(endpoint)
         settings = TrackingSettings(self._rig, self._memory, endpoint)
         self._process = get_context("spawn").Process(target=work, args=(settings,), daemon=True)
@@ -132,18 +134,18 @@ class Tracking:
 
     @property
     def alive(self) -> bool:
-        """Whether the tracker still works."""
+        """Whether the tracker's process is running."""
         return self._process.is_alive()
 
     @property
     def recorded(self) -> frozenset[str]:
-        """The records that are in the estimates."""
+        """The names of the records in the estimates."""
         return frozenset(str(entry["record"]) for entry in self._history)
 
     def _finish(self) -> None:
-        """Wait for the last estimates and write everything beside the records."""
+        """Wait for the last estimates and write all estimates into the run folder."""
         noted = len(self._history)
-        self._notes, self._shows = [], []  # the bench is closed
+        self._notes, self._shows = [], []  # the bench is closed, so waiting is safe
         self._send([b"stop"])
         deadline = time.monotonic() + FINISH
         ended = False
@@ -154,20 +156,20 @@ class Tracking:
             return
         self._say(f"tracked: {summary(self.parameters)}")
         if not ended:
-            self._say("the tracker did not finish; its last estimates stand")
+            self._say("the tracker did not finish in time; its last estimates are kept")
         memory = self._memory if math.isfinite(self._memory) else None
         data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
         if self._out.is_dir():
             write_json(self._out / NAME, data)
             events = EventLog(self._out)
-            for entry in self._history[noted:]:  # what a tracker that lagged had yet to say
+            for entry in self._history[noted:]:  # the delayed messages of a slow tracker
                 events.append("tracked", None, entry)
             events.close()
 
-    # What the bench tells
+    # Called by the bench
 
     def block(self, block: SampleBlock) -> None:
-        """Hand a block on and read the answers that have come; never waits."""
+        """Send a block to the tracker and read its answers; never waits."""
         started = time.perf_counter()
         tick = str(block.tick).encode()
         self._send([b"block", tick, np.ascontiguousarray(block.data, dtype="<f8").tobytes()])
@@ -184,7 +186,7 @@ class Tracking:
         self._send([b"begin", place, json.dumps(asdict(head)).encode()])
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
-        """Announce its end."""
+        """Announce the end of a record."""
         words = [str(start), str(ticks), state, meta.name]
         self._send([b"end", *(word.encode() for word in words)])
 
@@ -194,10 +196,12 @@ class Tracking:
         except zmq.Again:
             self._dropped += 1
             if self._dropped == 1:
-                log.warning("the tracker does not keep up; it misses samples, the run does not")
+                log.warning(
+                    "the tracker is too slow and loses samples; the run's record is complete"
+                )
 
     def _hear(self) -> bool:
-        """Take what the tracker said; True if that was its last word."""
+        """Read the tracker's messages; return whether the last one has come."""
         while True:
             try:
                 reply = json.loads(self._socket.recv(zmq.NOBLOCK))
@@ -223,13 +227,13 @@ class Tracking:
                     show(line.split("  ")[0])
 
 
-# The tracker's side
+# In the tracker's process
 
 
 def work(settings: TrackingSettings) -> None:
-    """Follow what comes in until told to stop, or until the run's process is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run says when to stop
-    os.nice(NICE)  # the acquisition goes first
+    """Process messages until told to stop or until the run's process has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run sends the message to stop
+    os.nice(NICE)  # the acquisition has priority
     context = zmq.Context()
     socket = context.socket(zmq.PAIR)
     socket.set(zmq.RCVHWM, WAITING)
@@ -289,4 +293,4 @@ def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) 
     try:
         socket.send_string(json.dumps(said), zmq.NOBLOCK)
     except zmq.Again:
-        log.debug("nobody hears the estimates")
+        log.debug("the run does not read the estimates; they are dropped")

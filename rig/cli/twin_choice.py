@@ -1,9 +1,9 @@
-"""Whose parameters the twin of a rig has: the last identified model's, a stated one's, nominal.
+"""Source of the twin's parameters: the last identified model, a given model file, or nominal.
 
-`identify --model`, `trace --model` and `loop` keep a copy of the model they write, one a rig, in
-the folder that outlives a session (`rig.bench.latch.state_folder`). A proof on the twin takes it
-where it belongs to the rig and is known well enough, and says so; otherwise it takes the nominal
-values and warns. A model that was asked for by name is refused instead.
+`identify --model`, `trace --model` and `loop` keep a copy of their model, one per rig, in the
+persistent folder `rig.bench.latch.state_folder`. A proof uses this model if it fits the rig and
+determines the parameters well enough; otherwise it uses the nominal values and warns. A model file
+given by the user is refused instead.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 _FOLDER = "models"
 _SAVED = "saved"  # in a model's provenance: when its file was written
 _FILE = "file"  # in a model's provenance: where to
-_SIMULATED = "simulated"  # in a model's provenance: whether a run of its was in virtual time
-_HASH_SHOWN = 12  # digits of a checksum that people compare
+_SIMULATED = "simulated"  # in a model's provenance: whether any of its runs was in virtual time
+_HASH_SHOWN = 12  # digits of a checksum shown to people
 
 
 @dataclass(frozen=True)
 class TwinSource:
-    """Where the twin's parameters come from: a model file, or none (nominal values).
+    """Source of the twin's parameters: a model file, or none (nominal values).
 
-    `shown` is what people call the file: a kept copy goes by the name it was written to.
-    `simulated`: a run that it was identified from was in virtual time, so on a simulated bench.
+    `shown`: the name of the file in messages; for a kept copy, that of the original.
+    `simulated`: one of the model's runs was in virtual time, so on a simulated bench.
     """
 
     path: Path | None = None
@@ -51,11 +51,11 @@ class TwinSource:
 
     @property
     def key(self) -> str:
-        """What a proof depends on."""
+        """The text of the source in the key of a proof."""
         return f"{self.sha256} {self.shown} {self.asked}" if self.path else "nominal"
 
     def as_dict(self) -> dict[str, Any] | None:
-        """Return it as plain data for JSON, None for nominal values."""
+        """Return the source as plain data for JSON, None for nominal values."""
         if self.path is None:
             return None
         return {
@@ -66,9 +66,9 @@ class TwinSource:
 
 @dataclass(frozen=True)
 class TwinParameters:
-    """A twin ready to simulate: itself, its draws, the rig with its parameters as nominal ones.
+    """The twin, its draws of parameters, and the rig with the twin's parameters as nominal ones.
 
-    `text` says in a report whose parameters they are; `warning` why a model was not taken.
+    `text`: the source of the parameters, for reports. `warning`: why a model was not used.
     """
 
     rig: Rig
@@ -79,19 +79,19 @@ class TwinParameters:
 
 
 def kept_model(rig: str) -> Path:
-    """Return where the last identified model of a rig is kept, whether there is one or not."""
+    """Return the path of a rig's last identified model, which may not exist."""
     readable = re.sub(r"[^A-Za-z0-9.-]", "_", rig)
     code = hashlib.sha256(rig.encode()).hexdigest()[:8]
     return state_folder() / _FOLDER / f"{readable}-{code}.json"
 
 
 def twin_source(rig: Rig, model: Path | None = None, nominal: bool = False) -> TwinSource:
-    """Return the model that the twin of a rig is to take; raises InputError for an unreadable file.
+    """Return the source of the twin's parameters; raises InputError for an unreadable file.
 
-    `model` is a file that a person stated; `nominal` asks for the nominal values.
+    `model`: a file given by the user. `nominal`: use the nominal values.
     """
     if model is not None and nominal:
-        raise InputError("--model and --nominal exclude each other: state one of them")
+        raise InputError("--model and --nominal exclude each other: expected one of them")
     path = kept_model(rig.name) if model is None else model
     if nominal or (model is None and not path.exists()):
         return TwinSource()
@@ -111,12 +111,12 @@ def _provenance(raw: bytes) -> Mapping[str, Any]:
     try:
         provenance = json.loads(raw)["provenance"]
     except (ValueError, KeyError, TypeError, RecursionError):
-        return {}  # what is wrong with the file is said when it is loaded as a model
+        return {}  # loading it as a model reports what is wrong with the file
     return provenance if isinstance(provenance, dict) else {}
 
 
 def source_text(source: TwinSource, now: datetime | None = None) -> str:
-    """Say in a sentence which model a source is, and how old."""
+    """Return the source and the age of its model in words."""
     if source.path is None:
         return "the nominal values of the rig file"
     which = "model" if source.asked else "last identified model"
@@ -142,8 +142,8 @@ def _age_text(saved: str, now: datetime | None = None) -> str:
 def load_twin(source: TwinSource, rig: Rig) -> TwinParameters:
     """Load the twin of a rig from its source.
 
-    Raises InputError for a stated model that cannot serve; a kept one that cannot is left for the
-    nominal values, with a warning.
+    Raises InputError for a given model that cannot be used; a kept model that cannot be used is
+    replaced by the nominal values, with a warning.
     """
     from analysis.simulation.twin import simulate_commands
 
@@ -162,7 +162,7 @@ def load_twin(source: TwinSource, rig: Rig) -> TwinParameters:
         raise InputError(f"{source.shown} cannot be the twin of rig {rig.name!r}: {reason}")
     if reason:
         warning = (
-            f"the last identified model {source.shown} is not used, {reason}; the twin has the "
+            f"the last identified model {source.shown} is not used, {reason}; the twin uses the "
             "nominal values of the rig file"
         )
         return replace(nominal, warning=warning)
@@ -176,7 +176,7 @@ def _twin_of(model: Model, rig: Rig, source: TwinSource) -> TwinParameters:
     from analysis.simulation.settings import SIMULATION
     from analysis.simulation.twin import simulate_commands
 
-    # The model's rig is the same physics; limits, wire and rate are those of today's file.
+    # The physics is that of the model's rig; limits, wire and rate are those of the rig file.
     here = replace(model, rig=rig)
     rng = np.random.default_rng(SIMULATION.twin_seed)
     draws = model_draws(here, SIMULATION.twin_draws, rng)
@@ -189,7 +189,7 @@ def _twin_of(model: Model, rig: Rig, source: TwinSource) -> TwinParameters:
 
 
 def _in_virtual_time(runs: Iterable[str]) -> bool:
-    """Whether any of the runs was taken from a device in virtual time; unknown ones count as no."""
+    """Return whether any run was recorded in virtual time; an unreadable run counts as no."""
     from rig.runs.store import read_header
 
     for folder in runs:
@@ -202,7 +202,7 @@ def _in_virtual_time(runs: Iterable[str]) -> bool:
 def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> None:
     """Write a model file and keep a copy as the last identified model of its rig.
 
-    `say` hears whether the copy was kept, or why not (the model before it then stays).
+    `say` receives whether the copy was kept, or why not; then the earlier copy remains.
     """
     from analysis.simulation.model import save_model
     from analysis.simulation.model_draws import unusable
@@ -215,16 +215,16 @@ def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> Non
     dated = replace(model, provenance={**model.provenance, **origin})
     save_model(dated, path)
     if model.rig.electric:
-        return  # no twin of an electric rig is checked
+        return  # electric rigs are not checked on a twin
     reason = unusable(model, model.rig)
     if reason:
-        say(f"note: {path} does not become the model that check and run prove on: {reason}")
+        say(f"note: {path} is not used by check and run: {reason}")
         return
     kept = kept_model(model.rig.name)
     try:
         kept.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         save_model(dated, kept)
     except OSError as error:
-        say(f"note: {path} could not be kept for check and run ({kept}: {error.strerror})")
+        say(f"note: {path} could not be stored for check and run ({kept}: {error.strerror})")
         return
-    say(f"check and run of rig {model.rig.name} are proved on {path} from now on (not: --nominal)")
+    say(f"check and run of rig {model.rig.name} now use {path} for the twin (unless --nominal)")

@@ -1,4 +1,4 @@
-"""The `validate` verb: the model's simulation beside records."""
+"""The `validate` verb: simulation of a model compared with records."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def validate(
     runs: RunsArgument,
     json: JsonOption = None,
 ) -> None:
-    """Simulate the model with the measured spool and compare it with records.
+    """Simulate the model with the measured spool and compare the result with the records.
 
     Example: bramah validate model.json runs/tuesday
     """

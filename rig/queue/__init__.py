@@ -1,1 +1,1 @@
-"""A night's work: items on disk, one runner that starts each as a process of its own."""
+"""The queue of runs: items on disk, and one runner that starts each as a separate process."""

@@ -1,7 +1,7 @@
-"""Notifications: a person's command that gets JSON on its standard input.
+"""Notifications: the user's command receives JSON on its standard input.
 
-Each runs in a thread and a session of its own, with a limit of time: a command that hangs, fails,
-cannot be started or does not read costs the queue nothing but a line in `hook.log`.
+Each runs in a separate thread and session with a time limit: a command that hangs, fails, cannot be
+started or does not read its input only causes a line in `hook.log`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from rig.model.parse import InputError
 
 log = logging.getLogger(__name__)
 
-SECONDS = 30.0  # a mail server that does not answer by then is not waited for
+SECONDS = 30.0  # time limit [s] of a command, such as of a mail server's answer
 
-IN_ORDER = 5.0  # [s] a message waits for the one before it: a trip is not held up by one that hangs
+IN_ORDER = 5.0  # [s] that a message waits for the previous one, which may hang
 
 
 def parse_command(text: str) -> tuple[str, ...]:
@@ -49,7 +49,7 @@ class Hook:
         self._threads: list[threading.Thread] = []
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """Hand a message over and return at once; never raises."""
+        """Deliver a message in the background; never raises."""
         if not self._command:
             return
         text = json.dumps(dict(message), default=str).encode() + b"\n"
@@ -61,7 +61,7 @@ class Hook:
         thread.start()
 
     def wait(self) -> None:
-        """Wait for what is being delivered, no longer than its limit of time."""
+        """Wait for the message being delivered, at most until its time limit."""
         deadline = time.monotonic() + self._seconds + 1.0
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))

@@ -1,7 +1,7 @@
-"""What a queue holds: items, the states they pass through, what they wait for. No I/O.
+"""Items of a queue, their states, and their conditions to start. No I/O.
 
 Glossary: an *item* is one protocol on one bench into one run folder; an *attempt* is one start of
-it; an item *waits* while it may start later, and is *over* once it is in a final state.
+it; an item *waits* while it may start later, and is *over* in a final state.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ EXPIRED: Final = "expired"
 ACTIVE: Final = (CHECKING, RUNNING)
 OVER: Final = {
     DONE: "ran to its end",
-    FAILED: "could not be done; the reason says why",
-    REFUSED: "the proof on the twin, or its input, was refused when it was to start",
+    FAILED: "failed; see the reason",
+    REFUSED: "refused at its start, by the check of its input or of its limits on the twin",
     TRIPPED: "a safety limit was passed; the queue stopped",
-    LOST: "the device did not answer any more",
+    LOST: "the device no longer answered",
     STOPPED: "stopped by a person, or with the runner",
     INTERRUPTED: "its process was killed; what it recorded was recovered",
     CANCELLED: "cancelled by a person",
-    SKIPPED: "the item it depends on ended otherwise than wanted",
-    EXPIRED: "its condition did not come, or it was too late to start",
+    SKIPPED: "the item of --after did not end as --if states",
+    EXPIRED: "its start condition was not met before its latest start",
 }
 STATES: Final = (QUEUED, *ACTIVE, *OVER)
-ENDED: Final = "ended"  # as a wanted result: any final state
+ENDED: Final = "ended"  # as a condition: any final state
 
 _COMPARISONS: Final[dict[str, Callable[[float, float], bool]]] = {
     "<=": operator.le,
@@ -73,7 +73,7 @@ class StartCondition:
     bound: float
 
     def holds(self, value: float) -> bool:
-        """Whether a value in SI passes the comparison; a NaN never does."""
+        """Return whether a value in SI fulfils the comparison; NaN never does."""
         return _COMPARISONS[self.sign](value, self.bound)
 
 
@@ -113,7 +113,7 @@ def result_condition(text: str) -> StartCondition:
 
 
 def check_wanted(text: str, known: Collection[str]) -> None:
-    """Raise InputError unless `text` is a final state, ``ended``, or a result's condition.
+    """Raise InputError unless `text` is a final state, ``ended``, or a condition on a result.
 
     `known` are the names of the parameters that are identified from the item waited for.
     """
@@ -138,12 +138,12 @@ def parse_time(text: str, now: datetime, option: str) -> datetime:
             return datetime.fromisoformat(text).astimezone(UTC)
         except ValueError:
             raise InputError(
-                f"{option} {text!r}: expected a time as 22:30 or 2026-03-01T22:30"
+                f"{option} {text!r}: expected a time such as 22:30 or 2026-03-01T22:30"
             ) from None
     local = now.astimezone()
     wanted = local.replace(hour=clock.hour, minute=clock.minute, second=0, microsecond=0)
     if wanted < local.replace(second=0, microsecond=0):
-        # Through naive time: a day on which the clocks change is not 24 h long.
+        # In local time, since a day with a change of the clocks does not last 24 h.
         day = wanted.date().toordinal() + 1
         naive = datetime.combine(datetime.fromordinal(day).date(), clock)
         wanted = naive.astimezone()
@@ -152,10 +152,10 @@ def parse_time(text: str, now: datetime, option: str) -> datetime:
 
 @dataclass(frozen=True)
 class QueueJob:
-    """What a person asked for; times are ISO 8601 in UTC, paths absolute, '' where not given.
+    """The user's request; times are ISO 8601 in UTC, paths absolute, '' if not given.
 
-    `options` are words that `bramah check` and `bramah run` both take, `run_options` those that
-    only `run` takes. `after` is an item's number, `wanted` what its result must be.
+    `options` are arguments of both `bramah check` and `bramah run`, `run_options` of `run` only.
+    `after` is an item's number, `wanted` the condition on its result.
     """
 
     protocol: str
@@ -173,12 +173,12 @@ class QueueJob:
     identify: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
+        """Return the job as plain data."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> QueueJob:
-        """Return it from plain data; keys of a later version are ignored."""
+        """Return a job from plain data; keys of later versions are ignored."""
         known = {f.name for f in fields(cls)}
         kept = {key: value for key, value in data.items() if key in known}
         for name in ("options", "run_options"):
@@ -186,11 +186,11 @@ class QueueJob:
         return cls(**kept)
 
     def check_words(self) -> list[str]:
-        """Return the words of its proof on the twin, result as JSON on standard output."""
+        """Return the arguments of the proof on the twin, with JSON on standard output."""
         return ["check", self.protocol, "--rig", self.rig, *self.options, "--json", "-"]
 
     def run_words(self, folder: str) -> list[str]:
-        """Return the words that run it into `folder`."""
+        """Return the arguments of the run into `folder`."""
         place = ["--endpoint", self.endpoint] if self.endpoint else []
         line = ["run", self.protocol, "--rig", self.rig, "--out", folder, *place]
         return [*line, *self.options, *self.run_options]
@@ -198,10 +198,10 @@ class QueueJob:
 
 @dataclass(frozen=True)
 class Item:
-    """An item as it stands in the queue.
+    """An item of the queue with its present state.
 
     `priority`: higher starts first; `place` orders equal ones. `run` is the folder of the latest
-    attempt, `proof` what the proof said when queued, `results` what was identified from the run.
+    attempt, `proof` the proof when queued, `results` the parameters identified from the run.
     """
 
     id: int
@@ -222,16 +222,16 @@ class Item:
 
     @property
     def over(self) -> bool:
-        """Whether it is in a final state."""
+        """Whether the item is in a final state."""
         return self.state in OVER
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data for JSON."""
+        """Return the item as plain data for JSON."""
         plain = {**asdict(self), "job": self.job.as_dict()}
         return {**plain, "found": plain.pop("results")}
 
     def next_folder(self) -> str:
-        """Return the run folder of the next attempt: the first as named, later ones numbered."""
+        """Return the run folder of the next attempt; a number is appended from the second on."""
         return self.job.out if self.attempt == 0 else f"{self.job.out}-{self.attempt + 1}"
 
 

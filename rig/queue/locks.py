@@ -1,8 +1,8 @@
-"""Locks that the kernel releases when their holder dies, at whatever moment that is.
+"""Lock files, which the kernel releases when their holder dies.
 
-A number in a file can be left behind by a killed process and then belong to another; a lock on an
-open file cannot. A child inherits the lock of its item, so that a runner started later can ask
-whether the item's process still lives, even one whose number was never written down.
+A process id left in a file by a killed process may later belong to another process; a lock on an
+open file cannot. An item's process inherits the item's lock, so that a later runner can determine
+whether it still runs, even if its id was not stored.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class LockFile:
 
     @classmethod
     def take(cls, path: Path) -> LockFile | None:
-        """Take the lock and write this process's number into it; None if another has it."""
+        """Take the lock and write this process's id into it; None if another process holds it."""
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -38,19 +38,19 @@ class LockFile:
         return cls(path, handle)
 
     def fileno(self) -> int:
-        """Return the descriptor that a child may inherit."""
+        """Return the file descriptor for a child to inherit."""
         assert self._handle is not None
         return self._handle
 
     def close(self) -> None:
-        """Close this process's handle; the lock goes with the last one. Twice is harmless."""
+        """Close this process's handle, repeatedly if need be; the last handle releases the lock."""
         handle, self._handle = self._handle, None
         if handle is not None:
             os.close(handle)
 
 
 def held(path: Path) -> bool:
-    """Whether a living process has the lock."""
+    """Return whether a running process holds the lock."""
     try:
         handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -65,7 +65,7 @@ def held(path: Path) -> bool:
 
 
 def holder(path: Path) -> int | None:
-    """Return the number that the last holder wrote, None if there is none."""
+    """Return the process id of the last holder, None if there is none."""
     with contextlib.suppress(OSError, ValueError):
         return int(path.read_text(encoding="ascii"))
     return None

@@ -1,4 +1,4 @@
-"""From how an item's process ended to the state of the item."""
+"""The final state of an item from the end of its process."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ _DEVICE: Final = ("device:", "device in use:")
 
 @dataclass(frozen=True)
 class ItemOutcome:
-    """The state an item ends in, and why; `latched`: an earlier trip kept it from starting."""
+    """The final state of an item and the reason; `latched`: an earlier trip prevented its start."""
 
     state: str
     reason: str
     latched: bool = False
 
     def adding(self, more: str) -> ItemOutcome:
-        """Return it with a further reason."""
+        """Return the outcome with a further reason."""
         return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
 
     def as_requested(self, state: str) -> ItemOutcome:
-        """Return it as `state` where the process ended because it was asked to for that."""
+        """Return the outcome with `state` if the process ended on that request."""
         if not state or self.state not in (it.STOPPED, it.FAILED):
             return self
         return replace(self, state=state, latched=False)
 
 
 def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
-    """Judge an exit code; `began`: a run folder was made."""
+    """Return the outcome for an exit code; `began`: a run folder exists."""
     if code < 0:
         return ItemOutcome(it.INTERRUPTED, f"its process was killed by signal {-code}")
     if code not in _STATES:
@@ -52,8 +52,8 @@ def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
 
 
 def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:
-    """Judge a process with unknown exit code from its run folder and its last line."""
-    unseen = "no runner saw its end"
+    """Return the outcome of a process with unknown exit code, from its run folder and last line."""
+    unseen = "ended while no runner was watching"
     if not store.is_run(folder):
         if not said:
             return ItemOutcome(
@@ -72,7 +72,7 @@ def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:
 
 
 def _state_of(message: str) -> str:
-    """Return the state that a run's last message stands for."""
+    """Return the state for a run's last message."""
     message = message.removeprefix(f"{UNSURE}; ")
     if message.startswith(_DEVICE):
         return it.LOST

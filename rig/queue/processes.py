@@ -1,4 +1,4 @@
-"""Verbs of `bramah` as child processes: started, watched, asked to end; what they said."""
+"""Verbs of `bramah` as child processes: start, end, results and error messages."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from rig.model.trips import OperatorStop
 from rig.queue.locks import LockFile
 
 BRAMAH: Final = (sys.executable, "-c", "from rig.cli.main import run; run()")
-_SAID = "bramah: "  # begins the one line in which a verb says why it failed
-_TAIL = 1 << 16  # [bytes] of a log that are searched for it
+_SAID = "bramah: "  # begins the lines with which a verb reports its error
+_TAIL = 1 << 16  # [bytes] at the end of a log that are searched for these lines
 _POLL = 0.05  # [s]
 
 
 @dataclass(frozen=True)
 class ProcessResult:
-    """How a verb ended: exit code, result on standard output, and the line that says why."""
+    """Result of a verb: exit code, standard output, and error message."""
 
     code: int
     output: str
     reason: str
 
     def as_json(self) -> Any:
-        """Return its JSON result, None if there is none."""
+        """Return the JSON result, None if there is none."""
         try:
             return json.loads(self.output)
         except ValueError:
@@ -42,7 +42,7 @@ class ProcessResult:
 
 
 def reason_in(text: str) -> str:
-    """Return the last lines in which a verb said why it ended, joined by ';', '' if it did not."""
+    """Return the last error messages of a verb, joined by ';', '' if there are none."""
     lines = [line.partition(_SAID) for line in text.splitlines()]
     while lines and not lines[-1][1]:
         lines.pop()
@@ -52,7 +52,7 @@ def reason_in(text: str) -> str:
 
 
 def reason_of(path: Path) -> str:
-    """Return why a process ended from the end of its log, '' if it did not say."""
+    """Return the error message at the end of a process's log, '' if there is none."""
     try:
         with path.open("rb") as stream:
             stream.seek(max(0, path.stat().st_size - _TAIL))
@@ -64,9 +64,9 @@ def reason_of(path: Path) -> str:
 def start(
     words: Sequence[str], output: IO[bytes], errors: IO[bytes] | int, lock: LockFile | None = None
 ) -> subprocess.Popen[bytes]:
-    """Start a program in a session of its own: a Ctrl-C at the terminal is not for it.
+    """Start a program in a separate session, which Ctrl-C at the terminal does not reach.
 
-    With `lock` the child holds it to its end, and this process no longer does.
+    The child takes over `lock`, if given, and holds it to its end.
     """
     inherited = () if lock is None else (lock.fileno(),)
     try:
@@ -80,7 +80,7 @@ def start(
 
 
 def ask_to_end(pid: int) -> None:
-    """Send the signal on which a run zeroes its outputs first; a process that is gone is fine."""
+    """Send SIGTERM, on which a run zeroes its outputs and ends; ignores an ended process."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.kill(pid, signal.SIGINT)
 
@@ -89,9 +89,9 @@ def call(
     program: Sequence[str], words: Sequence[str], seconds: float,
     stopped: Callable[[], str | None] = lambda: None,
 ) -> ProcessResult:  # fmt: skip
-    """Run a verb that moves nothing to its end; raises OperatorStop where `stopped` says why.
+    """Run a verb without motion to its end; raises OperatorStop if `stopped` returns a reason.
 
-    After `seconds` it is killed: the answer then has code -9 and says so.
+    After `seconds` it is killed, and the result has the code -9.
     """
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         child = start([*program, *words], output, errors)
@@ -115,7 +115,7 @@ def call(
         errors.seek(0)
         said = errors.read().decode(errors="replace")
         result = output.read().decode(errors="replace")
-    reason = f"no end within {seconds:.0f} s" if late else reason_in(said)
+    reason = f"did not end within {seconds:.0f} s" if late else reason_in(said)
     if not reason and child.returncode:
         reason = (
             f"ended with {child.returncode}: {(said.strip().splitlines() or ['no message'])[-1]}"

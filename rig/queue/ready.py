@@ -1,4 +1,4 @@
-"""Whether an item may start now, must wait, or never will: decisions without I/O."""
+"""Decides whether an item can start now, must wait, or never can. No I/O."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rig.queue.items import (
 
 @dataclass(frozen=True)
 class Readiness:
-    """May an item start? `state` is '' while it may still come to that, else the final state."""
+    """Whether an item can start; `state` is '' while it can start later, else its final state."""
 
     start: bool
     reason: str = ""
@@ -32,7 +32,7 @@ class Readiness:
 
 Reading = Callable[
     [QueueJob], Mapping[str, float] | str
-]  # channel means in SI, or why there are none
+]  # channel means in SI, or the reason why they cannot be read
 
 
 def _shown(moment: datetime) -> str:
@@ -44,7 +44,7 @@ def _wait(reason: str) -> Readiness:
 
 
 def dependence(item: Item, others: Mapping[int, Item]) -> Readiness:
-    """Judge what an item wants of the result of an earlier one."""
+    """Evaluate an item's condition on an earlier item."""
     wanted = item.job.wanted
     if item.job.after is None:
         return Readiness(True)
@@ -72,7 +72,7 @@ def _compared(wanted: str, other: Item) -> Readiness:
 
 
 def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Reading) -> Readiness:
-    """Judge one queued item; `read` is asked last, and only where a channel decides."""
+    """Evaluate one queued item; `read` is called last, and only for a condition on a channel."""
     job = item.job
     if job.not_after and moment >= datetime.fromisoformat(job.not_after):
         late = _shown(datetime.fromisoformat(job.not_after))
@@ -102,7 +102,7 @@ def _channel(job: QueueJob, read: Reading) -> Readiness:
 def choose(
     items: Sequence[Item], moment: datetime, read: Reading
 ) -> tuple[Item | None, list[tuple[Item, Readiness]]]:
-    """Return the first item that may start now, and the verdicts on those before it."""
+    """Return the first item that can start now, and the results for those before it."""
     others = {item.id: item for item in items}
     passed: list[tuple[Item, Readiness]] = []
     for item in items:

@@ -1,9 +1,9 @@
-"""The runner of a queue: one process that starts items, one at a time, and survives what they do.
+"""The runner of a queue: one process that starts the items one at a time.
 
-Every item runs as a child of its own. The state `running` is on the disk before the child starts,
-and the child holds the item's lock for as long as it lives: a runner that is killed is followed by
-one that finds out whether the child still runs (it then waits for it), has ended (its run folder
-says how) or died (its run is recovered). No item is started a second time unless a person says so.
+Every item runs as a child process. The state `running` is on disk before the child starts, and the
+child holds the item's lock while it runs. After a killed runner, the next one therefore determines
+whether the child still runs (and waits for it), has ended (its run folder says how) or was killed
+(its run is recovered). An item is started a second time only by a person.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ PAUSED: Final = "paused"
 class QueueSettings:
     """Times [s] and counts of a runner."""
 
-    poll: float = 0.2  # between two looks at a child and at what a person wishes
-    wait_poll: float = 2.0  # between two looks at a queue in which nothing may start yet
-    probe_every: float = 30.0  # between two readings of a bench whose channel decides
+    poll: float = 0.2  # between two checks of the child and of the user's requests
+    wait_poll: float = 2.0  # between two checks of a queue in which no item can start yet
+    probe_every: float = 30.0  # between two readings of a bench for a condition on a channel
     probe_seconds: float = 60.0  # a reading takes one connection and one block
     check_seconds: float = 1800.0  # the longest proof; the shipped ones take seconds
     recover_seconds: float = 3600.0  # an archive of hours is written and verified at disk speed
-    identify_seconds: float = 3600.0  # of a night's largest run
+    identify_seconds: float = 3600.0  # of the largest run
     stop_seconds: float = 600.0  # to zero the outputs and write the archive before it is killed
-    lost_in_a_row: int = 2  # devices lost one after another: the bench is gone, not one run's luck
+    lost_in_a_row: int = 2  # consecutive losses of the device after which the queue stops
 
 
 @dataclass(frozen=True)
 class QueueReport:
-    """How a runner ended: exit code of the contract, why, and the items it ended, in order."""
+    """Result of a runner: exit code, reason, and the ended items in order."""
 
     code: int
     reason: str
@@ -66,7 +66,7 @@ class QueueReport:
 
 
 class _Ending(Exception):
-    """The queue stops: the exit code, and why."""
+    """The queue stops, with an exit code and a reason."""
 
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)
@@ -80,13 +80,13 @@ def folder_of(queue: Path) -> Path:
 
 
 def runner_of(queue: Path) -> int | None:
-    """Return the process that runs a queue now, None if there is none."""
+    """Return the id of the process that runs a queue, None if there is none."""
     path = folder_of(queue) / "runner.lock"
     return holder(path) if held(path) else None
 
 
 def item_lock(queue: Path, number: int) -> Path:
-    """Return the lock that the process of an item holds while it lives."""
+    """Return the lock file that an item's process holds while it runs."""
     return folder_of(queue) / f"item-{number}.lock"
 
 
@@ -96,7 +96,7 @@ def log_of(queue: Path, item: Item) -> Path:
 
 
 def end_orphan(queue: Path, item: Item) -> bool:
-    """Ask an item's process to end where no runner watches it; says whether one was asked."""
+    """Ask an item's process to end if no runner watches it; return whether there was one."""
     if runner_of(queue) is not None or not held(item_lock(queue, item.id)):
         return False
     pid = _pid_of(item)
@@ -115,7 +115,7 @@ def _pid_of(item: Item) -> int | None:
 class Runner:
     """Runs a queue; a context manager that holds the queue's lock.
 
-    `program` starts a verb (by default this `bramah`). Raises InputError on entry where another
+    `program` starts a verb (default: this `bramah`). Raises InputError on entry if another
     process runs the queue.
     """
 
@@ -132,7 +132,7 @@ class Runner:
         self._stop = StopFlag()
         self._lock: LockFile | None = None
         self._ended: list[Item] = []
-        self._lost = 0  # devices lost one after another
+        self._lost = 0  # consecutive losses of the device
         self._readings: dict[tuple[str, str], tuple[float, dict[str, float] | str]] = {}
         self._told: dict[int, str] = {}
 
@@ -149,7 +149,7 @@ class Runner:
                 "`bramah queue pause` stops it after the present item"
             )
         if stale is not None:
-            self._say(f"the runner before this, process {stale}, ended without saying so")
+            self._say(f"the previous runner, process {stale}, was killed")
         self._stop.install()
         return self
 
@@ -162,7 +162,7 @@ class Runner:
             self._lock.close()
 
     def run(self) -> QueueReport:
-        """Run until nothing more may start, the queue is paused, or it must stop."""
+        """Run until no item can start any more, the queue is paused, or it must stop."""
         self._queue.note("runner begins", f"process {os.getpid()} on {runstate.here()}")
         try:
             self._resolve_leftovers()
@@ -217,7 +217,7 @@ class Runner:
         return item, verdicts
 
     def _read(self, job: QueueJob) -> dict[str, float] | str:
-        """Return the means of a bench's channels, read again after a while; moves nothing."""
+        """Return the means of a bench's channels, cached for a while; moves nothing."""
         key = (job.rig, job.endpoint)
         kept = self._readings.get(key)
         if kept is None or time.monotonic() - kept[0] > self._settings.probe_every:
@@ -228,7 +228,9 @@ class Runner:
             means: dict[str, float] | str = answer.reason or (
                 f"`bramah probe` wrote {answer.output[:60]!r}, not a JSON list of channels"
             )
-            if isinstance(readings, list):  # also with an implausible channel, which is no reason
+            if isinstance(
+                readings, list
+            ):  # exit code of an implausible channel, which does not matter here
                 means = {
                     reading["channel"]: float(reading["mean"])
                     for reading in readings
@@ -244,7 +246,7 @@ class Runner:
     # One item
 
     def _start(self, item: Item) -> None:
-        """Check a claimed item against the limits of now, then run it to its end."""
+        """Check a claimed item against the present limits, then run it to its end."""
         self._say(f"item {item.id} {item.job.name}: checking")
         try:
             proof = self._call(item.job.check_words(), self._settings.check_seconds)
@@ -261,11 +263,11 @@ class Runner:
         self._after(begun, self._run(begun))
 
     def _run(self, item: Item) -> ItemOutcome:
-        """Run an item's process to its end and say how it ended."""
+        """Run an item's process to its end and return the outcome."""
         lock = LockFile.take(item_lock(self._queue.path, item.id))
         if lock is None:
             return ItemOutcome(
-                it.FAILED, "a process of this item still lives; it was not started again"
+                it.FAILED, "a process of this item still runs; the item was not started again"
             )
         self._say(f"item {item.id} {item.job.name}: running into {item.run}")
         path = log_of(self._queue.path, item)
@@ -276,7 +278,7 @@ class Runner:
             self._queue.note_process(item.id, child.pid)
             request = self._watch(item, lambda: child.poll() is not None, lambda: child.pid)
         except BaseException:
-            # Whatever went wrong here: the bench is made safe by the child before this goes on.
+            # After any error of the runner, the child first makes the bench safe.
             processes.ask_to_end(child.pid)
             child.wait()
             raise
@@ -285,7 +287,7 @@ class Runner:
         return outcome.as_requested(request)
 
     def _watch(self, item: Item, over: Callable[[], bool], pid: Callable[[], int | None]) -> str:
-        """Wait until a process has ended; returns the state it was asked to end for, or ''."""
+        """Wait until a process has ended; return the state for which it was asked to end, or ''."""
         asked, since = "", 0.0
         while not over():
             end_state = it.STOPPED if self._stop.reason else ""
@@ -306,7 +308,7 @@ class Runner:
         return asked
 
     def _after(self, item: Item, outcome: ItemOutcome) -> None:
-        """Finish an item, recover what its death left, and stop the queue where it must."""
+        """Finish an item, recover its run if its process died, and stop the queue if necessary."""
         if outcome.latched:
             self._queue.release(item.id, f"not started: {outcome.reason}")
             self._notify("trip", item, outcome.reason)
@@ -326,14 +328,14 @@ class Runner:
         self._heed()
 
     def _make_safe(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
-        """Zero the outputs of a bench whose process died; its watchdog will have done so."""
+        """Zero the outputs of a bench whose process died; the watchdog has probably done so."""
         job = item.job
         place = ["--endpoint", job.endpoint] if job.endpoint else []
         words = ["stop", "--rig", job.rig, *place]
         answer = processes.call(self._program, words, self._settings.probe_seconds)
         if answer.code == 0:
             return outcome.adding("outputs confirmed at zero")
-        # Without the phrase that stops the queue: the next item shows whether this bench answers.
+        # Without the phrase that stops the queue: the next item tests whether the bench answers.
         return outcome.adding(f"outputs left to the watchdog: {answer.reason.replace(UNSURE, '')}")
 
     def _unfinished(self, item: Item) -> bool:
@@ -343,7 +345,7 @@ class Runner:
         )
 
     def _recover(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
-        # Not stopped by a wish to end: what was recorded is safe before this process goes.
+        # A request to end does not interrupt this, so that the recorded data are safe.
         answer = processes.call(
             self._program, ["recover", item.run], self._settings.recover_seconds
         )
@@ -362,7 +364,7 @@ class Runner:
             self._notify("failure", ended, outcome.reason)
 
     def _identify_due(self) -> None:
-        """Identify from the runs that are done, for what waits on their result and for the page."""
+        """Identify from the finished runs, for conditions on their results and for the page."""
         for item in self._queue.items():
             if item.state != it.DONE or not item.job.identify or item.results:
                 continue
@@ -375,7 +377,7 @@ class Runner:
                 item.id, result if isinstance(result, dict) else {"error": why}
             )
 
-    # What another runner left behind
+    # Items of an earlier runner
 
     def _resolve_leftovers(self) -> None:
         for item in self._queue.items():
@@ -388,7 +390,9 @@ class Runner:
         lock = item_lock(self._queue.path, item.id)
         request = it.CANCELLED if item.cancel else ""
         if held(lock):
-            self._say(f"item {item.id} {item.job.name}: its process still runs and is waited for")
+            self._say(
+                f"item {item.id} {item.job.name}: its process still runs; waiting for its end"
+            )
             request = self._watch(item, lambda: not held(lock), lambda: _pid_of(item)) or request
         said = processes.reason_of(log_of(self._queue.path, item))
         return outcome_of_folder(Path(item.run), said).as_requested(request)

@@ -25,7 +25,7 @@ from rig.queue.items import (
 from rig.runs.runstate import now
 
 SCHEMA_VERSION: Final = 1
-_PATIENCE = 20.0  # [s] another process may hold the file
+_PATIENCE = 20.0  # [s] to wait for another process that has locked the file
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS item (
     id INTEGER PRIMARY KEY AUTOINCREMENT, priority INTEGER NOT NULL, place REAL NOT NULL,
@@ -47,7 +47,7 @@ _PAUSE = "pause"
 
 @dataclass(frozen=True)
 class QueueLine:
-    """One line of the history: `event` is a state that an item entered, or what a queue did."""
+    """One line of the history; `event` is an item's new state or an action of the queue."""
 
     time: str
     item: int | None
@@ -66,15 +66,15 @@ def _item(row: Sequence[Any]) -> Item:
 
 
 class QueueStore:
-    """One open queue file; several processes may have it open.
+    """One open queue file, which several processes can use.
 
-    Raises InputError for a file that is no queue, or of a later version.
+    Raises InputError for a file that is not a queue, or of a later version.
     """
 
     def __init__(self, path: Path, *, create: bool = True) -> None:
         self.path = path
         if not create and not path.exists():
-            raise InputError(f"{path}: no such queue; `bramah queue add` makes one")
+            raise InputError(f"{path}: no such queue; `bramah queue add` creates it")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, isolation_level=None, timeout=_PATIENCE)
@@ -95,7 +95,7 @@ class QueueStore:
             self._db.close()
             raise InputError(f"{self.path}: a database of another program; expected a queue")
         self._db.execute("PRAGMA journal_mode=WAL")
-        # Changes are rare and each matters: on the disk before anything is done because of it.
+        # Every change must be on disk before any action that depends on it.
         self._db.execute("PRAGMA synchronous=FULL")
         if version == SCHEMA_VERSION:
             return
@@ -168,15 +168,15 @@ class QueueStore:
 
     @property
     def paused(self) -> str:
-        """Who paused the queue and when; '' where it is not paused."""
+        """Who paused the queue and when; '' if it is not paused."""
         with self._readable():
             row = self._db.execute("SELECT value FROM setting WHERE key = ?", (_PAUSE,)).fetchone()
         return "" if row is None else str(row[0])
 
-    # A person's changes
+    # Changes by the user
 
     def add(self, job: QueueJob, priority: int, proof: dict[str, Any]) -> Item:
-        """Append an item to those of its priority."""
+        """Add an item as the last of its priority."""
         with self._transaction():
             if job.after is not None:
                 self.item(job.after)
@@ -194,10 +194,12 @@ class QueueStore:
     def _refuse_taken(self, out: str) -> None:
         for item in self.items():
             if out in (item.job.out, item.run):
-                raise InputError(f"--out {out}: is the run folder of item {item.id} already")
+                raise InputError(
+                    f"--out {out}: is already the run folder of item {item.id}; name another"
+                )
 
     def next_number(self) -> int:
-        """Return the number that the next item will have, unless another process adds one first."""
+        """Return the number of the next item, unless another process adds one first."""
         with self._readable():
             row = self._db.execute("SELECT seq FROM sqlite_sequence WHERE name = 'item'").fetchone()
         return 1 if row is None else int(row[0]) + 1
@@ -229,7 +231,7 @@ class QueueStore:
         return self.item(number)
 
     def cancel(self, number: int, who: str) -> Item:
-        """Cancel a waiting item, or wish the end of the one that runs; raises InputError."""
+        """Cancel a waiting item, or request the end of a running one; raises InputError."""
         with self._transaction():
             item = self.item(number)
             if item.over:
@@ -242,11 +244,11 @@ class QueueStore:
         return self.item(number)
 
     def retry(self, number: int, who: str) -> Item:
-        """Queue an item again that is over, at its place; only a person does this."""
+        """Queue an ended item again, at its place; done by a person only."""
         with self._transaction():
             item = self.item(number)
             if not item.over:
-                raise InputError(f"item {number} is {item.state}; only one that is over is retried")
+                raise InputError(f"item {number} is {item.state}; expected an item that has ended")
             self._db.execute(
                 "UPDATE item SET cancel = 0, ended = '', found = '{}' WHERE id = ?", (number,)
             )
@@ -254,7 +256,7 @@ class QueueStore:
         return self.item(number)
 
     def pause(self, who: str) -> None:
-        """Let nothing more start, until `resume`."""
+        """Start no further item until `resume`."""
         with self._transaction():
             text = f"paused by {who} at {now()}"
             self._db.execute("INSERT OR REPLACE INTO setting VALUES (?, ?)", (_PAUSE, text))
@@ -266,10 +268,10 @@ class QueueStore:
             self._db.execute("DELETE FROM setting WHERE key = ?", (_PAUSE,))
             self._note(None, None, "pause lifted", f"by {who}")
 
-    # The runner's changes
+    # Changes by the runner
 
     def claim(self, number: int) -> Item | None:
-        """Take a queued item for its check; None if it is not queued any more, or paused."""
+        """Take a queued item for its check; None if it is not queued or the queue is paused."""
         with self._transaction():
             item = self.item(number)
             if item.state != QUEUED or self.paused:
@@ -283,7 +285,7 @@ class QueueStore:
         with self._transaction():
             item = self.item(number)
             if item.state != CHECKING:
-                raise InputError(f"item {number} is {item.state}; only a checked item begins")
+                raise InputError(f"item {number} is {item.state}; expected a checked item")
             self._db.execute(
                 "UPDATE item SET attempt = attempt + 1, run = ?, pid = NULL WHERE id = ?",
                 (item.next_folder(), number),
@@ -292,14 +294,14 @@ class QueueStore:
         return self.item(number)
 
     def note_process(self, number: int, pid: int) -> None:
-        """Keep the number of the process that runs an item."""
+        """Store the id of an item's process."""
         with self._transaction():
             self._db.execute("UPDATE item SET pid = ? WHERE id = ?", (pid, number))
 
     def finish(self, number: int, state: str, reason: str) -> Item:
-        """Enter a final state; an item that is over already is left as it is."""
+        """Set an item's final state; an item that has one is left unchanged."""
         if state not in OVER:
-            raise ValueError(f"{state!r} is no final state")
+            raise ValueError(f"{state!r} is not a final state")
         with self._transaction():
             item = self.item(number)
             if not item.over:
@@ -307,24 +309,24 @@ class QueueStore:
         return self.item(number)
 
     def release(self, number: int, reason: str) -> Item:
-        """Put an item back whose protocol did not begin: nothing moved and nothing was recorded."""
+        """Queue an item again whose protocol did not begin: no motion and no record."""
         with self._transaction():
             item = self.item(number)
-            if item.state == RUNNING:  # the folder of this attempt is free for the next
+            if item.state == RUNNING:  # the next attempt uses the same folder
                 self._db.execute("UPDATE item SET attempt = attempt - 1 WHERE id = ?", (number,))
             if item.state in ACTIVE:
                 self._enter(self.item(number), QUEUED, reason)
         return self.item(number)
 
     def keep_results(self, number: int, results: dict[str, Any]) -> None:
-        """Keep what was identified from an item's run."""
+        """Store the parameters identified from an item's run."""
         with self._transaction():
             self._db.execute(
                 "UPDATE item SET found = ? WHERE id = ?", (json.dumps(results), number)
             )
 
     def note(self, event: str, reason: str = "") -> None:
-        """Note what the queue as a whole did."""
+        """Add an action of the queue to the history."""
         with self._transaction():
             self._note(None, None, event, reason)
 

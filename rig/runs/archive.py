@@ -1,11 +1,11 @@
 """records.h5: plain HDF5 that h5py and MATLAB open; one group per record, units as attributes.
 
 Layout: `/NAME` is a record with one float64 dataset per channel (attribute `units`), its chunks
-with HDF5's own checksum (fletcher32), so that any reader refuses a sample changed later; attributes
-of the group are its step, repeat, locked joints, period and lines, what was lost, and whatever the
-protocol noted. `/between/0001 ...` are the samples outside of every record, so that the journal
-may go. Lists are one-dimensional integer arrays, flags are 0 or 1, text is UTF-8.
-`rig.runs.archive_reader` reads it.
+with HDF5's checksum (fletcher32), so that every reader refuses a sample changed later. Attributes
+of the group: step, repeat, locked joints, period, lines, lost samples and the protocol's notes.
+`/between/0001 ...` hold the samples outside all records, so that the journal can be removed. Lists
+are one-dimensional integer arrays, flags are 0 or 1, text is UTF-8. Read by
+`rig.runs.archive_reader`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rig.runs.sections import Assembled, Section, Written, assemble, blocks_of, 
 Array = NDArray[np.float64]
 
 NAME = "records.h5"
-_CHUNK = 1 << 14  # samples that are read, and checked, together
+_CHUNK = 1 << 14  # chunk size [samples], read and checked as a whole
 
 
 def write_group(
@@ -47,7 +47,9 @@ def write_group(
         target.attrs[key] = _plain(value)
     for name, values in columns.items():
         data = np.ascontiguousarray(values, dtype="<f8")
-        whole = data.ndim == 1 and len(data) > 0  # a checksum needs chunks, and they a length
+        whole = (
+            data.ndim == 1 and len(data) > 0
+        )  # a checksum needs chunks, which need a length above 0
         dataset = target.create_dataset(
             name, data=data, fletcher32=whole, chunks=(min(len(data), _CHUNK),) if whole else None
         )
@@ -56,7 +58,7 @@ def write_group(
 
 def _plain(value: Any) -> Any:
     if isinstance(value, bool):
-        return int(value)  # HDF5 would make an enumeration of it
+        return int(value)  # HDF5 would store an enumeration
     if isinstance(value, (tuple, list)):
         return np.array(value, dtype=np.int64)
     return value
@@ -123,12 +125,12 @@ def _attributes(
 
 
 def create(path: Path, rig_name: str, values: int) -> h5py.File:
-    """Open a fresh archive for writing, its root attributes set, with space for `values` numbers.
+    """Create an archive with its root attributes and disk space for `values` numbers.
 
-    Raises OSError where the disk has not got it: HDF5 may crash the process at a full disk.
+    Raises OSError if the space is missing, because HDF5 may crash the process on a full disk.
 
-    Without HDF5's file lock: nobody else knows the file until `put_in_place`, and a lock would pass
-    to a child process started meanwhile and refuse the check that follows.
+    Uses no HDF5 file lock: the file is private until `put_in_place`, and a child process started
+    meanwhile would inherit the lock and block the verification.
     """
     needed = 8 * values
     if shutil.disk_usage(path.parent).free < needed:
@@ -141,7 +143,7 @@ def create(path: Path, rig_name: str, values: int) -> h5py.File:
 
 
 def put_in_place(fresh: Path, path: Path) -> None:
-    """Give a finished archive its name, on the disk before anything relies on it."""
+    """Rename a finished archive to its final name, synchronised to disk."""
     sync_to_disk(fresh)
     os.replace(fresh, path)
     sync_to_disk(path.parent)
@@ -150,7 +152,7 @@ def put_in_place(fresh: Path, path: Path) -> None:
 def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written:
     """Write records.h5 and verify it against the journal, sample by sample.
 
-    Returns what it holds; raises RecordingFailed and leaves no archive if it cannot.
+    Returns the counts of its content; on failure raises RecordingFailed and leaves no archive.
     """
     spans = journal.spans()
     sections = plan(journal, spans)
@@ -184,14 +186,16 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
 
 
 def _note_saturation(group: h5py.Group, columns: Sequence[str], assembled: Assembled) -> None:
-    for name, count in zip(columns, assembled.saturated, strict=False):  # commands do not saturate
+    for name, count in zip(
+        columns, assembled.saturated, strict=False
+    ):  # commands have no saturation flags
         group[name].attrs["saturated_samples"] = int(count)
 
 
 def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:
-    """Compare every sample of the journal with the archive; raises OSError where they differ.
+    """Compare every sample of the journal with the archive; raises OSError on a difference.
 
-    Returns the number of blocks whose checksum fails, which nothing can be compared with.
+    Returns the number of journal blocks with a wrong checksum, which cannot be compared.
     """
     columns, spans = journal.meta("columns"), journal.spans()
     total = damaged = 0
@@ -209,7 +213,7 @@ def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:
                     raise OSError(f"group {section.group} differs at tick {block.tick}")
                 arrived += part.stop - part.start
             if arrived + int(file[section.group].attrs["lost_samples"]) != section.ticks:
-                raise OSError(f"group {section.group} miscounts its lost samples")
+                raise OSError(f"group {section.group} has a wrong count of lost samples")
             total += arrived
     if not damaged and total < int(spans.samples.sum()):
         raise OSError(

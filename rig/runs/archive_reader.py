@@ -1,4 +1,4 @@
-"""Reading records.h5 (`rig.runs.archive` says what is in it): heads, records, parts of them."""
+"""Reads records.h5 (layout: `rig.runs.archive`): heads, records, parts of records."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _OWN = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines",
 
 
 def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
-    """Return what a record's group says without its samples; raises InputError.
+    """Return a record's head, without its samples; raises InputError.
 
-    A group that h5py cannot open is None.
+    `group` is None if h5py cannot open it.
     """
     if not isinstance(group, h5py.Group):
         raise InputError(
@@ -53,7 +53,7 @@ def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
 def samples_of(
     group: h5py.Group, head: RecordHead, first: int = 0, last: int | None = None
 ) -> Record:
-    """Read the samples [first, last) of a record's group; InputError where they were changed."""
+    """Read the samples [first, last) of a record's group; InputError for a wrong checksum."""
     part = slice(first, last)
     columns = {}
     for name in head.channels:
@@ -63,14 +63,14 @@ def samples_of(
             raise InputError(
                 f"{group.file.filename}: record {head.name}, channel {name}: samples were changed "
                 "or damaged since they were written (their checksum does not match); take the "
-                f"file from a backup, or do without this run ({error})"
+                f"file from a backup, or leave this run out ({error})"
             ) from error
     return head.record(columns)
 
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn whatever a broken archive makes h5py raise into an InputError that names the file."""
+    """Convert any error of h5py on a damaged archive into an InputError with the file's name."""
     try:
         yield
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
@@ -80,7 +80,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def open_archive(path: Path) -> h5py.File:
-    """Open an archive for reading; raises InputError if the file is none."""
+    """Open an archive for reading; raises InputError for other files."""
     with readable(path):
         file = h5py.File(path, "r", locking=False)  # a finished archive is never changed in place
         if int(file.attrs.get("format", 0)) != FORMAT:
@@ -96,7 +96,7 @@ def _python(value: Any) -> Any:
 
 
 def read_heads(file: h5py.File, path: Path) -> list[RecordHead]:
-    """Return the heads of every record in the order it was taken."""
+    """Return the heads of all records in the order of recording."""
     heads = [head_of(name, group, path) for name, group in file.items() if name != BETWEEN]
     return sorted(heads, key=_record_order)
 
@@ -119,7 +119,7 @@ def count(path: Path) -> Written:
 
 
 def read_records(path: Path) -> list[Record]:
-    """Read every record in the order it was taken; raises InputError if the file is no archive."""
+    """Read all records in the order of recording; raises InputError."""
     with readable(path), open_archive(path) as file:
         return [samples_of(file[head.name], head) for head in read_heads(file, path)]
 

@@ -1,4 +1,4 @@
-"""Files and folders that must be whole or absent: read with limits, replaced atomically, synced."""
+"""Files and folders: read with limits, replaced atomically, synchronised to disk."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 
 from rig.model.parse import InputError
 
-MAX_TEXT = 1 << 20  # a description, not data: far beyond any real one
+MAX_TEXT = 1 << 20  # [bytes], far above any real text file
 CACHE_VARIABLE = "BRAMAH_CACHE"
 
 
 def cache_folder() -> Path:
-    """Return the folder of what can be computed again: $BRAMAH_CACHE, or below the user's cache."""
+    """Return the cache folder: $BRAMAH_CACHE, or one in the user's cache folder."""
     stated = os.environ.get(CACHE_VARIABLE)
     if stated:
         return Path(stated)
@@ -23,12 +23,12 @@ def cache_folder() -> Path:
 
 
 def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
-    """Return the UTF-8 text of a description; raises InputError saying what is wrong with it."""
+    """Return the UTF-8 text of a file; raises InputError. `what` names the file's kind."""
     try:
         if path.is_dir():
             raise InputError(f"{path}: is a folder; expected {what}")
         if not path.is_file() and path.exists():
-            raise InputError(f"{path}: is no regular file; expected {what}")
+            raise InputError(f"{path}: is not a regular file; expected {what}")
         with path.open("rb") as stream:
             raw = stream.read(limit + 1)
     except InputError:
@@ -77,12 +77,12 @@ def no_place_for(path: Path) -> str:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Replace a file so that a reader sees the old or the new text, never half; raises OSError."""
+    """Replace a file atomically: a reader sees the old or the new text; raises OSError."""
     replace_bytes(path, text.encode("utf-8"))
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
-    """Replace a file so that a reader sees the old or the new one, never half; raises OSError."""
+    """Replace a file atomically: a reader sees the old or the new bytes; raises OSError."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with fresh.open("wb") as stream:
@@ -91,7 +91,7 @@ def replace_bytes(path: Path, content: bytes) -> None:
             os.fsync(stream.fileno())
         fresh.replace(path)
     except OSError as error:
-        error.filename = os.fspath(path)  # a person knows no other, and a failed write names none
+        error.filename = os.fspath(path)  # the name that the user knows; a failed write names none
         raise
     finally:
         fresh.unlink(missing_ok=True)
@@ -100,10 +100,9 @@ def replace_bytes(path: Path, content: bytes) -> None:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """Give a folder to be filled with files, which are in `out` when all of them are written.
+    """Yield a temporary folder that becomes `out` when all files are written.
 
-    `out` is absent or an empty folder, and stays so where this fails or the process is killed.
-    Raises OSError.
+    `out` must be absent or empty, and stays so after an error or a kill. Raises OSError.
     """
     place = out.resolve()
     empty = place.exists()

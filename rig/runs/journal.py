@@ -47,18 +47,18 @@ CREATE TABLE mark (
 """
 
 
-# What the archive asks of every record's description.
+# Keys of every record's description that the archive needs.
 _DESCRIPTION: Final = frozenset(("name", "step", "repeat", "locked", "period", "lines"))
 
 
 def describes_record(meta: Any) -> bool:
-    """Return whether what was read as a mark's description has every key of a record's."""
+    """Return whether a mark's description has every key of a record's."""
     return isinstance(meta, dict) and _DESCRIPTION.issubset(meta)
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block as it stands in the journal; `late` [s] is None in virtual time."""
+    """A block of the journal; `late` [s] is None in virtual time."""
 
     stream: int
     sequence: int
@@ -70,7 +70,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Spans:
-    """Where blocks lie, without their samples: one entry per block in the order of arrival."""
+    """Stream, tick and length of blocks: one entry per block in order of arrival."""
 
     id: Ticks
     stream: Ticks
@@ -96,7 +96,7 @@ def _checksum(stream: int, sequence: int, tick: int, data: bytes, saturated: byt
 
 
 class Journal:
-    """One open journal; `create` to write, `open` to read; every failed write is RecordingFailed.
+    """One open journal; `create` to write, `open` to read; a failed write raises RecordingFailed.
 
     `max_pages` bounds its size in pages of 4 KiB (for tests of a full disk).
     """
@@ -116,7 +116,7 @@ class Journal:
         max_pages: int | None = None,
     ) -> Journal:
         """Start the journal of `columns` (the first `measured` are sensors); RecordingFailed."""
-        # Made under another name, renamed when whole: a kill leaves no journal or a usable one.
+        # Created under another name and renamed: a kill leaves no journal or a usable one.
         fresh = path.with_name(f"{path.name}.tmp")
         try:
             db = sqlite3.connect(fresh, isolation_level=None)
@@ -134,7 +134,7 @@ class Journal:
             fresh.replace(path)
             db = sqlite3.connect(path, isolation_level=None)
             # NORMAL: a kill loses nothing, a power cut at most the blocks since the last sync;
-            # FULL would hold up the acquisition by a disk sync for every block.
+            # FULL would delay the acquisition by a disk sync per block.
             db.execute("PRAGMA synchronous=NORMAL")
             if max_pages is not None:
                 db.execute(f"PRAGMA max_page_count={int(max_pages)}")
@@ -144,7 +144,7 @@ class Journal:
 
     @classmethod
     def open(cls, path: Path) -> Journal:
-        """Open a journal to read and finish it; raises InputError if it is none."""
+        """Open a journal to read and finish it; raises InputError for other files."""
         if not path.is_file():
             raise InputError(f"{path}: no such journal")
         try:
@@ -152,7 +152,7 @@ class Journal:
             journal = cls(db, path)
             if journal.meta("format") != _FORMAT:
                 db.close()
-                raise InputError(f"{path}: no journal of this format")
+                raise InputError(f"{path}: not a journal of this format")
         except sqlite3.Error as error:
             raise InputError(f"{path}: not a readable journal: {error}") from error
         return journal
@@ -162,12 +162,12 @@ class Journal:
             self._db.execute(sql, values)
         except sqlite3.Error as error:
             raise RecordingFailed(
-                f"{self.path}: cannot be written any more ({error}; is the disk full?); what was "
-                "recorded until then is kept"
+                f"{self.path}: cannot be written ({error}; is the disk full?); the blocks "
+                "recorded before are kept"
             ) from error
 
     def append(self, stream: int, block: SampleBlock, late: float | None) -> None:
-        """Keep one block (samples as float64); returns when it is safe; RecordingFailed."""
+        """Write one block (samples as float64) safely; raises RecordingFailed."""
         data = np.ascontiguousarray(block.data, dtype="<f8").tobytes()
         marked = np.count_nonzero(block.saturated)
         marks = np.packbits(block.saturated).tobytes() if marked else b""
@@ -193,11 +193,11 @@ class Journal:
         )
 
     def set_meta(self, key: str, value: Any) -> None:
-        """Note one fact about the run."""
+        """Store one property of the run."""
         self._write("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
 
     def meta(self, key: str) -> Any:
-        """Return a noted fact, None if there is none."""
+        """Return a stored property, None if there is none."""
         row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return None if row is None else json.loads(row[0])
 
@@ -212,12 +212,12 @@ class Journal:
         ]
 
     def spans(self) -> Spans:
-        """Return where every readable block lies, in the order of arrival."""
+        """Return the spans of all readable blocks in order of arrival."""
         out: list[tuple[int, int, int, int]] = []
         rows = self._db.execute("SELECT id, stream, tick, samples FROM block ORDER BY id")
         try:
             out.extend(rows)
-        except sqlite3.DatabaseError as error:  # a damaged page: keep what stands before it
+        except sqlite3.DatabaseError as error:  # a damaged page: keep the blocks before it
             log.warning("%s: unreadable after %d blocks: %s", self.path, len(out), error)
         table = np.array(out, dtype=np.int64).reshape(len(out), 4)
         return Spans(*table.T)
@@ -235,7 +235,7 @@ class Journal:
                 yield int(row[0]), decode_row(row[1:], columns, measured)
 
     def in_order(self) -> None:
-        """Number the blocks anew in the order of stream and tick; raises RecordingFailed."""
+        """Renumber the blocks in order of stream and tick; raises RecordingFailed."""
         rows = (
             "INSERT INTO block SELECT NULL, stream, sequence, tick, samples, late, crc, data, "
             "saturated FROM unordered ORDER BY stream, tick"

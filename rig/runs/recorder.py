@@ -39,10 +39,10 @@ Attribute = str | float | int
 
 @dataclass(frozen=True)
 class RecordMeta:
-    """What a record is: its step and repeat, what was locked, what excited it.
+    """Description of a record: step, repeat, locked joints, excitation.
 
     `locked` holds 1-based joints; `period` [samples] and `lines` describe the excitation;
-    `name` defaults to ``{step}_r{repeat}``. Raises ValueError for a name no file could bear.
+    `name` defaults to ``{step}_r{repeat}``. Raises ValueError for an invalid name.
     """
 
     step: str
@@ -61,7 +61,7 @@ class RecordMeta:
                 raise ValueError(f"{text!r} cannot name a record; use letters, digits, '_', '-'")
 
     def as_dict(self, more: Mapping[str, Attribute] | None = None) -> dict[str, Any]:
-        """Return it as plain data, with further attributes."""
+        """Return the description as plain data, with further attributes."""
         return {
             "name": self.name,
             "step": self.step,
@@ -102,9 +102,9 @@ class Recorder:
         self._journal: Journal | None = None
         self._events: EventLog | None = None
         self._names: set[str] = set()
-        self._unfinished: tuple[int, RecordMeta, int] | None = None  # the record left last
+        self._unfinished: tuple[int, RecordMeta, int] | None = None  # the last record that ended
         self._stream = 0
-        self._clock: StreamClock | None = None  # of the present stream, from its first block on
+        self._clock: StreamClock | None = None  # of the current stream, from its first block on
         self._newest = 0.0  # [s] since the run began, of the newest sample
         self._began = 0.0  # [s] by the host's clock, at the arrival of the first block
         store.refuse_occupied(self.folder)
@@ -116,11 +116,11 @@ class Recorder:
 
     @property
     def elapsed(self) -> float:
-        """Time [s] since the run began of the newest sample, across restarts of the device."""
+        """Time [s] of the newest sample since the run began, across restarts of the device."""
         return self._newest
 
     def open(self, info: DeviceInfo) -> None:
-        """Make the folder and its journal; the run is `running` from here on."""
+        """Create the folder and its journal; the state of the run is then `running`."""
         about: Any = self._about
         store.create_run(
             self.folder, self.rig, device=info.identity, virtual_time=info.virtual_time, **about
@@ -150,9 +150,9 @@ class Recorder:
         return self._journal
 
     def begin_stream(self) -> None:
-        """Note that the device counts its ticks anew from the next block on.
+        """Begin a stream: the device's ticks restart with the next block.
 
-        A record that the end of the stream before left unfinished is none: it can be taken again.
+        A record that the end of the previous stream left unfinished is discarded; its name is free.
         """
         if self._unfinished is not None:
             number, meta, ticks = self._unfinished
@@ -162,7 +162,7 @@ class Recorder:
         self._clock = None
 
     def append(self, block: SampleBlock, late: float | None) -> None:
-        """Keep one block, `late` [s] behind its time (None in virtual time)."""
+        """Write one block, which arrived `late` [s] (None in virtual time)."""
         journal = self._open_journal()
         journal.append(self._stream, block, late)
         if self._clock is None:
@@ -171,12 +171,12 @@ class Recorder:
             self._newest = self._clock.at(block.tick + len(block.data), self.rig.sample_rate)
 
     def _begin_clock(self, block: SampleBlock, *, virtual: bool) -> None:
-        """Place a stream's first tick in the time since the run began, which no restart resets."""
+        """Set the time since the run's begin of a stream's first tick."""
         arrived = time.monotonic()
         length = len(block.data) / self.rig.sample_rate
         first = not self._began
         self._began = self._began or arrived
-        # In virtual time the host's clock says nothing about the device's: streams adjoin there.
+        # In virtual time the clocks are unrelated: streams follow without a gap.
         began = 0.0 if first else self._newest if virtual else arrived - self._began
         self._newest = began
         self._clock = StreamClock(block.tick, began, now())
@@ -184,7 +184,7 @@ class Recorder:
         self._newest = began + length
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
-        """Note one event; it is on the disk when this returns."""
+        """Write one event; it is on disk when this returns."""
         if self._events is None:
             raise RecordingFailed(f"{self.folder}: the run is not open for recording")
         at = self._newest
@@ -195,7 +195,7 @@ class Recorder:
     def begin_record(self, meta: RecordMeta, start: int) -> int:
         """Open a record at a tick; raises ValueError if its name was used before."""
         if meta.name in self._names:
-            raise ValueError(f"record {meta.name!r} stands in this run already")
+            raise ValueError(f"this run already has a record {meta.name!r}; expected another name")
         number = self._open_journal().begin_mark(self._stream, start, meta.as_dict())
         self._names.add(meta.name)
         self.event("record begins", start, record=meta.name)
@@ -217,13 +217,13 @@ class Recorder:
         self.event(f"record {state}", record=meta.name, ticks=ticks)
 
     def finish(self, state: str, message: str = "") -> None:
-        """End the run: write and verify records.h5, set the state, drop the journal.
+        """End the run: write and verify records.h5, set the state, remove the journal.
 
         If the archive cannot be written the state is `aborted`, the journal stays, and
-        RecordingFailed says what to do. Calling it again does nothing.
+        RecordingFailed says what to do. Further calls do nothing.
         """
         if state not in STATES or state == RUNNING:
-            raise ValueError(f"{state!r} is no state to end in")
+            raise ValueError(f"{state!r} is not a final state")
         journal, self._journal = self._journal, None
         if journal is None:
             return
@@ -261,11 +261,11 @@ def finalise(
     state: str,
     note: Callable[[Written], None] | None = None,
 ) -> Written:
-    """Turn a journal into records.h5, call `note`, set the state, then let the journal go.
+    """Convert a journal to records.h5, call `note`, set the state, remove the journal.
 
-    `note` writes why the run ended: a state whose reason is not in the folder yet would leave a
-    process killed at that moment without one. A journal with damaged blocks is kept beside as
-    `journal.damaged.sqlite`. Raises RecordingFailed; the journal is then untouched.
+    `note` writes why the run ended, before the state is set, so that a kill in between leaves no
+    state without a reason. A journal with damaged blocks is kept as `journal.damaged.sqlite`.
+    Raises RecordingFailed; the journal is then unchanged.
     """
     from rig.runs.archive import write_from_journal  # noqa: PLC0415 - h5py loads slowly
 

@@ -1,4 +1,4 @@
-"""Finalise a run whose process died, wherever it died."""
+"""Finalises a run whose process died at any moment."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecoverReport:
-    """What `recover` found and did; `records` counts complete and partial ones.
+    """Result of `recover`; `records` counts complete and partial ones.
 
-    `samples` were measured within records, `lost_samples` are missing there, `outside` were
-    measured between them.
+    Counts: `samples` within records, `lost_samples` missing in them, samples `outside` records.
 
-    `damaged` is where a damaged journal is kept, of which `missing` samples are known to be lost.
+    `damaged` is the path of a damaged journal, from which at least `missing` samples are lost.
     """
 
     path: Path
@@ -44,12 +43,12 @@ class RecoverReport:
 
 
 def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
-    """Finalise an interrupted run; doing it twice is harmless.
+    """Finalise an interrupted run; repeating it changes nothing.
 
-    The state becomes the one the run was about to end in, or `interrupted`. `force` recovers a
-    run of another computer, where this one cannot ask whether its process lives. Raises
-    InputError (no run, still running) and RecordingFailed (the disk; nothing of the journal can be
-    read). A damaged journal is never deleted: see `RecoverReport.damaged`.
+    The state becomes the final one that the run was about to set, or `interrupted`. `force`
+    recovers a run of another computer, whose process cannot be checked. Raises InputError (not a
+    run, or still running) and RecordingFailed (not writable, or journal unreadable). A damaged
+    journal is never deleted: see `RecoverReport.damaged`.
     """
     folder = Path(path)
     header = store.read_header(folder)
@@ -105,7 +104,7 @@ def _from_journal(folder: Path, rig: Rig, stood: str) -> RecoverReport:
 
 
 def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverReport:
-    """Finalise what a damaged journal still holds; the journal itself is kept beside."""
+    """Finalise the readable part of a damaged journal and keep the journal."""
     path = folder / runstate.JOURNAL
     state = _outcome(path) or stood
     journal, rebuilt = rebuild(path, rig, damage)
@@ -113,8 +112,8 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
         if not rebuilt.blocks:
             journal.delete()
             raise RecordingFailed(
-                f"{path}: not a readable journal: {damage}; no block of samples in it can be read. "
-                "It stays as it is: copy it from a backup, or start the run anew"
+                f"{path}: not a readable journal: {damage}; none of its blocks can be read. "
+                "The file is unchanged: restore it from a backup, or repeat the run"
             )
         written = finalise(journal, folder, rig.name, state)
     finally:
@@ -129,7 +128,7 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
     )
     if rebuilt.nameless:
         message += (
-            f"; what these records were cannot be read, their samples stand under "
+            f"; the descriptions of these records are lost, their samples are under "
             f"{runstate.BETWEEN}: {', '.join(rebuilt.nameless)}"
         )
     _note(folder, state, message)
@@ -138,7 +137,7 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
 
 
 def _outcome(path: Path) -> str | None:
-    """Return the state that a damaged journal's run was about to end in, if that can be read."""
+    """Return the final state stored in a damaged journal, None if it cannot be read."""
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as db:
             outcome = Journal(db, path).meta("outcome")
@@ -156,7 +155,7 @@ def _counts(written: Written) -> str:
 
 
 def _tidy(folder: Path) -> None:
-    """Remove what a killed process had begun and not yet given its name."""
+    """Remove the temporary files of a killed process."""
     for stray in folder.glob("*.tmp*"):
         stray.unlink(missing_ok=True)
 

@@ -13,17 +13,17 @@ from rig.runs.files import read_text
 from rig.runs.store import parse_header
 
 _WHAT = "a rig file (YAML)"
-_RESOLVED = re.compile(r"^format:", re.MULTILINE)  # of a run.yaml; no rig file has that key
+_RESOLVED = re.compile(r"^format:", re.MULTILINE)  # key of a run.yaml that no rig file has
 
 
 def shipped_rigs() -> tuple[str, ...]:
-    """Name the rigs that come with the software."""
+    """Return the names of the shipped rigs."""
     entries = resources.files("rig").joinpath("shipped").iterdir()
     return tuple(sorted(e.name.removesuffix(".yaml") for e in entries if e.name.endswith(".yaml")))
 
 
 def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple[str, str]:
-    """Return (text, where it was read) of a rig; a shipped name goes before a file of that name.
+    """Return (text, source) of a rig; a shipped name has priority over a file of that name.
 
     `relative_to` is the folder that a relative path starts from (default: the current one).
     Raises InputError.
@@ -44,7 +44,7 @@ def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple
 
 
 def load_bench(name: str | Path) -> Rig:
-    """Load a rig that this software can drive; raises InputError, also for an electric one."""
+    """Load a rig that can be driven; raises InputError, also for an electric rig."""
     rig = load_rig(name)
     if rig.electric:
         raise InputError(
@@ -55,9 +55,9 @@ def load_bench(name: str | Path) -> Rig:
 
 
 def load_rig(name_or_path: str | Path, relative_to: Path | None = None) -> Rig:
-    """Load a rig by shipped name, rig file, or the run.yaml of a run that was taken on it.
+    """Load a rig by shipped name, rig file, or a run.yaml recorded on it.
 
-    Raises InputError naming file, line and expectation.
+    Raises InputError naming file, line and expected value.
     """
     text, source = rig_text(name_or_path, relative_to)
     if _RESOLVED.search(text):

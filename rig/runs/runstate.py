@@ -1,4 +1,4 @@
-"""The small files of a run folder that say how it stands: state, owner, events.
+"""Status files of a run folder: state, owner, events.
 
 `state` is one word, replaced atomically. `owner.json` names the process that writes the folder,
 with its start time so that a reused process number is not mistaken for it. `events.jsonl` has one
@@ -35,7 +35,7 @@ STATES: Final = (RUNNING, DONE, ABORTED, TRIPPED, INTERRUPTED)
 HEADER: Final = "run.yaml"
 JOURNAL: Final = "journal.sqlite"
 EVENTS: Final = "events.jsonl"
-BETWEEN: Final = "between"  # the group of records.h5 for samples outside of every record
+BETWEEN: Final = "between"  # group of records.h5 for samples outside all records
 _STATE, _OWNER = "state", "owner.json"
 
 
@@ -45,10 +45,10 @@ def here() -> str:
 
 
 def user_name() -> str:
-    """Return the name of the user whose process this is."""
+    """Return the name of this process's user."""
     try:
         return getpass.getuser()
-    except (OSError, KeyError):  # a user number without a name, as in containers
+    except (OSError, KeyError):  # a user id without a name, as in containers
         return str(os.getuid())
 
 
@@ -67,7 +67,7 @@ class Owner:
 
 
 def process_started(pid: int) -> str | None:
-    """Return when a process started, in its kernel's words; None if there is no such process."""
+    """Return the kernel's start time of a process as text; None if there is no such process."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
@@ -78,7 +78,7 @@ def process_started(pid: int) -> str | None:
     else:
         fields = stat.rpartition(")")[2].split()
         return None if fields[0] in ("Z", "X") else fields[19]
-    try:  # no /proc here: ask by signal 0
+    try:  # without /proc: test with signal 0
         os.kill(pid, 0)
     except ProcessLookupError:
         return None
@@ -88,7 +88,7 @@ def process_started(pid: int) -> str | None:
 
 
 def process_alive(pid: int, started: str = "") -> bool:
-    """Whether process `pid` lives; with `started`, whether it is still the same one."""
+    """Return whether process `pid` runs and, with `started`, is still the same one."""
     began = process_started(pid)
     if began is None:
         return False
@@ -96,18 +96,18 @@ def process_alive(pid: int, started: str = "") -> bool:
 
 
 def take_ownership(folder: Path) -> None:
-    """Note this process as the one that writes the run."""
+    """Store this process as the writer of the run."""
     owner = Owner(os.getpid(), process_started(os.getpid()) or "", here())
     replace_text(folder / _OWNER, json.dumps(asdict(owner)) + "\n")
 
 
 def release_ownership(folder: Path) -> None:
-    """Remove the note of who writes the run."""
+    """Remove the entry of the run's writer."""
     (folder / _OWNER).unlink(missing_ok=True)
 
 
 def read_owner(folder: Path) -> Owner | None:
-    """Return the process that writes the run, None if the file names none."""
+    """Return the process that writes the run, None without a valid entry."""
     try:
         return Owner(**json.loads((folder / _OWNER).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
@@ -115,7 +115,7 @@ def read_owner(folder: Path) -> Owner | None:
 
 
 def owner_alive(owner: Owner | None) -> bool:
-    """Whether the run's writer lives, as far as this machine can tell."""
+    """Return whether the run's writer is running; True if this machine cannot determine it."""
     if owner is None or owner.host != here():
         return False
     return process_alive(owner.pid, owner.started)
@@ -127,7 +127,7 @@ def write_state(folder: Path, state: str) -> None:
 
 
 def read_state(folder: Path) -> str:
-    """Return the state as it is: a run whose writer died while running is `interrupted`."""
+    """Return the state; a run in state `running` whose writer died is `interrupted`."""
     try:
         word = (folder / _STATE).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):
@@ -176,7 +176,7 @@ class EventLog:
 
 @dataclass(frozen=True)
 class StreamClock:
-    """The clocks of one stream: its first tick, when that was [s] since the run began, and where.
+    """The clock of one stream: its first tick and the time of that tick [s] since the run began.
 
     `host` is the wall clock (ISO 8601, UTC) at the arrival of the stream's first block.
     """
@@ -194,7 +194,7 @@ STREAM: Final = "stream begins"
 
 
 def stream_clocks(events: Iterable[Mapping[str, Any]]) -> dict[int, StreamClock]:
-    """Return the clocks of every stream that a run's events tell of."""
+    """Return the clocks of all streams from a run's events."""
     clocks: dict[int, StreamClock] = {}
     for event in events:
         if event.get("event") == STREAM:
@@ -205,7 +205,7 @@ def stream_clocks(events: Iterable[Mapping[str, Any]]) -> dict[int, StreamClock]
 
 
 def read_events(folder: Path) -> list[dict[str, Any]]:
-    """Return the events of a run; a line torn by a kill is left out."""
+    """Return the events of a run, without a line left incomplete by a kill."""
     try:
         raw = (folder / EVENTS).read_bytes()
     except OSError:

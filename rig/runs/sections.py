@@ -1,9 +1,9 @@
-"""From a journal to sections: the marked records, and what was measured between them.
+"""Sections of a journal: the marked records, and the samples between them.
 
 A record keeps a continuous time base: row k is tick start + k, and a sample that never arrived is
-NaN in every channel, counted in `lost_samples`. (A record split at a gap would lose what makes
-repeats comparable: the same excitation, started at the same sample.) A record that the run did
-not live to finish is kept up to its last sample, with `complete` 0.
+NaN in every channel, counted in `lost_samples`. (Splitting a record at a gap would make repeats
+incomparable, which need the same excitation from the same sample on.) A record that was not
+finished when the run ended is kept up to its last sample, with `complete` 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Section:
-    """A tick range of one stream and the group of the archive it becomes."""
+    """A tick range of one stream and its group in the archive."""
 
     group: str
     stream: int
@@ -40,7 +40,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Assembled:
-    """A section's samples (ticks, columns) with NaN where lost, and what was counted."""
+    """A section's samples (ticks, columns), NaN if lost, and its counts."""
 
     data: Array
     lost: int
@@ -52,9 +52,9 @@ class Assembled:
 
 @dataclass(frozen=True)
 class Written:
-    """What an archive holds: records (complete or not), samples measured in them, and missing.
+    """Contents of an archive: records (complete or not), samples in them, and lost samples.
 
-    `outside` are the samples measured between records.
+    `outside` counts the samples between records.
     """
 
     records: int
@@ -101,7 +101,7 @@ def _record(mark: Mark, extent: dict[int, tuple[int, int]]) -> Section | None:
         return None
     low, high = extent[mark.stream]
     wanted_end = high if mark.ticks is None else mark.start + mark.ticks
-    # Leading samples that never came are lost samples of the record, not another start.
+    # Missing leading samples are lost samples of the record and do not change its start.
     ticks = min(wanted_end, high) - mark.start
     if ticks <= 0 or wanted_end <= low:
         return None
@@ -111,7 +111,7 @@ def _record(mark: Mark, extent: dict[int, tuple[int, int]]) -> Section | None:
 
 
 def _unmarked(runs: Sequence[_Run], records: Sequence[Section]) -> list[Section]:
-    """Cover what was measured outside of every record; a gap begins another section."""
+    """Return sections of the samples outside all records; a gap begins another section."""
     unmarked: list[Section] = []
     for run in runs:
         pieces = [(run.start, run.end)]
@@ -129,7 +129,7 @@ def _unmarked(runs: Sequence[_Run], records: Sequence[Section]) -> list[Section]
 
 
 def plan(journal: Journal, spans: Spans) -> list[Section]:
-    """Return the journal's records, then what lies between them; together every sample once."""
+    """Return the records, then the sections between them; together they hold every sample once."""
     runs = _runs(spans)
     extent = _extent(runs)
     records = [r for mark in journal.marks() if (r := _record(mark, extent)) is not None]

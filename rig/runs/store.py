@@ -1,4 +1,4 @@
-"""Run folders: make one, load one as data."""
+"""Run folders: creating and loading."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _NOTE = "# How this run was taken. Numbers are SI: m, Pa, V, s, Hz, rad, degC.\n
 
 
 class Header(BaseModel):
-    """What run.yaml holds; keys of later versions are ignored."""
+    """Contents of run.yaml; keys of later versions are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -90,12 +90,12 @@ def create_run(
     virtual_time: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Make a run folder in state `running`, owned by this process.
+    """Create a run folder in state `running`, owned by this process.
 
-    `protocol` is the resolved protocol as plain data, with a `name`; `provenance` what else a
-    reader needs to take the same run again: command, files with checksums, seeds. `virtual_time`:
-    the device's clock stood still while nobody read, so it was a simulator. Raises InputError if
-    the folder is occupied or cannot be made.
+    `protocol`: the resolved protocol as plain data, with a `name`. `provenance`: command, files
+    with checksums and seeds, for repeating the run. `virtual_time`: the device is a simulator whose
+    clock advances only when it is read. Raises InputError if the folder is occupied or cannot be
+    created.
     """
     refuse_occupied(folder)
     head = {
@@ -118,16 +118,16 @@ def create_run(
         write_state(folder, RUNNING)
         replace_text(folder / HEADER, _NOTE + yaml.safe_dump(head, sort_keys=False))
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from error
+        raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
     return folder
 
 
 @contextmanager
 def whole_run(out: Path, rig: Rig, source: str) -> Iterator[Path]:
-    """Give the folder of a run that no bench records, in `out` when it is filled and finished.
+    """Yield a temporary folder for a run without a bench; it becomes `out` when finished.
 
-    It is whole or not there. Raises InputError if `out` is occupied, RecordingFailed if the disk
-    does not take it.
+    `out` is complete or absent. Raises InputError if `out` is occupied, RecordingFailed if it
+    cannot be written.
     """
     refuse_occupied(out)
     try:
@@ -140,7 +140,7 @@ def whole_run(out: Path, rig: Rig, source: str) -> Iterator[Path]:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds a run."""
+    """Return whether a folder is a run folder."""
     return (folder / HEADER).is_file()
 
 
@@ -178,7 +178,7 @@ def parse_header(text: str, source: str) -> Header:
 
 
 def finished(folder: Path) -> tuple[Header, str]:
-    """Return head and state of a run whose records can be read; raises InputError otherwise."""
+    """Return header and state of a finalised run; raises InputError otherwise."""
     header = read_header(folder)
     state = read_state(folder)
     if state == RUNNING:
@@ -194,7 +194,7 @@ def finished(folder: Path) -> tuple[Header, str]:
 
 
 def chosen_of(folder: Path, state: str, records: Sequence[T], partial: bool) -> tuple[T, ...]:
-    """Return the complete records, with `partial` all; raises InputError where there are none."""
+    """Return the complete records, or all if `partial`; raises InputError if there are none."""
     chosen = tuple(r for r in records if partial or r.attributes["complete"])
     if not chosen:
         kept = f"; it keeps {len(records)} unfinished one(s)" if records else ""
@@ -203,10 +203,10 @@ def chosen_of(folder: Path, state: str, records: Sequence[T], partial: bool) -> 
 
 
 def load_run(path: str | Path, *, partial: bool = False) -> Run:
-    """Load a run's complete records, with `partial` the unfinished ones as well.
+    """Load a run's complete records and, if `partial`, the unfinished ones.
 
     A sample lost on the wire is NaN in every channel (attribute `lost_samples` counts them).
-    Raises InputError with a one-line message for anything that cannot be read.
+    Raises InputError with a one-line message for unreadable data.
     `rig.runs.stream` reads them one by one.
     """
     folder = Path(path)
@@ -218,9 +218,9 @@ def load_run(path: str | Path, *, partial: bool = False) -> Run:
 
 
 def refuse_repeated(folders: Sequence[str | Path]) -> None:
-    """Raise InputError where two folders are one run: by path, or by equal content of records.h5.
+    """Raise InputError if two folders are the same run: by path, or by content of records.h5.
 
-    Folders that are not here (a cluster may read them elsewhere) are told apart by name only.
+    Folders that do not exist here (a cluster may read them elsewhere) are compared by name only.
     """
     seen: dict[object, Path] = {}
     sized: dict[int, list[Path]] = {}
@@ -229,15 +229,15 @@ def refuse_repeated(folders: Sequence[str | Path]) -> None:
         archive = folder / ARCHIVE
         if archive.is_file():
             like = sized.setdefault(archive.stat().st_size, [])
-            for other in like:  # equal in size: then the content tells
+            for other in like:  # equal size: compare the contents
                 seen.setdefault(_digest(other / ARCHIVE), other)
             keys += [_digest(archive)] if like else []
             like.append(folder)
         for key in keys:
             if key in seen:
                 raise InputError(
-                    f"{folder}: is the same run as {seen[key]}; the same samples twice are no "
-                    "further evidence: name each run once"
+                    f"{folder}: is the same run as {seen[key]}; expected each run once, "
+                    "since repeated samples add no information"
                 )
             seen[key] = folder
 
@@ -251,5 +251,5 @@ def _digest(path: Path) -> str:
 
 
 def mark_done(folder: Path) -> None:
-    """Set the state of a run that needed no journal (an import) to done."""
+    """Set the state of a run without a journal (an import) to done."""
     write_state(folder, DONE)

@@ -1,4 +1,4 @@
-"""Runs read piece by piece: heads first, then one record, or a part of one, at a time."""
+"""Reads runs in parts: heads first, then one record, or part of a record, at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rig.runs import archive_reader, store
 
 @dataclass(frozen=True)
 class RunHead:
-    """A run without samples: rig, the heads of its records, where it is and how it ended."""
+    """A run without samples: rig, heads of its records, path and final state."""
 
     rig: Rig
     records: tuple[RecordHead, ...]
@@ -25,7 +25,7 @@ class RunHead:
 
 
 class RecordReader:
-    """One record of an open archive, whose samples are read when asked for."""
+    """One record of an open archive; its samples are read on request."""
 
     def __init__(self, path: Path, group: h5py.Group, head: RecordHead) -> None:
         self.head = head
@@ -33,7 +33,7 @@ class RecordReader:
         self._group = group
 
     def read(self, first: int = 0, last: int | None = None) -> Record:
-        """Return the samples [first, last) as a record of their own."""
+        """Return the samples [first, last) as a record."""
         with archive_reader.readable(self._path):
             return archive_reader.samples_of(self._group, self.head, first, last)
 
@@ -61,7 +61,7 @@ def open_record(path: str | Path, name: str) -> Iterator[RecordReader]:
 
 
 def iterate_records(path: str | Path) -> Iterator[Record]:
-    """Yield a run's records in the order they were taken, one in memory at a time.
+    """Yield a run's records in the order of recording, one in memory at a time.
 
     Raises InputError as `store.load_run` does.
     """

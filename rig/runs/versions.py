@@ -1,4 +1,4 @@
-"""Which software took a run: version, interpreter, platform and commit, for run.yaml."""
+"""Software versions of a run for run.yaml: package, interpreter, platform and commit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-# What turns bytes into numbers and numbers into files: a run taken again wants the same.
+# Libraries that decode, store or compute data; a repeated run needs the same versions.
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "pymodbus", "pyserial", "pydantic")
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,7 +45,7 @@ def _version(name: str) -> str | None:
 
 
 def versions() -> dict[str, str]:
-    """Return what a reader needs to take the same run again: software and where it ran."""
+    """Return the software versions and the platform of this process."""
     out = {
         "bramah": _version("bramah") or "unknown",
         "python": platform.python_version(),

@@ -311,6 +311,6 @@ def test_a_report_is_written_whole_and_one_that_cannot_be_says_where(
     path = tmp_path / "r.html"
     write(path, html)
     with pytest.raises(InputError, match=re.escape("cannot write the report")):
-        write(tmp_path / "no" / "r.html", html)
+        write(path / "r.html", html)  # a file stands where the folder should
     assert path.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]

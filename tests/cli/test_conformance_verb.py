@@ -22,12 +22,12 @@ def test_a_device_is_checked_and_nothing_put_out(tmp_path: Path) -> None:
         assert unknown.returncode == 2
         driven = bramah_here(*modbus, "--outputs", "--only", "zero_within_one_block")
         assert driven.returncode == 0
-        assert "what they drive will move" in driven.stderr
+        assert "the joints will move" in driven.stderr
     verdicts = {one["check"]: one["verdict"] for one in json.loads(report.read_text())["results"]}
     assert verdicts["identity"] == "passed"
     assert verdicts["waveform_is_played"] == "skipped"
     assert "samples_in_order" in checked.stdout
-    assert "name that, or give --endpoint modbus-rtu://" in other.stderr
+    assert "expected that driver, or --endpoint modbus-rtu://" in other.stderr
     assert "no check is called 'levitation'" in unknown.stderr
 
 

@@ -149,7 +149,7 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     folder: Path, rubbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, run, none = folder / "rubbing.json", folder / "run", folder / "none"
-    with pytest.raises(InputError, match="--like takes a model's terms"):
+    with pytest.raises(InputError, match="--like uses the terms of a model"):
         bramah("identify", run, "--like", model, "--with", "payload")
     other = load_model(model)
     save_model(

@@ -76,7 +76,7 @@ def test_what_could_not_be_confirmed_is_said_first() -> None:
 def test_pressure_that_the_rig_cannot_let_out_is_named(endpoint: str) -> None:
     left = bramah_here("depressurise", "--rig", RIG, "--endpoint", endpoint)
     assert left.returncode == 1
-    assert "no way to let the pressure out" in left.stderr
+    assert "no way to release the pressure" in left.stderr
     assert "supply 7.0" in left.stderr
 
 

@@ -195,7 +195,7 @@ def test_check_says_that_nothing_changed_and_so_does_a_run_folder(tmp_path: Path
     assert (first.returncode, again.returncode) == (0, 0), first.stderr + again.stderr
     assert "the kept proof stands" not in first.stdout
     assert again.stdout.strip() == (
-        first.stdout.strip() + "\n\nunchanged since it was proved; the kept proof stands"
+        first.stdout.strip() + "\n\nnothing has changed since the last proof; it is shown again"
     )
 
 

@@ -167,7 +167,7 @@ def test_observers_see_all_and_one_with_a_fault_is_dismissed(
             bench.run_for(0.02)
             other.discard("disturbed")
     assert broken.calls == 1
-    assert "Broken failed and sees no more" in caplog.text
+    assert "Broken failed and is removed" in caplog.text
     assert seeing.ticks == list(range(0, 90, 10))
     assert seeing.heard == [
         ("begins", "step1_r1", 50),

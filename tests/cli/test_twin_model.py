@@ -60,7 +60,7 @@ def test_a_protocol_that_nominal_values_pass_is_refused_once_the_machine_is_iden
     checked = ("check", protocol, "--rig", RIG)
     before = bramah(*checked)
     assert before.returncode == 0, before.stderr
-    assert "the twin has the nominal values of the rig file" in before.stdout
+    assert "the twin uses the nominal values of the rig file" in before.stdout
     queued = bramah("queue", "add", protocol, "--rig", RIG, "--out", tmp_path / "queued")
     assert queued.returncode == 0, queued.stderr
 
@@ -105,7 +105,7 @@ def test_a_run_keeps_which_model_it_was_proved_on(tmp_path: Path, rig: Rig) -> N
             "--out", "run", cwd=tmp_path,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "the twin has the last identified model" in done.stderr
+    assert "the twin uses the last identified model" in done.stderr
     proof = json.loads((tmp_path / "run" / "proof.json").read_text())
     source = twin_source(rig)
     assert proof["model"] == source.as_dict()
@@ -239,7 +239,7 @@ def test_a_model_that_cannot_serve_does_not_replace_the_one_before(
     save_identified(identified(rig, 1.1), tmp_path / "good.json", said.append)
     save_identified(identified(rig, 1.2, 0.4), tmp_path / "vague.json", said.append)
     assert "good.json from now on" in said[0]
-    assert "vague.json does not become the model" in said[1]
+    assert "vague.json is not used by check and run" in said[1]
     assert twin_source(rig).shown == str(tmp_path / "good.json")
     assert (
         load_model(tmp_path / "vague.json").values["C_pp_1"] > 0

@@ -258,7 +258,7 @@ def test_one_screen_holds_the_controls_and_anyone_may_stop() -> None:
     first, second = Command("pause", holder="first"), Command("resume", holder="second")
     assert holder.judge(first, lambda _: None) is None
     refused = holder.judge(second, lambda _: None)
-    assert refused == "the controls are held by first; take them, or wait for their release"
+    assert refused == "first is in control; take control, or wait for its release"
     assert holder.judge(Command("stop"), lambda _: "never") is None
     assert holder.judge(Command("release", holder="first"), None) is None
     assert holder.judge(second, lambda _: "not now") == "not now"

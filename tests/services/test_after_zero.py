@@ -135,7 +135,7 @@ def test_a_device_that_still_reports_a_command_is_an_alarm_and_in_the_record(
     ):
         bench.apply(MOVE)
         bench.run_for(1.0)
-    assert "outputs not confirmed at zero: it still reports a command" in caplog.text
+    assert "outputs not confirmed at zero: the device still reports a command" in caplog.text
     assert "outputs not confirmed at zero" in caught.value.__notes__
     assert len(commands(run)) == 160 + 6000
     assert "not confirmed" in read_events(run)[-1]["message"]

@@ -140,7 +140,10 @@ def test_a_bench_in_use_is_refused_with_the_run_and_process_that_have_it(tmp_pat
         assert f"process {os.getpid()}, which writes {run}" in str(refused.value)
         assert BenchState(RIG.wire).holder() is not None
     assert BenchState(RIG.wire).holder() is None
-    with pytest.raises(DeviceBusy, match="no process of this computer"), Bench(RIG, Busy(RIG)):
+    with (
+        pytest.raises(DeviceBusy, match="no known process of this computer"),
+        Bench(RIG, Busy(RIG)),
+    ):
         pytest.fail("two sessions with one bench")
 
 

@@ -145,5 +145,5 @@ def test_an_occupied_folder_and_a_model_are_refused(run: Path) -> None:
     export(run)
     with pytest.raises(InputError, match="not empty"):
         export(run)
-    with pytest.raises(InputError, match="--model does not go"):
+    with pytest.raises(InputError, match="--model cannot be used"):
         export(run, "--model", "m.json", "--out", "x")

@@ -1,7 +1,7 @@
-"""Bands of every channel: what a sample may be without a warning, and without a trip.
+"""Bands of every channel: the values without a warning, and without a trip.
 
-A value counts as outside after `delay` samples in a row (0: the first one). All channels of a block
-are judged at once; a run that began in the block before goes on.
+A violation is reported when more than `delay` consecutive samples are outside (0: the first one).
+All channels of a block are checked at once; runs of samples continue across blocks.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _NO_BAND = AlarmBand()
 
 
 def run_lengths(marks: Flags, before: Counts) -> Counts:
-    """Return the length of the run of marks that ends at each row, shape of marks (n, channels).
+    """Return the length of the run of marks ending at each row, (n, channels) as `marks`.
 
-    `before` (channels,) is the run at the end of the block before.
+    `before` (channels,) is the length of the run at the end of the previous block.
     """
     rows = np.arange(len(marks))[:, None]
     last_clear = np.maximum.accumulate(np.where(marks, -1, rows), axis=0)
@@ -39,26 +39,26 @@ def run_lengths(marks: Flags, before: Counts) -> Counts:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Ends of the bands of all recorded channels, shape (channels,) each."""
+    """Lower and upper ends of the bands of all recorded channels, (channels,) each."""
 
     low: Array
     high: Array
 
     def outside(self, data: Array) -> Flags:
-        """Mark the samples outside; a NaN is outside."""
+        """Mark the samples outside their bands; NaN is outside."""
         inside = (data >= self.low) & (data <= self.high)
         return ~inside
 
     def contain(self, least: Array, most: Array) -> bool:
-        """Say whether all values from `least` to `most`, (channels,) each, are inside; NaN is not.
+        """Return whether `least` and `most`, (channels,) each, are inside the bands; NaN is not.
 
-        Most blocks are: this takes a third of the time of looking at each of their samples.
+        True for most blocks, and three times as fast as checking each sample.
         """
         held = np.count_nonzero(least >= self.low) + np.count_nonzero(most <= self.high)
         return bool(held == 2 * len(self.low))
 
     def within(self, other: Bounds) -> Bounds:
-        """Return the bands where both hold."""
+        """Return the intersection of both bands."""
         return Bounds(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
 
     def of(self, column: int) -> Range:
@@ -67,20 +67,20 @@ class Bounds:
 
 
 class Delayed:
-    """Finds the samples that have been outside for longer than a delay, across blocks."""
+    """Finds samples that have been outside for longer than a delay, across blocks."""
 
     def __init__(self, delay: Counts) -> None:
         self._delay = delay
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: what comes next does not continue what came before."""
+        """Reset: the next samples do not continue the previous ones."""
         self._runs: Counts = np.zeros(len(self._delay), dtype=np.int64)
 
     def over(self, outside: Flags | None) -> Flags | None:
-        """Mark the samples whose run outside is longer than the delay; None where none is.
+        """Mark the samples outside for longer than the delay; None if there are none.
 
-        `outside` may be None for a block that is inside as a whole.
+        `outside` is None for a block entirely inside.
         """
         if outside is None or not outside.any():
             self._runs[:] = 0
@@ -98,12 +98,12 @@ def first_of(marks: Flags) -> tuple[int, int]:
 
 
 def trip_bounds(rig: Rig, roles: tuple[JointRole, ...]) -> Bounds:
-    """Return what trips each channel: its limits by its joint's role, narrowed by `alarms`."""
+    """Return each channel's trip band: its limits for the joint's role, narrowed by `alarms`."""
     return _bounds(_trip_band(rig, roles, name) for name in rig.recorded)
 
 
 def warning_bounds(rig: Rig, roles: tuple[JointRole, ...], settings: GuardSettings) -> Bounds:
-    """Return what warns on each channel: its `alarms` band, or the share of its limits."""
+    """Return the warning band of each channel: from `alarms`, or a share of its limits."""
     return _bounds(_warning_band(rig, roles, name, settings) for name in rig.recorded)
 
 
@@ -117,7 +117,7 @@ def _trip_band(rig: Rig, roles: tuple[JointRole, ...], name: str) -> Range:
     low, high = rig.limits_of(name)
     if joint is not None and kind == ch.PISTON:
         _, low, high = piston_bounds(roles[joint - 1], rig, joint - 1)
-    elif joint is not None and kind == ch.COMMAND:  # the output converter may round up by a step
+    elif joint is not None and kind == ch.COMMAND:  # the output converter may round up by one step
         valve = rig.joints[joint - 1].valve
         step = valve.command_range / ((1 << (valve.command_bits - 1)) - 1)
         low, high = low - step, high + step
@@ -154,17 +154,17 @@ def _joint_warning(rig: Rig, role: JointRole, name: str, share: float) -> Range:
         return role.locked_at - reach, role.locked_at + reach
     if kind == ch.PISTON and role.excited:
         return towards_zero(rig.limits_of(name), share)
-    return -_HUGE, _HUGE  # a command at its limit, a free piston at its end: nothing to warn of
+    return -_HUGE, _HUGE  # normal conditions: a command at its limit, a free piston at its end
 
 
 def towards_zero(limits: Range, share: float) -> Range:
-    """Return limits drawn in to a share of each: 9 MPa to 8.1 MPa; a low limit above 0 grows."""
+    """Return limits narrowed by `share`: 9 to 8.1 MPa at 0.9; a positive low limit is raised."""
     low, high = limits
     return (low * share if low < 0 else low / share), (high * share if high > 0 else high / share)
 
 
 def delays(rig: Rig, settings: GuardSettings) -> tuple[Counts, Counts]:
-    """Return the (warning, trip) delays of all recorded channels [samples]."""
+    """Return the (warning, trip) delays [samples] of all recorded channels, (channels,) each."""
     out = []
     for name in rig.recorded:
         band = rig.alarms.channels.get(name, _NO_BAND)
@@ -176,7 +176,7 @@ def delays(rig: Rig, settings: GuardSettings) -> tuple[Counts, Counts]:
 
 
 def inner_bounds(rig: Rig, outer: Bounds, settings: GuardSettings) -> Bounds:
-    """Return the warning bounds narrowed by each channel's dead band: inside, a warning returns."""
+    """Return the warning bands narrowed by each channel's hysteresis: inside, a warning ends."""
     widths = []
     for column, name in enumerate(rig.recorded):
         low, high = outer.of(column)

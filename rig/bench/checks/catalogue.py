@@ -1,6 +1,6 @@
-"""Every check in words: what it judges, from when on, what it says and what to do about it.
+"""Every check in words: quantity, threshold, delay, message and advice.
 
-The table in docs/safety.md is this catalogue.
+The table in docs/safety.md is generated from this catalogue.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where the spools should be: the commands put out, through the valves' own dynamics."""
+"""Expected spool positions: the commands filtered by the valves' dynamics."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-_SQUARINGS, _TERMS = 10, 8  # of the series for the matrix exponential: exact to rounding below w dt
+_SQUARINGS, _TERMS = (
+    10,
+    8,
+)  # terms of the series of the matrix exponential: exact to rounding for small w dt
 _AT_ONCE: Final = 128  # samples
 
 
 class ExpectedSpool:
-    """Second-order response of every spool to its held command, sample after sample.
+    """Second-order response of every spool to its command, sample by sample.
 
     y'' + 2 zeta w y' + w^2 y = w^2 spool_gain command, |y| <= spool_stroke, discretised exactly
     for an output held between samples; Merritt (1967), Hydraulic Control Systems, 6.3.
@@ -33,8 +36,8 @@ class ExpectedSpool:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew with the spools at rest under the next command."""
-        self._states: list[Array] = []  # of each spool: place, speed
+        """Reset: the spools are at rest under the next command."""
+        self._states: list[Array] = []  # of each spool: position, speed
 
     def follow(self, commands: Array) -> Array:
         """Return the expected spools [V] under commands [V], both of shape (joints, n).
@@ -59,9 +62,10 @@ class ExpectedSpool:
 
 
 def _maps(step: Array) -> Array:
-    """Return how place and speed after 0 to `_AT_ONCE` samples follow from those and the inputs.
+    """Return the maps from state and inputs to the state after 0 to `_AT_ONCE` samples.
 
-    `step` (2, 3) is that of one sample; the shape is (_AT_ONCE + 1, 2, 2 + _AT_ONCE).
+    The state is position and speed; `step` (2, 3) is the map of one sample. Shape
+    (_AT_ONCE + 1, 2, 2 + _AT_ONCE).
     """
     maps = np.zeros((_AT_ONCE + 1, 2, 2 + _AT_ONCE))
     maps[0, :, :2] = np.eye(2)
@@ -72,7 +76,7 @@ def _maps(step: Array) -> Array:
 
 
 def _exponential(matrix: Array) -> Array:
-    """Return exp(matrix) by scaling and squaring; scipy has it too and loads slowly."""
+    """Return exp(matrix) by scaling and squaring, because scipy loads slowly."""
     small = matrix / 2.0**_SQUARINGS
     term = total = np.eye(len(matrix))
     for n in range(1, _TERMS):

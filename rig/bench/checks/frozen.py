@@ -5,8 +5,8 @@ joint's command and another of its channels move. This cannot be a slow signal o
 converter: only sensors whose stated noise is a code or more are judged. Even at rest, two samples
 in a row of such a sensor read the same code with a probability of at most q / (2 sigma sqrt(pi)) <
 0.29 (q: one code), 250 of them with 0.29^249. Noise four times smaller than stated would still need
-a pressure or position constant to a code while the joint moves. What rests at an end of its range
-is left to the check for saturation.
+a pressure or position constant to a code while the joint moves. A sensor at an end of its range is
+left to the check for saturation.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-SWING: Final = 0.05  # of the command's limit, peak to peak: such a command moves the joint
+SWING: Final = 0.05  # share of the command's limit, peak to peak, that moves a joint
 _MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
 
 
 class Frozen:
-    """Finds a channel of one joint (0-based) that stands still while the joint moves."""
+    """Finds a channel of one joint (0-based) that stays constant while the joint moves."""
 
     def __init__(self, rig: Rig, joint: int) -> None:
         own = [(c, *ch.kind_of(name)) for c, name in enumerate(rig.channels)]

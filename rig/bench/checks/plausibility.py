@@ -1,9 +1,9 @@
-"""Plausibility: what no single sample shows, but the channels of a joint together do.
+"""Plausibility: checks of the channels of a joint against each other, over a window.
 
-Features are taken over a window of the latest samples, `hop` apart, so every sample is in several.
-It is held channel by channel, (recorded, n): numpy reduces rows much faster than columns.
-A finding counts when it lasts for `confirm`. A window never reaches across a change of roles or a
-gap long enough to trip.
+Features are computed over overlapping windows of the latest samples, `hop` [s] apart. The window
+is stored by channel, (recorded, n), because numpy reduces rows much faster than columns. A finding
+is reported when it lasts for `confirm` [s]. A window never extends across a change of roles or
+across a gap that trips.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _FEWEST = 20  # samples in a window
 
 
 class Plausibility:
-    """Looks at windows of blocks that continue each other."""
+    """Checks windows of consecutive blocks."""
 
     def __init__(self, rig: Rig, settings: GuardSettings) -> None:
         self._rig = rig
@@ -74,19 +74,19 @@ class Plausibility:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: what comes next does not continue what came before."""
-        self._new: list[Array] = []  # blocks whose spools are not followed yet
+        """Reset: the next samples do not continue the previous ones."""
+        self._new: list[Array] = []  # blocks for which the expected spools are not yet computed
         self._expected.forget()
         self.restart()
 
     def skip(self) -> None:
-        """Go on after a few lost samples: the spools are where their next command holds them."""
+        """Continue after a few lost samples, with the spools at rest under their next command."""
         self._follow()
         self._expected.forget()
         self._slow.forget()
 
     def restart(self) -> None:
-        """Begin a new window: the joints do something else from the next block on."""
+        """Begin a new window, because the joints' roles change."""
         self._follow()
         self._parts: list[Array] = []
         self._parts_expected: list[Array] = []
@@ -95,7 +95,7 @@ class Plausibility:
         self._pending: dict[Key, Violation] = {}
 
     def look(self, block: SampleBlock, roles: Roles) -> list[Violation] | None:
-        """Take a block; return what has lasted long enough, None between two looks."""
+        """Take a block; return the confirmed violations, None if no window is due."""
         self._new.append(block.data)
         self._since_look += len(block.data)
         if self._since_look < self._hop:
@@ -117,7 +117,7 @@ class Plausibility:
         ]  # fmt: skip
 
     def _follow(self) -> None:
-        """Let the expected spools follow the blocks since the last look, all at once."""
+        """Compute the expected spools for all blocks since the last window."""
         if self._new:
             data = np.concatenate(self._new)
             self._new = []
@@ -173,7 +173,7 @@ class Plausibility:
         at_rest = (data[self._command] == 0.0).all(axis=1)
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
             if role.locked:
-                continue  # the band of its lock is watched
+                continue  # the tolerance of the lock covers it
             column = self._piston[j]
             inside = self._within_stroke(data, j)
             still = settings.still_piston * float(self._noise[column])
@@ -219,7 +219,7 @@ class Plausibility:
         excited = [j for j, role in enumerate(roles) if role.excited]
         held = [j for j, role in enumerate(roles) if role.locked]
         if len(excited) != 1 or len(excited) + len(held) != len(roles):
-            return  # what a free joint does to the others' loads is not known here
+            return  # a free joint loads the others by an unknown amount
         rig, settings, slow = self._rig, self._settings, self._slow
         rows = slow.last(settings.trend_span)
         if rows is not None:
@@ -251,8 +251,8 @@ class Plausibility:
             steps = steps[:, 1:] - steps[:, :-1]
         size = np.abs(steps)
         allowed, scale = self._settings.noise * self._noise, _NORMAL_MEDIAN * _THIRD_DIFFERENCE
-        # A median above a bound has half of its samples there: mostly not even all channels
-        # together have as many, and none need be sorted. A NaN counts as above.
+        # A median above a bound needs half of its samples there. Mostly all channels together have
+        # fewer, so that no sorting is needed. NaN counts as above.
         bound = allowed * scale * (1.0 - 1e-9)
         above = size.size - np.count_nonzero(size <= bound[:, None])
         if 2 * above < size.shape[1]:
@@ -264,6 +264,6 @@ class Plausibility:
 
 
 def _mean(values: Array) -> Array:
-    """Return the mean of each row, in a third of the time that numpy's own takes for so few."""
+    """Return the mean of each row, three times as fast as numpy's for few rows."""
     mean: Array = np.add.reduce(values, axis=1) / values.shape[1]
     return mean

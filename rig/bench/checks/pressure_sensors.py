@@ -4,8 +4,8 @@ Closed cylinder. Behind a shut valve the oil is only compressed, dp_cap/dt = -b 
 dp_rod/dt = b A_rod v / V_rod (Merritt, Hydraulic Control Systems, 3.1), so that the swings of both
 pressures are in opposite phase and in the ratio A_cap V_rod / (A_rod V_cap), whatever b and v are.
 
-Force. A_cap p_cap - A_rod p_rod is what the load takes: a function of position, speed and
-acceleration while all other joints are held. A part that grows with time alone is none of them.
+Force. A_cap p_cap - A_rod p_rod is the load force, a function of position, speed and acceleration
+while all other joints are locked. A part that grows with time alone is a sensor's drift.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-ROW_SECONDS = 0.02  # over which samples are averaged for the slow part of the force
+ROW_SECONDS = 0.02  # [s] over which samples are averaged for the slow part of the force
 PISTON, CAP, ROD, COMMAND = range(4)
-_SLIP = 0.1  # of the greatest speed: friction has its sign beyond
+_SLIP = 0.1  # share of the largest speed, above which friction has the sign of the speed
 
 
 @dataclass(frozen=True)
 class PressureFinding:
-    """A pressure sensor (place among `joints`, cap or rod), what it shows and what was expected."""
+    """A pressure sensor (index among `joints`, cap or rod), its value and the expected one."""
 
     joint: int
     cap: bool
@@ -37,9 +37,9 @@ class PressureFinding:
 
 
 def swing_ratio(rig: Rig, joint: int, piston: float) -> float:
-    """Return the swing of the cap pressure over that of the rod pressure of a closed cylinder.
+    """Return the ratio of cap to rod pressure amplitude of a closed cylinder.
 
-    `joint` is 0-based, `piston` [m] where it stands.
+    `joint` is 0-based, `piston` [m] its position.
     """
     part = rig.joints[joint].cylinder
     cap = part.cap_pipe_volume + part.cap_area * (0.5 * part.stroke + piston)
@@ -54,11 +54,11 @@ def swapped(
     rows: Array,
     noise: Array,
 ) -> Iterator[PressureFinding]:
-    """Find sensors of closed cylinders whose plug is exchanged with one of another joint.
+    """Find sensors of closed cylinders that are exchanged with sensors of another joint.
 
-    `closed` are the joints (0-based) locked behind a shut valve, `rows` as of `SlowRows.last`,
-    `noise` (2,) [Pa] of cap and rod pressure in them. Said only where the own sensor does not fit
-    its cylinder and one of another joint does.
+    `closed`: joints (0-based) locked behind a shut valve. `rows`: as of `SlowRows.last`. `noise`
+    (2,) [Pa]: of cap and rod pressure in `rows`. Reported only if a sensor does not fit its
+    cylinder and one of another joint does.
     """
     x = _detrended(rows[:, :, CAP : ROD + 1])
     swings = np.sqrt(np.mean(x * x, axis=0))
@@ -86,11 +86,11 @@ def swapped(
 def drifting(
     rig: Rig, settings: GuardSettings, joint: int, rows: Array, seconds: float
 ) -> PressureFinding | None:
-    """Return which sensor of the one excited joint drifts, all others held, None if none.
+    """Return the drifting pressure sensor of the only excited joint, others locked; None if none.
 
-    `joint` is 0-based, `rows` as of `SlowRows.last`, `seconds` apart. `value` is the sensor's part
-    that grows with time [Pa], over the rows. A finding needs a motion that time does not explain,
-    a force that it explains, and one chamber alone that shows it.
+    `joint` is 0-based, `rows` as of `SlowRows.last`, `seconds` apart. `value` of the finding is the
+    drift [Pa] over the rows. Needs a motion uncorrelated with time, a force with a trend in time,
+    and that trend in one chamber alone.
     """
     part = rig.joints[joint].cylinder
     cap, rod = rows[2:-2, joint, CAP], rows[2:-2, joint, ROD]
@@ -98,7 +98,7 @@ def drifting(
     bound = settings.trend * rig.supply.pressure
     time = np.linspace(-0.5, 0.5, len(force))
     least = settings.trend_alone * (time @ time)
-    # By Schwarz' inequality no trend is larger than this, and mostly none needs to be fitted.
+    # The Cauchy-Schwarz bound of the trend; mostly it is small and no fit is needed.
     spread = force - np.add.reduce(force) / len(force)
     if spread @ spread < (1.0 - 1e-6) * bound**2 * least:
         return None
@@ -107,7 +107,7 @@ def drifting(
     energy = leftover @ leftover
     if energy < least:
         return None
-    # What a fit of motion and time together gives to time (Frisch, Waugh 1933).
+    # The coefficient of time in a joint fit of motion and time (Frisch, Waugh 1933).
     trend = (leftover @ force) / energy
     if abs(trend) < bound:
         return None
@@ -124,7 +124,7 @@ def drifting(
 
 
 class SlowRows:
-    """The last seconds of a bench in means over `ROW_SECONDS`, without most of their noise."""
+    """The latest samples of a bench, averaged over `ROW_SECONDS` to reduce noise."""
 
     def __init__(self, rate: float, joints: int, span: float) -> None:
         """Keep `span` [s] of samples at `rate` [Hz]."""
@@ -135,12 +135,12 @@ class SlowRows:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: what comes next does not continue what came before."""
+        """Reset: the next samples do not continue the previous ones."""
         self._rows: Array = np.empty((0, self._joints, COMMAND + 1))
         self._begun: Array = self._rows
 
     def add(self, states: Array) -> None:
-        """Take samples that follow, (n, joints, 4): piston [m], cap, rod [Pa], command [V]."""
+        """Add the next samples, (n, joints, 4): piston [m], cap and rod [Pa], command [V]."""
         samples = np.concatenate([self._begun, states])
         whole = len(samples) // self.each * self.each
         self._begun = samples[whole:]
@@ -150,16 +150,16 @@ class SlowRows:
         self._rows = np.concatenate([self._rows, rows])[-self._most :]
 
     def last(self, span: float) -> Array | None:
-        """Return the rows of the last `span` [s], (rows, joints, 4), None before there are so many.
+        """Return the rows of the last `span` [s], (rows, joints, 4); None if there are fewer.
 
-        A command is the greatest of its row.
+        The command of a row is its largest magnitude.
         """
         count = round(span / self.seconds)
         return self._rows[-count:] if count <= len(self._rows) else None
 
 
 def _motion(piston: Array, seconds: float) -> Array:
-    """Return what a load's force may follow, (rows - 4, 5)."""
+    """Return the regressors of a load force, (rows - 4, 5)."""
     speed = (piston[2:] - piston[:-2]) / (2.0 * seconds)
     acceleration = (speed[2:] - speed[:-2]) / (2.0 * seconds)
     speed, piston = speed[1:-1], piston[2:-2]
@@ -173,7 +173,7 @@ def _fit(terms: Array, values: Array) -> Array:
 
 
 def _detrended(x: Array) -> Array:
-    """Return columns without their straight line, shape (n, ...)."""
+    """Return columns without their linear trend, shape (n, ...)."""
     time = np.arange(len(x)) - 0.5 * (len(x) - 1)
     columns = x.reshape(len(x), -1)
     centred: Array = columns - np.add.reduce(columns, axis=0) / len(x)

@@ -2,7 +2,7 @@
 
 Rates are differences over the shortest window in which the sensor's own noise stays below a
 tenth of the limit: |x[k] - x[k-w]| fs / w, 6 sqrt(2) sigma fs / w <= 0.1 limit. A block is
-checked together with the tail of the one before it, so nothing falls between blocks.
+checked together with the tail of the previous one, so that rates across blocks are checked too.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 
 
 def rate_window(noise: float, limit: float, sample_rate: float) -> int:
-    """Return the samples over which a rate is taken: the fewest that keep noise below limit/10."""
+    """Return the window [samples] of a rate: the shortest that keeps its noise below limit/10."""
     return max(1, math.ceil(6.0 * math.sqrt(2.0) * noise * sample_rate / (0.1 * limit)))
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A bound on |x[k] - x[k-window]|, (recorded,), infinite where none is set; a share warns."""
+    """A bound on |x[k] - x[k-window]|, (recorded,), infinite without a limit; a share warns."""
 
     limit: str
     window: int
@@ -37,10 +37,10 @@ class Rate:
     def find(
         self, rig: Rig, joined: Array, first: int, new: int, share: float
     ) -> tuple[Violation | None, list[Violation]]:
-        """Return the first violation of the limit and one per channel past `share` of it.
+        """Return the first violation of the limit, and one per channel above `share` of it.
 
-        `joined` (n, recorded) begins at tick `first`; only its last `new` samples are judged. It
-        may hold infinite samples: the caller silences the warning of their difference.
+        `joined` (n, recorded) begins at tick `first`; only its last `new` samples are checked. It
+        may contain infinite samples: the caller suppresses numpy's warning of their difference.
         """
         values = joined[-(new + self.window) :]
         start = first + len(joined) - len(values) + self.window

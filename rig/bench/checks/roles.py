@@ -1,4 +1,4 @@
-"""What each joint does now, and the piston's bounds that follow from it."""
+"""The role of each joint, and the bounds of its piston."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 from rig.model.rig import Rig
 
-_STROKE_MARGIN = 0.02  # of the stroke: give of the end stop and offset of the sensor
+_STROKE_MARGIN = 0.02  # share of the stroke: compliance of the end stop and offset of the sensor
 
 
 @dataclass(frozen=True)
 class JointRole:
-    """What one joint does now.
+    """The present role of a joint.
 
-    An `excited` joint keeps `limits.piston`; any other may touch the ends of its stroke. A locked
-    one has `locked_at` [m] and may leave it by `tolerance` [m] at most.
+    The piston of an `excited` joint must stay within `limits.piston`; any other may reach the ends
+    of its stroke. A locked piston must stay within `tolerance` [m] of `locked_at` [m].
     """
 
     excited: bool = False
@@ -24,7 +24,7 @@ class JointRole:
 
     @property
     def locked(self) -> bool:
-        """Whether the joint is held in its place."""
+        """Whether the joint is locked."""
         return self.locked_at is not None and math.isfinite(self.tolerance)
 
 
@@ -33,7 +33,7 @@ EXCITED = JointRole(excited=True)
 
 
 def piston_bounds(role: JointRole, rig: Rig, joint: int) -> tuple[str, float, float]:
-    """Return (name of the limit, lowest, highest) of a joint's piston in its role."""
+    """Return (name of the limit, lowest, highest [m]) of a joint's piston in its role."""
     part = rig.joints[joint]
     if role.locked_at is not None and role.locked:
         return "lock", role.locked_at - role.tolerance, role.locked_at + role.tolerance

@@ -1,4 +1,4 @@
-"""Sensors at an end of their converter's range: blind, or dead."""
+"""Sensors at an end of their converter's range: out of range, or broken."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.trips import SATURATED, Violation
 
-_VACUUM = -90e3  # no gauge pressure far below this exists, so none hides under such a range
+_VACUUM = -90e3  # no gauge pressure is far below this, so such a range cannot be exceeded
 
 
 class Saturation:
-    """Finds the channels whose samples stand at an end of their range, across blocks."""
+    """Finds channels whose samples stay at an end of their range, across blocks."""
 
     def __init__(self, rig: Rig, settings: GuardSettings) -> None:
         self._rig = rig
@@ -32,13 +32,13 @@ class Saturation:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: what comes next does not continue what came before."""
+        """Reset: the next samples do not continue the previous ones."""
         self._runs: Counts = np.zeros(len(self._middles), dtype=np.int64)
 
     def find(
         self, marks: NDArray[np.bool_], measured: NDArray[np.float64], tick: int
     ) -> Violation | None:
-        """Return the first channel too long at an end; marks and measured are (n, channels)."""
+        """Return the first channel too long at an end; `marks` and `measured` are (n, channels)."""
         if not np.count_nonzero(marks):
             self._runs[:] = 0
             return None

@@ -7,31 +7,33 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class GuardSettings:
-    """Patience and thresholds of the checks.
+    """Delays and thresholds of the checks.
 
     "Seen" below is the largest value on the shipped benches, shipped protocols, clean and with
     each shipped effect (`make study NAME=guard`).
     """
 
     # Single samples
-    saturated_samples: int = 5  # so many in a row blind a channel
+    saturated_samples: int = 5  # consecutive samples that count as saturated
     saturated_samples_vacuum: int = 50  # cavitating oil rests at the low end, but with noise
     max_gap: float = 0.1  # [s] of device time without samples
     stale_after: float | None = None  # [s] of wall time; default: the rig's watchdog
-    stale_warning: float = 0.5  # of `stale_after`; half the time is left to look
+    stale_warning: float = 0.5  # share of `stale_after` that warns
 
     # Warnings: against chatter
     warning_delay: float = 0.05  # [s] outside the band; five blocks of the shipped bench
-    dead_band: float = 0.02  # of the band's width; four times the noise of a worn sensor
-    return_after: float = 1.0  # [s] inside before a warning returns; a person reads no faster
+    dead_band: float = (
+        0.02  # hysteresis: share of the band's width; four times the noise of a worn sensor
+    )
+    return_after: float = 1.0  # [s] inside before a warning ends; time for a person to read it
 
-    # Plausibility: features over a window, looked at every `hop`
+    # Plausibility: features over a window, every `hop`
     window: float = 0.5  # [s]; half of a 1 Hz period, the slowest wave of the seed's protocol
-    hop: float = 0.1  # [s] between two looks
-    confirm: float = 0.2  # [s] a finding must last, so that a passing through is none
+    hop: float = 0.1  # [s] between two windows
+    confirm: float = 0.2  # [s] that a finding must last, to exclude transients
 
     frozen_after: float = 0.25  # [s] that a moving joint's sensor keeps one value
-    # A spool stands off its command by the part that moves, or by a constant part.
+    # Deviation of a spool from its command: of its motion, or constant.
     spool_share: float = 0.5  # of the movement commanded, mean deviation; seen: 0.04
     spool_floor: float = 0.005  # of the stroke, mean deviation; seen: 0.0001
     spool_constant: float = 0.1  # of the stroke; an LVDT's own offset stays below 0.03
@@ -48,14 +50,18 @@ class GuardSettings:
     # Swings of a closed cylinder's pressures against each other; sound: within 1.2 of the ratio
     # that its volumes say, correlated by -0.97; plugs exchanged: 10 times off.
     swing_span: float = 1.0  # [s]; a period of 1 Hz
-    swing_noise: float = 5.0  # times the noise of a 20 ms mean, deviation; less shows nothing
+    swing_noise: float = (
+        5.0  # times the noise of a 20 ms mean, standard deviation; smaller swings are not judged
+    )
     swing_factor: float = 3.0  # off the ratio either way: the sensor is not of this cylinder
     swing_match: float = 1.5  # off the ratio at most: another joint's sensor is
     swing_phase: float = 0.9  # least correlation of opposite phase
-    # Force of an excited joint that grows with time and with nothing that moves
+    # Trend of an excited joint's force that its motion does not explain
     trend_span: float = 2.0  # [s]; two periods of 1 Hz
     trend: float = 0.1  # of supply.pressure over the span
-    trend_alone: float = 0.7  # of time's own square that the motion must leave: no slow ramp
+    trend_alone: float = (
+        0.7  # share of the variance of time that the motion must not explain: excludes slow ramps
+    )
     trend_clear: float = 2.0  # times the residual without it
     trend_other: float = 0.25  # of the drifting sensor's trend, in the other chamber, at most
 

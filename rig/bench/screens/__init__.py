@@ -1,1 +1,1 @@
-"""What screens see of a run: snapshots, published over local sockets of their owner only."""
+"""Snapshots of a run for screens, published over local sockets that only their owner can open."""

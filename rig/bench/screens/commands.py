@@ -1,4 +1,4 @@
-"""Commands of screens on their way to a run, and who holds the controls."""
+"""Commands of screens to a run, and the screen that is in control."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rig.runs.runstate import process_alive
 
 log = logging.getLogger(__name__)
 
-STOP: Final = "stop"  # anyone may, always
-ACKNOWLEDGE: Final = "acknowledge"  # an alarm by its key, without a value all; anyone may
-TAKE: Final = "take"  # the controls, from whoever holds them
+STOP: Final = "stop"  # from any screen, at any time
+ACKNOWLEDGE: Final = "acknowledge"  # an alarm by its key, without a value all; from any screen
+TAKE: Final = "take"  # take control from the present holder
 RELEASE: Final = "release"
-PAST: Final = "past"  # the last minute and the plan, for a screen that attaches late; anyone may
+PAST: Final = "past"  # the last minute and the plan, for a late screen; from any screen
 CONTROLS: Final = ("pause", "resume", "skip", "abort", "answer")
-BY_HAND: Final = ("jog", "lock", "unlock")  # what a manual session takes
+BY_HAND: Final = ("jog", "lock", "unlock")  # commands of a manual session
 COMMANDS: Final = (STOP, ACKNOWLEDGE, *CONTROLS, *BY_HAND, TAKE, RELEASE, PAST)
 
-_LONGEST = 500  # characters of a value or a holder's name
+_LONGEST = 500  # largest length of a value or a holder's name [characters]
 
 
 @dataclass(frozen=True)
 class Command:
-    """One command: its word, a value (an answer, an alarm), who sends it and from which process."""
+    """One command: its word, a value (an answer, an alarm), its sender and the sender's process."""
 
     word: str
     value: str = ""
@@ -65,9 +65,10 @@ def from_bytes(raw: bytes) -> Command | None:
 
 
 class CommandHolder:
-    """Lets one screen at a time command a run.
+    """Lets one screen at a time control a run.
 
-    The first to do so holds the controls until it releases them, is gone, or another takes them.
+    The first to send a command stays in control until it releases control, ends, or another screen
+    takes control.
     """
 
     def __init__(self) -> None:
@@ -75,13 +76,13 @@ class CommandHolder:
 
     @property
     def held(self) -> Command | None:
-        """The newest command of the screen that holds the controls; None where they are free."""
+        """The newest command of the screen in control; None if there is none."""
         if self._held is not None and self._held.pid and not process_alive(self._held.pid):
             self._held = None
         return self._held
 
     def judge(self, command: Command, judge: Judge | None) -> str | None:
-        """Return None where the command is taken, else in one line why it is refused."""
+        """Return None if the command is accepted, else the reason in one line."""
         if command.word in (STOP, ACKNOWLEDGE, PAST):
             return None
         refusal = self._refusal(command, judge)
@@ -92,13 +93,13 @@ class CommandHolder:
     def _refusal(self, command: Command, judge: Judge | None) -> str | None:
         held = self.held
         if not command.holder:
-            return f"{command.word}: say who asks ('holder'), so that one screen has the controls"
+            return f"{command.word}: the key 'holder' is missing; expected the name of the sender"
         if command.word == TAKE:
             return None
         if held is not None and held.holder != command.holder:
-            return f"the controls are held by {held.holder}; take them, or wait for their release"
+            return f"{held.holder} is in control; take control, or wait for its release"
         if command.word == RELEASE:
             return None
         if judge is None:
-            return f"{command.word}: this run takes no commands but stop"
+            return f"{command.word}: this run accepts no command but stop"
         return judge(command)

@@ -1,4 +1,4 @@
-"""The bench's side of a screen: gathers samples, publishes snapshots, hears commands."""
+"""The bench's connection to screens: publishes snapshots, receives commands."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from rig.runs import runstate
 Array = NDArray[np.float64]
 Limits = dict[str, Band]
 
-LOST: Final = "lost"  # what a snapshot says of a device that does not answer
+LOST: Final = "lost"  # `device` in a snapshot if the device does not answer
 _INTERVAL = 0.05  # [s] of wall time between snapshots
 
 
 class Display:
-    """Publishes at most twenty snapshots a second of wall time; without a publisher, nothing."""
+    """Publishes at most twenty snapshots per second of wall time; none without a publisher."""
 
     def __init__(
         self, rig: Rig, publisher: Publisher | None, run: str, clock: Callable[[], float]
@@ -55,22 +55,22 @@ class Display:
             publisher.past = self._past.answer
 
     def describe(self, plan: Sequence[PlanLine]) -> None:
-        """Say which steps there will be; a screen lists them."""
+        """Set the steps of the plan, which a screen lists."""
         self._past.plan = tuple(plan)
         self.progress = replace(self.progress, parts=len(self._past.plan))
 
     def repeat(self) -> None:
-        """Publish, if it is time, that nothing new was measured: the device is being looked for."""
+        """Publish, if due, a snapshot without new samples while the device is lost."""
         if self._publisher is not None and self._clock() >= self._next:
             self._publish(runstate.RUNNING, 0.0)
             self._next = self._clock() + _INTERVAL
 
     def commands(self, judge: Judge | None = None) -> list[Command]:
-        """Return what the screens asked for and `judge` did not refuse."""
+        """Return the screens' commands that `judge` did not refuse."""
         return [] if self._publisher is None else self._publisher.commands(judge) or []
 
     def show(self, block: SampleBlock, age: float, lost: int, roles: Sequence[JointRole]) -> None:
-        """Take a block; publish if it is time."""
+        """Take a block; publish a snapshot if one is due."""
         if self._publisher is None:
             return
         self._waiting.append(block.data)
@@ -91,7 +91,7 @@ class Display:
         device_time = self._tick / self._rig.sample_rate
         self._past.add(device_time, samples)
         if state == runstate.RUNNING and not self._publisher.watched:
-            return  # nobody looks: whoever comes gets the past and what is new then
+            return  # no screen attached; a later one gets the last minute and new samples
         if self._first is not None:
             done = (self._tick - self._first) / self._rig.sample_rate
             self.progress = replace(self.progress, done_s=done)
@@ -116,7 +116,7 @@ class Display:
         self._publisher.publish(snapshot)
 
     def _both_bands(self) -> tuple[Limits, Limits]:
-        """Return what trips and what warns on every channel; they change with the roles only."""
+        """Return the trip and warning bands of every channel, which change with the roles only."""
         if self._bands is None or self._bands[0] is not self._roles:
             warn: Limits = {}
             if self._roles:
@@ -146,7 +146,7 @@ class Display:
         return limits_by_channel
 
     def ended(self, state: str, message: str, *, lost: bool = False) -> None:
-        """Publish how the run ended, as soon as the outputs are at zero; `lost` is the device."""
+        """Publish how the run ended, with the outputs at zero; `lost`: the device was lost."""
         if lost:
             self.progress = replace(self.progress, device=LOST)
         if message:

@@ -1,8 +1,8 @@
-"""The last minute of a run, kept by the run itself for screens that attach late.
+"""The last minute of a run, kept by the run for screens that attach late.
 
-One bucket, a smallest and a largest sample of every channel, is kept of each snapshot. The answer
-to the command "past" is a header in JSON and one array of float64, shape (buckets, 1 + 2 channels):
-device time [s], then the smallest, then the largest samples in SI.
+Of each snapshot, one bucket is kept: the smallest and the largest sample of every channel. The
+answer to the command "past" is a JSON header and a float64 array (buckets, 1 + 2 channels): device
+time [s], smallest samples, largest samples [SI].
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ KEPT: Final = 1200  # buckets: one minute of wall time at twenty snapshots a sec
 
 @dataclass(frozen=True)
 class PlanLine:
-    """One step of the plan as a screen lists it: name, in words, expected time [s]."""
+    """One step of the plan for a screen: name, description, expected time [s]."""
 
     name: str
     title: str
@@ -31,7 +31,7 @@ class PlanLine:
 
 @dataclass(frozen=True)
 class PastMinute:
-    """What a run did lately: ends of buckets (n,) [s of device time], low and high of them."""
+    """The last minute of a run: ends (n,) of the buckets [s of device time], their low and high."""
 
     names: tuple[str, ...]
     time: Array
@@ -49,7 +49,7 @@ class PastKeeper:
         self._rows: deque[Array] = deque(maxlen=KEPT)
 
     def add(self, device_time: float, samples: Array) -> None:
-        """Keep the samples (n, channels) of a snapshot as one bucket; n = 0 adds none."""
+        """Add the samples (n, channels) of a snapshot as one bucket; n = 0 adds none."""
         if len(samples):
             parts = ([device_time], samples.min(axis=0), samples.max(axis=0))
             self._rows.append(np.concatenate(parts))
@@ -69,6 +69,6 @@ def past_from(header: Mapping[str, Any], raw: bytes) -> PastMinute:
         table = np.frombuffer(raw, dtype="<f8").reshape(-1, 1 + 2 * len(names))
         plan = tuple(PlanLine(**line) for line in header["plan"])
     except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"not the past of a run: {error}") from error
+        raise ValueError(f"not a valid answer to the command past: {error}") from error
     cut = 1 + len(names)
     return PastMinute(names, table[:, 0], table[:, 1:cut], table[:, cut:], plan)

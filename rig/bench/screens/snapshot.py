@@ -1,4 +1,4 @@
-"""What a screen sees of a run: immutable snapshots, min/max-decimated, some twenty a second."""
+"""Snapshots of a run for screens: immutable, min/max-decimated, about twenty per second."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rig.model.alarms.states import Alarm, AlarmState
 Array = NDArray[np.float64]
 Band = tuple[float | None, float | None]
 
-BUCKETS = 25  # of new samples per snapshot: at 20 snapshots a second, 500 columns for a plot
+BUCKETS = 25  # per snapshot; at 20 snapshots per second, 500 columns of a plot
 
 
 @dataclass(frozen=True)
 class ChannelView:
     """One channel since the previous snapshot, in SI; `low` and `high` are its limits.
 
-    Beyond `warn_low` and `warn_high` a warning begins.
+    Values below `warn_low` or above `warn_high` cause a warning.
     """
 
     unit: str
@@ -41,15 +41,14 @@ class Snapshot:
     """The run at one moment.
 
     `state` is running, tripped, done or aborted; `device_time` and `wall_time` are in seconds
-    (the latter since the epoch); `block_age` [s] is how late the newest block came.
-    `alarms` are those that stand (`rig.model.alarms.states.folded` orders them). `engine` is the
+    (the latter since the epoch); `block_age` [s] is the lateness of the newest block.
+    `alarms` are the active ones (`rig.model.alarms.states.folded` orders them). `engine` is the
     state of the protocol's engine; `prompt` the open question, with its possible `answers`. `part`
     of `parts` (from 1) is the step of the plan; `estimates` holds [value, low, high] in SI by
     parameter, low to high being its 95 % interval; `residuals` holds [rms, size] in SI by family
-    of equations: what the estimates left of the newest rows before they took them in, and the rms
-    of those rows. `device` is empty, or "lost"; `wire` is its
-    endpoint. `holder` is the screen that has the controls, `roles` what each joint does (excited,
-    free, locked).
+    of equations: rms of the prediction error of the newest rows, and of those rows. `device` is
+    empty, or "lost"; `wire` is its endpoint. `holder` is the screen in control, `roles` the role
+    of each joint (excited, free, locked).
     """
 
     run: str
@@ -88,7 +87,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the protocol stands; the engine says it, the screen shows it."""
+    """The progress of the protocol, from the engine to the screen."""
 
     step: str = ""
     phase: str = ""
@@ -110,7 +109,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class BenchView:
-    """What the bench itself adds to a snapshot."""
+    """The bench's part of a snapshot."""
 
     run: str
     rig: str
@@ -145,9 +144,9 @@ def take_snapshot(
     limits: Mapping[str, Band],
     warnings: Mapping[str, Band] | None = None,
 ) -> Snapshot:
-    """Make a snapshot of the samples (n, channels) since the previous one; n may be 0.
+    """Return a snapshot of the samples (n, channels) since the previous one; n may be 0.
 
-    `limits` and, if known, `warnings` have every channel's band.
+    `limits` and, if known, `warnings` are the bands of every channel.
     """
     low, high = decimate(samples)
     channels = {}
@@ -168,7 +167,7 @@ def _alarm(view: dict[str, Any]) -> Alarm:
 
 def to_json(snapshot: Snapshot) -> bytes:
     """Write a snapshot as JSON."""
-    # Without `asdict` for all of it, whose copies of every number cost three times the rest.
+    # `asdict` copies every number, which would take three times as long as the rest.
     data = dict(vars(snapshot))
     data["channels"] = {name: vars(view) for name, view in snapshot.channels.items()}
     data["alarms"] = [asdict(alarm) for alarm in snapshot.alarms]

@@ -1,11 +1,11 @@
-"""The local sockets through which a screen watches a run and stops it; only their owner may.
+"""Local sockets through which a screen watches and controls a run; open to their owner only.
 
 Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB: snapshots) and
-`<rig>-<pid>.cmd` (REP: commands). The run never waits for a screen: snapshots that nobody
-takes are dropped, commands are polled. Requests and answers are JSON
-(`rig.bench.screens.commands`): {"command", "value", "holder", "pid"}, then {"ok"} with "error" in
-one line where the command was refused. The answer to "past" has a second frame
-(`rig.bench.screens.past`).
+`<rig>-<pid>.cmd` (REP: commands). The run never waits for a screen: unread snapshots are dropped,
+commands are polled.
+Requests and answers are JSON (`rig.bench.screens.commands`): {"command", "value", "holder", "pid"},
+then {"ok"}, with a one-line "error" if the command was refused. The answer to "past" has a second
+frame (`rig.bench.screens.past`).
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ __all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", 
 
 log = logging.getLogger(__name__)
 
-_MAX_PATH = 100  # a Unix socket's address holds 107 bytes
+_MAX_PATH = 100  # largest length of a Unix socket's address [bytes]
 _MAX_NAME = 32
 _FILE = re.compile(r"^(?P<rig>.+)-(?P<pid>\d+)\.(?:pub|cmd)$")
 _COMMANDS_AT_ONCE = 16
 
 
 class AttachError(Exception):
-    """The local sockets cannot be made or trusted; the message says why."""
+    """The local sockets cannot be created or are not private; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Endpoint:
 
 
 def session_folder() -> Path:
-    """Return this user's folder for sockets, made and checked: ours, mode 0700, short enough."""
+    """Create and return this user's folder for sockets; checks owner, mode 0700 and length."""
     fallback = Path("/tmp") / f"bramah-{os.getuid()}"
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     longest = _MAX_NAME + len("-4194304.pub/bramah")
@@ -84,7 +84,7 @@ def _private(folder: Path) -> Path:
             folder.mkdir(mode=0o700)
         status = folder.lstat()
         if not stat.S_ISDIR(status.st_mode):
-            raise AttachError(f"{folder}: is not a folder (a link?); remove it")
+            raise AttachError(f"{folder}: is not a folder, perhaps a link; remove it")
         if status.st_uid != os.getuid():
             raise AttachError(
                 f"{folder}: belongs to user {status.st_uid}; sockets there are unsafe"
@@ -101,7 +101,7 @@ def _address(path: Path) -> str:
 
 
 def _listening(path: Path) -> bool:
-    """Whether a process listens at a Unix socket; a file left by a dead one does not."""
+    """Return whether a process listens at a Unix socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         error = probe.connect_ex(os.fspath(path))
@@ -109,9 +109,9 @@ def _listening(path: Path) -> bool:
 
 
 def _sessions(folder: Path) -> list[Endpoint]:
-    """Return the live sessions; files of dead processes are removed.
+    """Return the running sessions; remove the files of dead processes.
 
-    A live process that does not listen yet may be starting: its files stay.
+    A process that does not listen yet may be starting, so its files stay.
     """
     sessions = []
     for pub in sorted(folder.glob("*.pub")):
@@ -128,12 +128,12 @@ def _sessions(folder: Path) -> list[Endpoint]:
 
 
 def _pending(socket: zmq.Socket[bytes]) -> bool:
-    """Whether a message has come."""
+    """Return whether a message has arrived."""
     return bool(int(socket.get(zmq.EVENTS)) & zmq.POLLIN)
 
 
 class Publisher:
-    """The run's side; raises AttachError if its sockets cannot be made."""
+    """The run's end; raises AttachError if the sockets cannot be created."""
 
     def __init__(self, rig: str, folder: Path | None = None) -> None:
         where = session_folder() if folder is None else _private(folder)
@@ -147,9 +147,9 @@ class Publisher:
         self._holder = CommandHolder()
         self.past: Callable[[], tuple[dict[str, Any], bytes]] | None = None
         self._watched = False
-        self._unread = True  # whether commands may have come that were not taken
+        self._unread = True  # whether unread commands may have arrived
         try:
-            self._pub = self._bind(zmq.XPUB, self.endpoint.pub)  # it hears who subscribes
+            self._pub = self._bind(zmq.XPUB, self.endpoint.pub)  # XPUB receives the subscriptions
             self._cmd = self._bind(zmq.REP, self.endpoint.cmd)
             self._wake = select.poll()
             self._wake.register(int(self._cmd.get(zmq.FD)), select.POLLIN)
@@ -164,32 +164,32 @@ class Publisher:
         made = self._context.socket(kind)
         made.setsockopt(zmq.SNDHWM, 8)
         made.setsockopt(zmq.RCVHWM, _COMMANDS_AT_ONCE)
-        made.setsockopt(zmq.LINGER, 200)  # let the last snapshot and answer out, then go
+        made.setsockopt(zmq.LINGER, 200)  # [ms] for sending the last snapshot and answer
         made.setsockopt(zmq.MAXMSGSIZE, 1 << 16)
         made.bind(_address(path))
         return made
 
     @property
     def watched(self) -> bool:
-        """Whether any screen is attached: else a snapshot need not be made."""
+        """Whether any screen is attached, so that snapshots are needed."""
         with suppress(zmq.ZMQError):
-            while _pending(self._pub):  # the first to come, the last to go
+            while _pending(self._pub):  # the first to attach, or the last to detach
                 self._watched = self._pub.recv(zmq.NOBLOCK)[:1] == b"\1"
         return self._watched
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Offer a snapshot to whoever watches; never waits."""
+        """Publish a snapshot to the attached screens; never waits."""
         with suppress(zmq.ZMQError):
             self._pub.send(to_json(snapshot), zmq.NOBLOCK)
 
     def commands(self, judge: Judge | None = None) -> list[Command]:
-        """Return the commands taken since the last call, each answered; never waits.
+        """Answer the commands that have arrived and return the accepted ones; never waits.
 
-        `judge` says of every command but "stop" why it is refused, None where it is taken.
+        `judge` returns, for every command but "stop", why it is refused, None if it is accepted.
         """
         accepted: list[Command] = []
-        # Asking the library costs much more than its file, which can be read from when something
-        # may have come until the library is asked.
+        # Polling the file descriptor is much cheaper than asking the library. It stays readable
+        # after a message has arrived until the library is asked.
         if not (self._unread or self._wake.poll(0)):
             return accepted
         self._unread = True
@@ -221,7 +221,7 @@ class Publisher:
 
     @property
     def holder(self) -> str:
-        """The screen that holds the controls, empty where they are free."""
+        """The screen in control, '' if there is none."""
         held = self._holder.held
         return "" if held is None else held.holder
 
@@ -240,7 +240,7 @@ class Publisher:
 
 
 class Attachment:
-    """The screen's side of one session."""
+    """The screen's end of one session."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -253,7 +253,7 @@ class Attachment:
 
     @staticmethod
     def find(rig: str | None = None, folder: Path | None = None) -> list[Endpoint]:
-        """Return the live sessions (of one rig); raises AttachError for an unsafe folder."""
+        """Return the running sessions (of one rig); raises AttachError for an unsafe folder."""
         sessions = _sessions(session_folder() if folder is None else _private(folder))
         return [e for e in sessions if rig is None or e.rig == rig[:_MAX_NAME]]
 
@@ -268,28 +268,30 @@ class Attachment:
             return None
 
     def send(self, command: str, timeout: float = 2.0) -> bool:
-        """Send a command; True when the run has taken it, False without an answer in `timeout`."""
+        """Send a command; return whether the run accepted it within `timeout` [s]."""
         return self.ask(own_command(command), timeout) is None
 
     def ask(self, command: Command, timeout: float = 2.0) -> str | None:
-        """Send a command; None when the run has taken it, else in one line why not."""
+        """Send a command; return None if the run accepted it, else the reason in one line."""
         answer = self._exchange(command, timeout)
         return answer if isinstance(answer, str) else None
 
     def past(self, timeout: float = 2.0) -> PastMinute | None:
-        """Return what the run did lately and its plan; None where it does not say."""
+        """Return the run's last minute and its plan; None without a valid answer."""
         answer = self._exchange(own_command(PAST), timeout)
         if isinstance(answer, str) or len(answer) != 2:  # header and array
             return None
         try:
             return past_from(json.loads(answer[0]), answer[1])
         except ValueError as error:
-            log.debug("no past: %s", error)
+            log.debug("no last minute of the run: %s", error)
             return None
 
     def _exchange(self, command: Command, timeout: float) -> list[bytes] | str:
-        """Return the frames of the answer, or in one line why the command was not taken."""
-        asking = self._context.socket(zmq.REQ)  # a new one: an unanswered one is of no use again
+        """Return the frames of the answer, or the reason in one line why there is none."""
+        asking = self._context.socket(
+            zmq.REQ
+        )  # a new socket: one without its answer cannot be used again
         asking.setsockopt(zmq.LINGER, 0)
         try:
             asking.connect(_address(self.endpoint.cmd))
@@ -306,9 +308,9 @@ class Attachment:
 
     @property
     def alive(self) -> bool:
-        """Whether the run's process still lives."""
+        """Whether the run's process is running."""
         return process_alive(self.endpoint.pid)
 
     def close(self) -> None:
-        """Detach; the run does not notice."""
+        """Detach from the run, which continues."""
         self._context.destroy(linger=0)

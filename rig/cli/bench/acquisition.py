@@ -1,4 +1,4 @@
-"""How well samples come over a wire: what was lost, what came late, how much arrival scatters."""
+"""Quality of acquisition over a wire: lost samples, late blocks, scatter of arrival times."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def measure_acquisition(
     seconds: float,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float | int]:
-    """Stream for `seconds` of device time with outputs untouched and account for every sample.
+    """Stream for `seconds` of device time, outputs unchanged; count lost samples and time blocks.
 
     `driver` is connected and `info` is what its `connect` returned. A block's lateness is its
-    arrival by the host's clock minus the time of its last sample by the device's, counted from
-    the earliest block after a straight line through all is removed (two clocks drift apart), so it
-    holds the wire, both ends' scheduling and the wait for the block, not the clocks' offset.
+    arrival time (host clock) minus the time of its last sample (device clock), relative to the
+    earliest block, after the linear drift between the clocks is removed. It contains the delay
+    of the wire, the scheduling of both ends and the block's length, not the clocks' offset.
     Raises ValueError for a device in virtual time, DeviceError and DeviceLost as the driver does.
     """
     if info.virtual_time:
-        raise ValueError("a device in virtual time has no arrival to be late for; use real time")
+        raise ValueError("lateness cannot be measured on a device in virtual time; use real time")
     if seconds <= 0.0:
         raise ValueError(f"a measurement takes longer than {seconds:g} s")
     wanted = round(seconds * info.sample_rate)
@@ -77,7 +77,7 @@ def timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
 
 
 def lateness(ends: np.ndarray, arrivals: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return how late [s] each block came against the earliest, and the clocks' drift [s/s]."""
+    """Return each block's lateness [s] relative to the earliest, and the clocks' drift [s/s]."""
     late = arrivals - ends
     drift = float(np.polyfit(ends - ends[0], late, 1)[0]) if len(late) > 2 else 0.0
     late = late - drift * (ends - ends[0])
@@ -88,7 +88,7 @@ def lateness(ends: np.ndarray, arrivals: np.ndarray) -> tuple[np.ndarray, float]
 def waited_seconds() -> float:
     """Return how long [s] this thread was ready to run and had no processor; NaN where unknown.
 
-    Linux tells it: the second number of /proc/thread-self/schedstat [ns].
+    Source on Linux: the second number of /proc/thread-self/schedstat [ns].
     """
     try:
         return 1e-9 * int(Path("/proc/thread-self/schedstat").read_text("ascii").split()[1])

@@ -1,4 +1,4 @@
-"""The analysis' part of the performance figures, as dicts; nothing here prints."""
+"""Performance figures of the analysis, as dicts."""
 
 from __future__ import annotations
 
@@ -18,20 +18,22 @@ from rig.model.rig import Rig
 
 
 def bench_run(rig: Rig, repeats: int = 10, seconds: float = 10.0) -> Run:
-    """Return synthetic records of the lock-and-excite steps (two joints: 3 times `repeats`)."""
+    """Return `repeats` synthetic records of each lock-and-excite step (two joints: three steps)."""
     rng = np.random.default_rng(0)
     wave = multisine(rng, rig.sample_rate, 10.0, 9.5)
     return synthetic_run(rig, rng, wave, rms=0.025, repeats=repeats, seconds=seconds)
 
 
 def identify_figures(run: Run) -> dict[str, Any]:
-    """Return records, seconds of data, rows, identify_seconds in all and solve_seconds of it.
+    """Return counts of records and rows, seconds of data, and times [s] of identification.
 
-    `twelve` is the processor time of identifying the first twelve records; `solve` that of all
-    values and their covariance from the records' triangles, `lstsq` that of numpy's `lstsq` for
-    the values alone from all rows.
+    `identify_seconds` includes `solve_seconds`. Processor times: `twelve` identifies the first
+    twelve records; `solve` computes values and covariance from the records' triangular factors;
+    `lstsq` computes the values alone from all rows with numpy's `lstsq`.
     """
-    identify([Run(run.rig, run.records[:1])])  # imports and FFT plans are not the method's
+    identify(
+        [Run(run.rig, run.records[:1])]
+    )  # excludes imports and FFT plans from the measured time
     started = time.perf_counter()
     result = identify([run])
     seconds = time.perf_counter() - started

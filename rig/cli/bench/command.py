@@ -1,4 +1,4 @@
-"""The `bench` verb: the figures of README and docs, as ratios taken in one run."""
+"""The `bench` verb: the performance figures of README and docs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rig.cli.output import progress, write_json
 def bench(
     json: JsonOption = None,
     minutes: Annotated[
-        float, typer.Option(min=0.02, help="Of real-time acquisition, over each wire.")
+        float, typer.Option(min=0.02, help="Minutes of real-time acquisition over each wire.")
     ] = 10.0,
     seeds: Annotated[
-        int, typer.Option(min=1, help="Simulated benches to identify, from seed 100 on.")
+        int, typer.Option(min=1, help="Number of simulated benches to identify, from seed 100 on.")
     ] = 10,
     only: Annotated[
         str | None,
@@ -27,10 +27,11 @@ def bench(
         ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Of the screen: 10 stops by key instead of 200.")
+        bool, typer.Option("--quick", help="Measure 10 stops by key at the screen instead of 200.")
     ] = False,
     docs: Annotated[
-        Path | None, typer.Option(help="Also write the table as a page.", callback=writable_file)
+        Path | None,
+        typer.Option(help="Also write the table to this Markdown file.", callback=writable_file),
     ] = None,
 ) -> None:
     """Measure this machine: plant, identification, ten unseen benches, acquisition.

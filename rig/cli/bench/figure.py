@@ -1,4 +1,4 @@
-"""One measured performance figure and the limit that it has to keep."""
+"""One measured performance figure and its limit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured number: `limit` is what it must keep below, or above if `above`."""
+    """One measured number and its upper limit, or its lower limit if `above`."""
 
     group: str
     name: str
@@ -18,7 +18,7 @@ class Figure:
 
     @property
     def ok(self) -> bool:
-        """Whether the limit is kept; always where there is none."""
+        """Whether the number is within its limit; True without a limit."""
         if self.limit is None:
             return True
         return self.value >= self.limit if self.above else self.value <= self.limit

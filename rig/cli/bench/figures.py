@@ -1,4 +1,4 @@
-"""The figures behind `bramah bench`, each against the number it has to meet."""
+"""The figures of `bramah bench`, each with its limit."""
 
 from __future__ import annotations
 
@@ -33,12 +33,14 @@ from rig.model.parse import InputError
 from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 
-JUDGING_SEED = 100  # seeds below were used to tune; these and above judge
-# About how long a group takes on two cores [s]; of the demo, a seed. Others say it themselves.
+JUDGING_SEED = (
+    100  # smaller seeds were used for tuning; these and larger ones serve for evaluation only
+)
+# Approximate time of a group on two cores [s]; `demo`: per seed. Other groups report their own.
 SECONDS: Final = {
     "plant": 20.0, "analysis": 60.0, "stream": 60.0, "demo": 30.0, "growth": 120.0, "run": 20.0,
 }  # fmt: skip
-LONG: Final = ("wires", "faults", "screen")  # measured only when asked for
+LONG: Final = ("wires", "faults", "screen")  # measured only with --only
 Say = Callable[[str], None]
 
 
@@ -56,7 +58,7 @@ def plant_figures(_: Path, say: Say) -> list[Figure]:
 
 
 def analysis_figures(folder: Path, say: Say) -> list[Figure]:
-    """Measure identification and simulation on 30 records of 10 s taken over the wire."""
+    """Measure identification and simulation on 30 records of 10 s, acquired over the wire."""
     say("analysis: 30 records of 10 s from a simulated bench")
     experiment(folder / "thirty", JUDGING_SEED - 1, Overrides(repeats=10), _quiet)
     started = time.perf_counter()
@@ -82,7 +84,7 @@ def parameter_errors(done: Experiment) -> dict[str, float]:
 
 
 def fit_margins(done: Experiment) -> dict[str, float]:
-    """Return FIT minus the paper's [%] for each cell of its Table IV that has a number."""
+    """Return the difference to the paper's FIT [%] for each cell of its Table IV with a number."""
     measured = {result.step: result for result in done.validation}
     return {
         f"{cell.step} {kind}": measured[cell.step].fit[ch.channel(kind, cell.joint)] - printed
@@ -93,7 +95,7 @@ def fit_margins(done: Experiment) -> dict[str, float]:
 
 
 def demo_figures(folder: Path, say: Say, seeds: int) -> list[Figure]:
-    """Identify benches of unseen seeds and print the worst of each."""
+    """Identify benches of seeds not used for tuning; return the worst errors of each."""
     figures = []
     for seed in range(JUDGING_SEED, JUDGING_SEED + seeds):
         say(f"demo: seed {seed}")
@@ -115,7 +117,7 @@ def demo_figures(folder: Path, say: Say, seeds: int) -> list[Figure]:
 
 
 def acquisition_figures(_: Path, say: Say, minutes: float) -> list[Figure]:
-    """Stream every channel in real time over the wire and count what was lost or late."""
+    """Stream every channel in real time over the wire; count lost and late samples."""
     say(f"acquisition: {minutes:g} min in real time over the wire")
     rig = load_rig(RIG)
     with simulated_bench(RIG, seed=JUDGING_SEED, real_time=True) as endpoint:
@@ -141,9 +143,9 @@ def _quiet(_: str) -> None:
 def measure(
     minutes: float, seeds: int, only: str | None, say: Say, *, quick: bool = False
 ) -> list[Figure]:
-    """Measure all groups, or the one named; raises InputError for an unknown name.
+    """Measure all groups, or the group `only`; raises InputError for an unknown name.
 
-    `quick` takes fewer repetitions where a group counts events (stops by key).
+    `quick` measures fewer stops by key.
     """
     streamed = min(60.0 * minutes, 60.0)  # [s] in real time, within the group `run`
     groups: Mapping[str, Callable[[Path, Say], list[Figure]]] = {
@@ -175,7 +177,7 @@ def measure(
             left = sum(seconds[later] for later in chosen[number:])
             about = f", about {clock_text(left)} left" if left else ""
             say(f"{name}: group {number + 1} of {len(chosen)}{about}")
-            own = Path(folder) / name  # two groups may name their runs alike
+            own = Path(folder) / name  # two groups may use the same names of runs
             own.mkdir()
             figures += groups[name](own, say)
         return figures
@@ -223,12 +225,12 @@ processor load, delay of a stop, age of its values: [screen](screen.md#figures))
 
 
 def page(figures: Sequence[Figure]) -> str:
-    """Return the figures as a page of the documentation."""
+    """Return the figures as a Markdown page."""
     return _PAGE.format(cores=os.cpu_count(), first=JUDGING_SEED, table=text(figures))
 
 
 def text(figures: Sequence[Figure]) -> str:
-    """Return the figures as a table, with the limit each has to keep."""
+    """Return the figures as a table with their limits."""
     rows = []
     for figure in figures:
         limit = ""

@@ -1,4 +1,4 @@
-"""The plant's own figures: how exact its fixed step is, and how fast."""
+"""Accuracy and speed of the simulated plant with its fixed step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rig.model.parse import parse_model
 from rig.model.rig import Rig
 from rig.model.wire.codes import Array, decode_output
 
-PEAK = 1.6  # of the command, either joint [V]
+PEAK = 1.6  # amplitude of the command of each joint [V]
 LINES = (1, 3, 5, 7, 9, 13, 19)  # odd multiples of 0.5 Hz
 
 
@@ -46,14 +46,14 @@ def hard_laws(rig: Rig) -> list[Law]:
 
 
 def signals(plant: Plant) -> Array:
-    """Return angles [rad], then all pressures [Pa] of the plant now, shape (3 N + 1,)."""
+    """Return the plant's angles [rad], then its pressures [Pa], shape (3 N + 1,)."""
     now = plant.snapshot()
     names = ("angle", "cap_pressure", "rod_pressure", "supply_pressure")
     return np.concatenate([np.atleast_1d(now[name]) for name in names])
 
 
 class Reference:
-    """The same equations by scipy, tick by tick so that held inputs do not break its order."""
+    """The same equations solved by scipy, per tick: within a call the input must be constant."""
 
     def __init__(self, plant: Plant) -> None:
         self.n = len(plant._rig.joints)
@@ -62,7 +62,7 @@ class Reference:
         self.y = np.concatenate([plant._state, plant._spool.ravel()])
         self.tick = plant.tick
         n = self.n
-        # Errors are judged against 1 rad and 7 MPa; z is a pressure over the bulk modulus.
+        # Scales of the tolerances: 1 rad and 7 MPa; z is a pressure divided by the bulk modulus.
         self.scale = np.concatenate(
             [
                 np.ones(2 * n),
@@ -74,7 +74,7 @@ class Reference:
         )
 
     def rates(self, target: Array, warmth: float) -> Callable[[float, Array], Array]:
-        """Return the right-hand side of the whole state under held spool targets."""
+        """Return the right-hand side of the whole state for constant spool targets."""
         n, size, t = self.n, 5 * self.n + 3, self.tables
         work = np.zeros((n + 4, n))
 
@@ -111,7 +111,7 @@ class Reference:
         self.tick += 1
 
     def signals(self) -> Array:
-        """Return what `signals` does, of the reference."""
+        """Return angles [rad], then all pressures [Pa], shape (3 N + 1,)."""
         n = self.n
         z = [*self.y[2 * n : 4 * n], self.y[5 * n]]
         return np.concatenate([self.y[:n], [kernel.pressure(v, self.bench) for v in z]])
@@ -123,7 +123,7 @@ def _shipped() -> Rig:
 
 
 def spool_targets(rig: Rig, outputs: NDArray[np.int64]) -> Array:
-    """Return what DA codes (ticks, joints) ask of the spools [V], same shape."""
+    """Return the spool targets [V] of DA codes, both (ticks, joints)."""
     columns = [
         np.clip(
             decode_output(outputs[:, i], j.valve.command_range, j.valve.command_bits)
@@ -137,7 +137,7 @@ def spool_targets(rig: Rig, outputs: NDArray[np.int64]) -> Array:
 
 
 def reference_run(rig: Rig, targets: Array, **options: Any) -> tuple[Array, float]:
-    """Integrate the targets (ticks, joints) from rest: (signals per tick, processor seconds)."""
+    """Integrate `targets` (ticks, joints) from rest: (signals per tick, processor time [s])."""
     reference = Reference(Plant(rig, Scenario(), 1))
     rows = []
     began = time.process_time()
@@ -148,7 +148,7 @@ def reference_run(rig: Rig, targets: Array, **options: Any) -> tuple[Array, floa
 
 
 def plant_run(rig: Rig, ticks: int) -> tuple[Array, Array]:
-    """Run the plant on the hard input: (signals per tick, spool targets)."""
+    """Run the plant with `hard_laws`; return (signals per tick, spool targets)."""
     plant, laws, rows, codes = Plant(rig, Scenario(), 1), hard_laws(rig), [], []
     for _ in range(ticks):
         codes.append(plant.advance(1, laws)[1])
@@ -157,7 +157,7 @@ def plant_run(rig: Rig, ticks: int) -> tuple[Array, Array]:
 
 
 def errors(states: Array, true: Array, joints: int) -> dict[str, float]:
-    """Return the largest error of angles and of pressures, each relative to its signal's range."""
+    """Return the largest errors of angles and pressures, each relative to its signal's range."""
     relative = np.max(np.abs(states - true), axis=0) / np.ptp(true, axis=0)
     return {
         "angle_error": float(np.max(relative[:joints])),
@@ -166,7 +166,7 @@ def errors(states: Array, true: Array, joints: int) -> dict[str, float]:
 
 
 def accuracy(seconds: float = 1.0) -> dict[str, float]:
-    """Return the plant's errors against scipy (DOP853, rtol 1e-10) on a hard input to all joints.
+    """Return the plant's errors against scipy (DOP853, rtol 1e-10) under `hard_laws`.
 
     Keys: angle_error, pressure_error (relative to each signal's range), step [s], seconds.
     """
@@ -177,16 +177,18 @@ def accuracy(seconds: float = 1.0) -> dict[str, float]:
 
 
 def speed(seconds: float = 5.0) -> dict[str, float]:
-    """Return how much faster than time the plant runs on one core, converters and noise included.
+    """Return the plant's speed on one core as a multiple of real time, with converters and noise.
 
-    Keys: real_time_ratio; lsoda_ratio, the time scipy's LSODA takes over the plant's for the same
-    input at the loosest of several tolerances that is no less exact, lsoda_rtol that tolerance,
-    plant_error and lsoda_error the two largest errors.
+    Keys: real_time_ratio; lsoda_ratio, the time of scipy's LSODA divided by the plant's for the
+    same input; lsoda_rtol, the loosest of several tolerances at which LSODA is as accurate;
+    plant_error and lsoda_error, the largest errors.
     """
     rig = _shipped()
     laws, ticks = hard_laws(rig), round(seconds * rig.sample_rate)
     taken = math.inf
-    for _ in range(3):  # the best of three, in processor time: other programs are not its fault
+    for _ in range(
+        3
+    ):  # the best of three, in processor time, to exclude the load of other programs
         plant = Plant(rig, Scenario(), 1)
         began = time.process_time()
         plant.advance(ticks, laws)

@@ -1,4 +1,4 @@
-"""Figures of scale: rows streamed against rows in memory, two workers against one."""
+"""Figures of large data sets: rows streamed or in memory, two workers or one."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from analysis.regression.qr import Accumulator
 from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import ONE_THREAD, Processes, environment
 
-COLUMNS = 9  # of the two-joint bench's fluid rows
+COLUMNS = 9  # columns of the two-joint bench's fluid rows
 READ_ROWS = 16_384
 WRITE_ROWS = 100_000
 WARM_SECONDS = 0.3
-# Dask's own setting gives every freed array back to the system: twice the work (docs/scale.md).
+# Dask's default returns every freed array to the system, which doubles the time (docs/scale.md).
 WORKER_ENVIRONMENT = {
     **ONE_THREAD,
     "MALLOC_TRIM_THRESHOLD_": "268435456",
@@ -28,7 +28,7 @@ WORKER_ENVIRONMENT = {
 }
 
 
-_TRIES = 3  # the best of them counts
+_TRIES = 3  # repetitions, of which the fastest counts
 
 
 def write_rows(path: Path, rows: int) -> None:
@@ -43,7 +43,7 @@ def write_rows(path: Path, rows: int) -> None:
 
 
 def streamed(path: str) -> dict[str, Any]:
-    """Fold a file of rows as it is read: seconds, peak memory of this process [B], solution."""
+    """Solve a file of rows block by block: time [s], peak memory of this process [B], solution."""
     started = time.perf_counter()
     whole = Accumulator(COLUMNS)
     with Path(path).open("rb") as file:
@@ -61,7 +61,7 @@ def streamed(path: str) -> dict[str, Any]:
 
 
 def in_memory(path: str) -> dict[str, Any]:
-    """Solve a file of rows by numpy's lstsq; only that is timed, the rows being in memory."""
+    """Solve a file of rows by numpy's lstsq; the time excludes loading the rows."""
     every = np.fromfile(path).reshape(-1, COLUMNS + 1)
     X, y = np.ascontiguousarray(every[:, :-1]), every[:, -1].copy()
     del every
@@ -73,9 +73,9 @@ def in_memory(path: str) -> dict[str, Any]:
 
 
 def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
-    """Return the memory and the time of streaming rows from a file against numpy's lstsq.
+    """Return memory and time of solving `rows` streamed from a file, and by numpy's lstsq.
 
-    Each is measured in a fresh process with one BLAS thread, best of three for the stream.
+    Each is measured in a new process with one BLAS thread, best of three for the stream.
     """
     path = folder / "rows.f64"
     write_rows(path, rows)
@@ -99,15 +99,15 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
 
 
 def cluster_figures(folders: Sequence[str]) -> dict[str, float]:
-    """Return how much faster two Dask workers identify run folders than one, on this machine.
+    """Return the speed-up of two Dask workers over one in identifying run folders, on this machine.
 
     Each worker is a process with one thread. Raises ImportError without dask.distributed.
     """
     distributed: Any = importlib.import_module("distributed")
     best: dict[int, float] = {1: np.inf, 2: np.inf}
-    busiest = dict(best)  # processor seconds of the worker that used most
+    busiest = dict(best)  # processor seconds of the busier worker
     values = []
-    # No dashboard, nothing but loopback; workers end with the block.
+    # No dashboard, loopback only; the workers end with the block.
     for workers in (1, 2) * _TRIES:
         with (
             environment(WORKER_ENVIRONMENT),
@@ -141,7 +141,7 @@ def cluster_figures(folders: Sequence[str]) -> dict[str, float]:
 
 
 def spin_figures() -> float:
-    """Return how much faster two processes do bare arithmetic than one: what the machine gives."""
+    """Return the speed-up of two processes over one in plain arithmetic: the machine's limit."""
     best = {1: np.inf, 2: np.inf}
     for workers in (1, 2) * _TRIES:
         with Processes(workers) as pool:
@@ -157,5 +157,5 @@ def _spin(rounds: int) -> int:
 
 
 def _warm(seconds: float) -> None:
-    """Let a worker import this module, and be busy so that others have to do so too."""
+    """Let a worker import this module and stay busy, so that the other workers import it too."""
     time.sleep(seconds)

@@ -1,4 +1,4 @@
-"""The figures of scale and of the running estimate, for `bramah bench`: group `stream`."""
+"""Figures of the group `stream` of `bramah bench`: large data sets and running estimates."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from rig.runs.rigs import load_rig
 
 RIG = "shinshu-2dof"
 BLOCK = 10  # samples: 10 ms
-RUNS, RECORD_SECONDS = 8, 20.0  # the archive: 144 records
+RUNS, RECORD_SECONDS = 8, 20.0  # length of the archive: 144 records
 GROUP = "stream"
 Say = Callable[[str], None]
 
 
 def stream_figures(folder: Path, say: Say) -> list[Figure]:
-    """Measure rows streamed, an archive on one and two Dask workers, and the tracker's cost."""
+    """Measure streamed rows, an archive on one and two Dask workers, and the tracker's cost."""
     say("stream: 1e7 rows of 9 from a file, and in memory")
     rows = row_figures(folder)
     figures = [
@@ -88,7 +88,7 @@ def _tracking(folder: Path, say: Say) -> list[Figure]:
 
 
 def _handover(rig: Rig, record: Record, folder: Path) -> np.ndarray:
-    """Return what each block of a record costs the acquisition [s]."""
+    """Return the time [s] that handing each block of a record to the tracker takes."""
     fill = np.zeros(record.samples)
     data = np.column_stack([record.channels.get(name, fill) for name in rig.recorded])
     seen = np.zeros((BLOCK, len(rig.channels)), dtype=bool)
@@ -101,6 +101,6 @@ def _handover(rig: Rig, record: Record, folder: Path) -> np.ndarray:
             started = time.perf_counter()
             tracking.block(block)
             spent.append(time.perf_counter() - started)
-            time.sleep(0.002)  # five times real time
+            time.sleep(0.002)  # blocks arrive at five times real time
         tracking.record_ends(meta, 0, record.samples, "complete")
     return np.array(spent)

@@ -16,7 +16,7 @@ REPEATS: Final = 5
 class ProcessorTime:
     """Processor time [s] of one piece of work: least and median of its repeats.
 
-    The least is what the work costs; a median far above it says that the machine was busy.
+    The least is the cost of the work; a median far above it means that the machine was busy.
     """
 
     least: float
@@ -34,7 +34,7 @@ def processor_times(
 ) -> dict[str, ProcessorTime]:
     """Return the processor time of each of several pieces of work, done in turns.
 
-    In turns, because a machine that gets busier meanwhile slows all of them alike.
+    In turns, so that changes of the machine's load affect all of them alike.
     """
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):

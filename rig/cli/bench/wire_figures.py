@@ -1,8 +1,8 @@
-"""The figures of each wire, for `bramah bench`: group `wires`.
+"""Figures of the group `wires` of `bramah bench`.
 
-The acquisition process is measured as it runs: driver, guard and recorder, against a simulated
-bench in real time in another process. The driver alone is compared with the library that carries
-it, moving the same bytes to and from the same device in virtual time, where nobody waits.
+Driver, guard and recorder are measured together, with a simulated bench in real time in another
+process. The driver alone is compared with the library on which it is based, for the same bytes
+to and from the same device in virtual time, where nothing waits.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ Say = Callable[[str], None]
 class Stream:
     """All channels of a wire streamed in real time through driver, guard and recorder.
 
-    `core_share` is the acquisition process's of one core; times are in seconds. `worst_waited` is
-    how long this process was ready to run and had no processor while the worst built up.
+    `core_share`: processor load of the acquisition process, as a share of one core. Times in
+    seconds. `worst_waited`: time that this process waited for a processor before the latest block.
     """
 
     samples: int
@@ -65,7 +65,7 @@ class Stream:
 def wire_figures(say: Say, minutes: float) -> list[Figure]:
     """Measure every wire of the simulated bench for `minutes` each.
 
-    Valves of CiA 408 stream nothing: the host is their clock, at some tens of Hz.
+    Excludes CiA 408 valves, which do not stream: the host samples them at some tens of Hz.
     """
     figures = []
     for wire in WIRES:
@@ -90,12 +90,12 @@ def stream_of(wire: str, seconds: float) -> Stream:
         simulated_bench(RIG, seed=0, real_time=True, wire=wire) as endpoint,
         tempfile.TemporaryDirectory(prefix="bramah-wires-") as folder,
     ):
-        # A computer that stands still makes blocks late, which is measured; it must end nothing.
+        # Late blocks of a stalled computer are to be measured and must not end the session.
         patient = rig.wire.model_copy(update={"watchdog": WATCHDOG_RANGE[1]})
         reached = reached_at(rig.model_copy(update={"wire": patient}), endpoint)
         recorder = Recorder(Path(folder) / "run", reached)
         with Bench(reached, make_driver(reached.wire, reached), recorder, signals=False) as bench:
-            bench.run_for(0.5)  # what is imported and opened first is not the stream
+            bench.run_for(0.5)  # excludes imports and opening of files
             lost, busy, began = bench.lost_samples, time.process_time(), time.perf_counter()
             ends, arrivals, waits, samples, disordered = [], [], [], 0, 0
             while time.perf_counter() - began < seconds:
@@ -110,7 +110,7 @@ def stream_of(wire: str, seconds: float) -> Stream:
             lost = bench.lost_samples - lost
     late, _ = lateness(np.array(ends), np.array(arrivals))
     worst = int(late.argmax())
-    # What made the block late lies between the last one that was not and this one.
+    # The delay arose between the last block in time and this one.
     before_it = np.flatnonzero(late[:worst] < 0.1 * late[worst])
     waited = waits[worst] - waits[int(before_it[-1]) if len(before_it) else 0]
     return Stream(
@@ -135,7 +135,7 @@ def acquisition_of(wire: str, seconds: float) -> list[Figure]:
 
 
 def driver_and_bare(wire: str) -> tuple[float, float]:
-    """Return the time [s] of one block by the driver and by the bare library, best of rounds."""
+    """Return the times [s] of one block by the driver and by the bare library, best of several."""
     rig = load_rig(RIG)
     ours, bare = [], []
     with simulated_bench(RIG, seed=0, wire=wire) as endpoint:
@@ -169,7 +169,7 @@ def _streaming(rig: Rig) -> Iterator[Driver]:
 
 @contextmanager
 def bare_modbus(rig: Rig) -> Iterator[Callable[[], object]]:
-    """Ask for blocks with pymodbus and nothing else."""
+    """Read blocks with pymodbus alone."""
     client, layout = _client(rig.wire), reg.block_layout(len(rig.channels), len(rig.joints))
     client.connect()
     words = [0xFFFF, 0]
@@ -202,7 +202,7 @@ def _client(wire: Wire) -> Any:
 
 @contextmanager
 def _bare_serial(rig: Rig) -> Iterator[Callable[[], object]]:
-    """Send notes and receive blocks with pyserial and the frames' encoding, and nothing else."""
+    """Send messages and receive blocks with pyserial and the frames' encoding alone."""
     at, heart = SerialSettings.of(rig.wire), 0
     decoder = FrameDecoder()
     with serial.Serial(at.device, at.baud, timeout=2.0) as port:

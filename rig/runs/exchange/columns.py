@@ -24,9 +24,9 @@ _DELIMITERS = (",", ";", "\t")
 
 
 def read_table(path: Path, wanted: Iterable[str], needed: Iterable[str]) -> dict[str, Array]:
-    """Return the columns in `wanted` that the file has, each (n,) finite numbers as they stand.
+    """Return those columns of `wanted` that the file has, each (n,), finite, without conversion.
 
-    Raises InputError naming file, column and row; also when one of `needed` is missing.
+    Raises InputError naming file, column and row; also if a column of `needed` is missing.
     """
     if path.suffix.lower() == ".mat":
         table = _read_mat(path, list(wanted))
@@ -64,13 +64,15 @@ def _read_csv(path: Path, wanted: list[str], needed: list[str]) -> dict[str, Arr
             raise _missing(path, name, names)
     for name in chosen:
         if names.count(name) > 1:
-            raise InputError(f"{path}:{head + 1}: column {name!r} stands there twice")
+            raise InputError(
+                f"{path}:{head + 1}: column {name!r} occurs twice; expected distinct names"
+            )
     rows = [i for i in range(head + 1, len(lines)) if lines[i].strip()]
     if not rows:
         raise InputError(f"{path}: has a header row but no numbers under it")
     body = [lines[i] for i in rows]
     if delimiter != "," and not any("." in line for line in body[:50]):
-        body = [line.replace(",", ".") for line in body]  # a decimal comma
+        body = [line.replace(",", ".") for line in body]  # the file has decimal commas
     _refuse_ragged(path, body, rows, names, delimiter)
     values = _numbers(path, body, rows, names, chosen, delimiter)
     return {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(chosen)}
@@ -128,7 +130,7 @@ def _bad_cell(
     delimiter: str,
     reason: str,
 ) -> InputError:
-    """Find the first cell that is no number, row by row: slow, but only for a bad file."""
+    """Return the error of the first cell that is not a number; slow, for invalid files only."""
     for line, row in zip(body, rows, strict=True):
         cells = _split(line, delimiter)
         for column in columns:

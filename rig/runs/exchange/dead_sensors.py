@@ -1,8 +1,8 @@
-"""Sensors that say nothing in a foreign record: dead, at the end of their range, or cut flat.
+"""Sensors without information in a foreign record: constant, out of range, or clipped.
 
-A foreign record does not say where its converter ends, so a flat top is known by its shape: near
-the peak of any smooth motion the samples thin out towards the peak by the square root, so that few
-of those within two percent of the range share its exact value; of a clipped one most do.
+The range of the converter is unknown, so clipping is detected by shape: the density of samples of
+a smooth signal has an inverse square root singularity at a peak, so that few samples within two
+percent of the range have exactly the peak's value; of a clipped signal most do.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from rig.runs.exchange.settings import EXCHANGE
 
 Array = NDArray[np.float64]
 
-_DRIVEN = (ch.SPOOL, ch.DRIVE)  # what a waveform or its limit may hold at one value
+_DRIVEN = (ch.SPOOL, ch.DRIVE)  # channels that a waveform or its limit may keep constant
 
 
 def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
-    """Return a sentence for each channel (n,) that is dead or clipped; [] where all are well.
+    """Return a sentence for each constant or clipped channel (n,); [] if there is none.
 
     Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
     """

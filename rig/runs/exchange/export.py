@@ -1,6 +1,6 @@
 """Runs as files for other programs: CSV, MAT, Parquet or MDF 4, one file per record, SI units.
 
-CSV and MAT come with a manifest and the rig, so that `bramah import` makes the same run of them.
+CSV and MAT include a manifest and the rig, so that `bramah import` restores the same run.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from rig.runs.stream import RunHead, iterate_records, read_run_head
 Array = NDArray[np.float64]
 
 TIME: Final = "time"
-MODEL: Final = "model_"  # before a channel's name: as a model has it
+MODEL: Final = "model_"  # prefix of a channel simulated by a model
 RIG_FILE: Final = "rig.yaml"
 MANIFEST: Final = "manifest.yaml"
 LIBRARIES: Final = {"parquet": "pyarrow", "mf4": "asammdf"}
 _RIG_NOTE = "# The rig as it was when this run was taken. Numbers are SI.\n"
 _MANIFEST_NOTE = "# bramah import {name} --out RUN makes a run of these files.\n"
-_LONG = 63  # characters of a name that MATLAB takes
+_LONG = 63  # longest name in MATLAB [characters]
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """One record for a file: columns (n,) by name, the time first; units; what it is."""
+    """One record for a file: columns (n,) by name, the time first; units; attributes."""
 
     columns: Mapping[str, Array]
     units: Mapping[str, str]
@@ -46,7 +46,7 @@ class Sheet:
 
 
 def library_missing(kind: str) -> str:
-    """Name the library that a format needs and this installation lacks ('' if it has it)."""
+    """Return the name of a format's library that is not installed, '' if all are."""
     name = LIBRARIES.get(kind, "")
     return name if name and importlib.util.find_spec(name) is None else ""
 
@@ -57,16 +57,16 @@ def export_run(
 ) -> list[Path]:  # fmt: skip
     """Write every complete record of a run into the folder `out`; returns the files.
 
-    `more` gives further channels of a record, each (n,), written as `model_NAME` in the unit of
-    `NAME`. One record is in memory at a time. Raises InputError for an unknown format, a run that
-    cannot be read, or a folder that is occupied.
+    `more` returns further channels of a record, each (n,), written as `model_NAME` in the unit of
+    `NAME`. One record is in memory at a time. Raises InputError for an unknown format, an
+    unreadable run, or an occupied folder.
     """
     if kind not in WRITERS:
         raise InputError(f"--format {kind}: expected one of: {' '.join(WRITERS)}")
     head = read_run_head(run)
     store.refuse_occupied(out)
     names = []
-    with new_folder(out) as folder:  # half an export would pass for a whole one
+    with new_folder(out) as folder:  # a partial export would look complete
         for record in iterate_records(run):
             names.append(f"{record.name}.{kind}")
             added = {} if more is None else more(record)
@@ -108,7 +108,7 @@ def _write_csv(path: Path, sheet: Sheet) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(sheet.columns)
-        # Python writes the fewest digits that read back as the same number.
+        # repr has the fewest digits that give the same number when read.
         writer.writerows(zip(*(c.tolist() for c in sheet.columns.values()), strict=True))
 
 

@@ -1,4 +1,4 @@
-"""Run folders of records at hand: archives that no bench recorded, for studies and figures."""
+"""Run folders from records in memory, for studies and figures."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from rig.runs import archive, store
 
 
 def write_run(folder: str | Path, run: Run) -> Path:
-    """Write a finished run folder of records at hand, whole or not at all.
+    """Write a finished run folder from records in memory, completely or not at all.
 
-    Raises InputError if it is occupied, RecordingFailed if the disk does not take it.
+    Raises InputError if it is occupied, RecordingFailed if it cannot be written.
     """
     out = Path(folder)
     values = sum(c.size for r in run.records for c in r.channels.values())

@@ -1,4 +1,4 @@
-"""Foreign records, described by a manifest, as a run folder like any other."""
+"""Imports foreign records, described by a manifest, into a run folder."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What was imported, and what a user should know about it."""
+    """The imported run and warnings for the user."""
 
     path: Path
     records: int
@@ -43,7 +43,7 @@ class ImportReport:
 
 @dataclass(frozen=True)
 class _Source:
-    """A manifest with everything needed to read one file."""
+    """A manifest with the data needed to read its files."""
 
     path: Path
     manifest: Manifest
@@ -51,7 +51,7 @@ class _Source:
     maps: Mapping[str, tuple[float, float]]
 
     def column(self, channel: str) -> str:
-        """Return the name that a channel's column has in the files."""
+        """Return the column name of a channel in the files."""
         entry = self.manifest.columns.get(channel)
         return channel if entry is None or entry.column is None else entry.column
 
@@ -68,7 +68,7 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
     """Import every record of a manifest into a new run folder.
 
     Raises InputError naming file, column and row, before anything is written; RecordingFailed if
-    the disk does not take it.
+    the run cannot be written.
     """
     path, folder = Path(manifest_path), Path(out)
     store.refuse_occupied(folder)
@@ -88,7 +88,7 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
 def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     file = source.path.parent / entry.file
     required, optional = channels_of(source.rig)
-    # What the manifest maps by name is meant to be there, optional or not.
+    # A channel that the manifest maps is required, even if it is optional otherwise.
     needed = [n for n in (*required, *optional) if n in required or n in source.manifest.columns]
     timed = source.manifest.sample_rate is None or TIME in source.manifest.columns
     every = (*required, *optional, TIME)
@@ -113,7 +113,7 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
 def _common(
     file: Path, rate: float, samples: int, delays: Mapping[str, float]
 ) -> tuple[int, int]:  # fmt: skip
-    """Return the samples [first, last) that every column has once its delay [samples] is out."""
+    """Return the samples [first, last) common to all columns without their delays [samples]."""
     least, most = min((0.0, *delays.values())), max((0.0, *delays.values()))
     first, last = math.ceil(-least - EXCHANGE.whole), samples - math.ceil(most - EXCHANGE.whole)
     if last - first < 2:
@@ -126,7 +126,7 @@ def _common(
 
 
 def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
-    """Return a column (n,) without its delay [samples]; what lies outside [first, last) is 0."""
+    """Return a column (n,) advanced by its delay [samples]; 0 outside [first, last)."""
     whole = round(delay)
     out = np.zeros_like(values)
     if abs(delay - whole) < EXCHANGE.whole:
@@ -142,7 +142,7 @@ def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
 def _part(entry: ManifestRecord, file: Path, rate: float, first: int, last: int) -> slice:
     """Return the samples between the entry's `begin` and `end`; raises InputError if none are.
 
-    Both count from the file's first sample; [first, last) are those that every column has.
+    Both count from the file's first sample; [first, last) are the samples common to all columns.
     """
     begin = max(first, round(entry.begin * rate))
     end = last if entry.end is None else round(entry.end * rate)
@@ -204,7 +204,7 @@ def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, 
             f"{steps[row - 1]:.6g} s among steps of {step:.6g} s; expected even sampling"
         )
     mean = float((time[-1] - time[0]) / (len(time) - 1))
-    rate = float(f"{1.0 / mean:.6g}")  # rounded time stamps know it no better
+    rate = float(f"{1.0 / mean:.6g}")  # rounded time stamps are not more accurate
     if given is not None and abs(rate - given) > 1e-3 * given:
         raise InputError(
             f"{file}: column {column!r} steps at {rate:.6g} Hz, but the manifest's sample_rate is "

@@ -1,4 +1,4 @@
-"""The import manifest (CONTRACT, "Import manifest") as data, every refusal with its line."""
+"""The import manifest (format: docs/runs.md) as data; errors name its line."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class _Part(BaseModel):
 
 
 class Column(_Part):
-    """Where a channel stands: value = to_SI(raw * scale + offset).
+    """The column of a channel: value = to_SI(raw * scale + offset).
 
-    `scale` and `offset` apply to the raw number, their result is in `unit` (default: SI). `delay`
-    [s] is by how much the column lags behind the others: what it shows at t was so at t - delay.
+    `scale` and `offset` apply to the raw number and give a value in `unit` (default: SI). `delay`
+    [s] is the lag of the column: its value at t belongs to t - delay.
     """
 
     column: str | None = Field(default=None, min_length=1)
@@ -38,12 +38,12 @@ class Column(_Part):
     @model_validator(mode="after")
     def _scale_is_a_scale(self) -> Self:
         if self.scale == 0.0:
-            raise ValueError("scale 0 leaves nothing of the column")
+            raise ValueError("scale is 0, which makes the column constant; expected another number")
         return self
 
 
 class ManifestRecord(_Part):
-    """One file, one record, or the part of it from `begin` to `end`.
+    """One record: a file, or its part from `begin` to `end`.
 
     `period` [samples] and `lines` describe a periodic excitation.
     """
@@ -68,7 +68,7 @@ class ManifestRecord(_Part):
         return self
 
     def meta(self) -> RecordMeta:
-        """Return what the record is."""
+        """Return the description of the record."""
         return RecordMeta(self.step, self.repeat, self.locked, self.period, self.lines, self.name)
 
 
@@ -100,12 +100,14 @@ def _refuse_duplicates(
         key = (entry.step, entry.repeat)
         if key in seen:
             raise InputError(
-                f"{path}:{line}: records: step {entry.step!r} repeat {entry.repeat} stands in "
-                f"line {seen[key]} already; give this one another repeat"
+                f"{path}:{line}: records: step {entry.step!r} repeat {entry.repeat} is already in "
+                f"line {seen[key]}; expected another repeat"
             )
         name = entry.meta().name
         if name in names:
-            raise InputError(f"{path}:{line}: records: name {name!r} stands there twice")
+            raise InputError(
+                f"{path}:{line}: records: name {name!r} occurs twice; expected distinct names"
+            )
         seen[key] = line
         names.add(name)
 
@@ -120,8 +122,8 @@ def check_against_rig(
         if wrong or len(set(entry.locked)) != len(entry.locked):
             line = lines.get(("records", index, "locked"), lines.get(("records", index), 1))
             raise InputError(
-                f"{path}:{line}: records.{index}.locked: {list(entry.locked)} is no list of "
-                f"different joints of rig {rig.name!r}, which has 1 to {joints}"
+                f"{path}:{line}: records.{index}.locked: found {list(entry.locked)}, expected "
+                f"different joints of rig {rig.name!r}, 1 to {joints}"
             )
     maps = {}
     known = (TIME, *_all_channels(rig))
@@ -140,8 +142,8 @@ def check_against_rig(
             raise InputError(f"{path}:{at}: columns.{name}.unit: {error}") from error
         if name == TIME and column.delay:
             raise InputError(
-                f"{path}:{line}: columns.{name}.delay: the time itself has no delay; state that of "
-                "the columns that lag"
+                f"{path}:{line}: columns.{name}.delay: time has no delay; expected the delay of "
+                "the lagging columns"
             )
         maps[name] = (factor * column.scale, factor * column.offset + shift)
     return maps

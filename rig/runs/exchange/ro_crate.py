@@ -1,4 +1,4 @@
-"""A run as an RO-Crate: the run's own files and a JSON-LD description that archives understand.
+"""A run as an RO-Crate: the run's files and a JSON-LD description for data archives.
 
 RO-Crate 1.1 (https://w3id.org/ro/crate/1.1) with the Process Run Crate profile: the run is a
 `CreateAction` of this software on the rig, by the operator, from run.yaml to records.h5.
@@ -30,7 +30,7 @@ _FILES: Final = {
     EVENTS: ("application/jsonl", "What happened, one line an event"),
     "state": ("text/plain", "How the run ended"),
 }
-# UN/CEFACT common codes, as schema.org wants them.
+# UN/CEFACT common codes, as required by schema.org.
 _UNIT_CODES: Final = {"V": "VLT", "m": "MTR", "Pa": "PAL", "degC": "CEL", "rad": "C81", "N": "NEW"}
 Entity = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Thresholds by which foreign records are read, and windows written.
+"""Thresholds for importing foreign records and for writing the window around a trip.
 
 Set on the measured machines of docs/emps.md and docs/crane.md, and by the tests of
 importing (tests/services/test_importer.py).
@@ -14,12 +14,12 @@ from typing import Final
 class ExchangeSettings:
     """Numbers without unit are shares or counts."""
 
-    file_bytes: int = 4 << 30  # [bytes] of a file of columns, at most
-    whole: float = 1e-6  # of a sample: a delay so near to whole samples is one
-    uneven: float = 0.1  # of the mean step: what rounded time stamps may differ from it
+    file_bytes: int = 4 << 30  # [bytes], largest size of a file of columns
+    whole: float = 1e-6  # of a sample, within which a delay counts as whole samples
+    uneven: float = 0.1  # of the mean step: allowed deviation of rounded time stamps
     trip_seconds: float = 2.0  # [s] before the offending sample, and after it
 
-    # Sensors at the end of their range, and dead ones.
+    # Clipped and constant sensors.
     levels: int = 500  # of resolution within the range; a coarser channel has flat tops anyway
     near: float = 0.02  # of the channel's range, counted from its extreme
     share: float = 0.5  # of the samples near an extreme with its exact value; a parabola: a third

@@ -1,7 +1,6 @@
-"""The samples around a trip, beside the run as `trip.csv`: what a person looks at first.
+"""The samples around a trip, in the run's file `trip.csv`, for a person to inspect.
 
-Everything in it is in `records.h5` too, where a trip divides it between a record and what came
-after.
+They are also in `records.h5`, where the trip divides them into a record and the samples after it.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def write_trip_window(folder: Path) -> Path | None:
     """Write the samples around a finished run's trip; returns the file, None if there is none.
 
     The columns are `time [s]` since the offending sample, `tick`, and every channel in SI. A sample
-    that never arrived is left out. Never raises: the run itself is complete without it.
+    that never arrived is left out. Never raises, because the run is complete without the file.
     """
     trips = [e for e in read_events(folder) if e.get("event") == "trip"]
     if not trips or not isinstance(trips[-1].get("tick"), int):
@@ -68,6 +67,6 @@ def _around(file: h5py.File, tick: int) -> tuple[list[str], NDArray[np.float64]]
         parts.append(np.column_stack([(ticks[rows] - tick) / rate, ticks[rows], *values]))
     table = np.concatenate(parts)
     table = table[np.isfinite(table[:, 2:]).any(axis=1)]
-    # A sample may be in two records; it stands here once, in the order of time.
+    # A sample may be in two records; it is written once, in order of time.
     _, first = np.unique(table[:, 1], return_index=True)
     return names, table[first]

@@ -1,1 +1,1 @@
-"""What runs there are: a line for each, an index of them, filters."""
+"""Lists of runs: summaries, their index, filters."""

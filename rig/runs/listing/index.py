@@ -1,7 +1,7 @@
-"""An index of a folder's runs: what each line says is read again only where a folder has changed.
+"""An index of a folder's runs, so that only changed run folders are read again.
 
-The folders are what counts: the index may be deleted, damaged or behind, and is made from them
-anew. A run that is being written is never taken from it.
+The index is a cache: if it is deleted, damaged or outdated, it is rebuilt from the folders. A run
+in progress is never read from it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _WATCHED = (HEADER, "state", "owner.json", EVENTS, ARCHIVE, JOURNAL)
 
 
 def _signature(folder: Path) -> str:
-    """Return what changes when a run does: sizes and times of its files."""
+    """Return sizes and times of a run's files, which change with the run."""
     parts: list[object] = []
     for name in _WATCHED:
         try:
@@ -65,9 +65,9 @@ def _summary(folder: Path, line: str) -> RunSummary:
 
 
 def rebuild(root: Path) -> int:
-    """Delete a folder's index and make it from the run folders; returns how many there are.
+    """Rebuild a folder's index from the run folders; return their number.
 
-    Raises InputError where the folder cannot be read; an index that cannot be written is logged.
+    Raises InputError if the folder cannot be read; logs an index that cannot be written.
     """
     for suffix in ("", "-journal", "-wal", "-shm"):
         root.joinpath(INDEX + suffix).unlink(missing_ok=True)
@@ -86,7 +86,7 @@ def indexed_runs(root: Path) -> list[RunSummary]:
                 return in_order(_read(db, folders))
         except (sqlite3.Error, ValueError, TypeError) as error:
             if attempt == 1 and isinstance(error, (sqlite3.DatabaseError, ValueError, TypeError)):
-                log.info("%s: made anew: %s", path, error)
+                log.info("%s: index rebuilt: %s", path, error)
                 if not _removed(path):
                     break
     return in_order([summarise(folder) for folder in folders])
@@ -95,7 +95,7 @@ def indexed_runs(root: Path) -> list[RunSummary]:
 def _removed(path: Path) -> bool:
     try:
         path.unlink(missing_ok=True)
-    except OSError as error:  # a folder that may only be read: listed without an index
+    except OSError as error:  # a read-only folder is listed without an index
         log.info("%s: %s", path, error)
         return False
     return True
@@ -113,7 +113,7 @@ def _read(db: sqlite3.Connection, folders: list[Path]) -> list[RunSummary]:
             continue
         summary = summarise(folder)
         summaries.append(summary)
-        if summary.state != RUNNING:  # its writer may die without touching a file
+        if summary.state != RUNNING:  # its writer may die without changing a file
             fresh.append((signature, summary))
     gone = set(kept) - {folder.name for folder in folders}
     if fresh or gone:

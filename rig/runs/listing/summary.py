@@ -1,4 +1,4 @@
-"""One line for a run folder: its state, what it is of, and what it holds."""
+"""One line for a run folder: state, rig, protocol and contents."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _UNKNOWN = Written(-1, 0, -1, 0, 0, -1)
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One line of a list of runs; counts are -1 where they are not known.
+    """One line of a list of runs; unknown counts are -1.
 
-    `records` are complete, `partial` ones are not; `samples` were measured within records,
-    `lost_samples` are missing there, `outside` were measured between them; `seconds` is the
-    device's time of all. `recovered`: its process died and `recover` has finalised it since.
+    Counts: complete `records`, incomplete ones (`partial`), `samples` within records,
+    `lost_samples` missing in them, samples `outside` records. `seconds` is the device time of all
+    samples. `recovered`: `recover` has finalised the run after its process died.
     """
 
     path: Path
@@ -43,7 +43,7 @@ class RunSummary:
 
 
 def summarise(folder: Path) -> RunSummary:
-    """Summarise one run; never raises: what cannot be read is said in the message."""
+    """Summarise one run; never raises: the summary's message states what cannot be read."""
     try:
         header = read_header(folder)
     except InputError as error:
@@ -100,7 +100,7 @@ def _count(folder: Path) -> Written:
 
 
 def _count_journal(path: Path) -> Written:
-    """Count what a journal holds, also while its run writes it; raises sqlite3.Error."""
+    """Count the contents of a journal, even one being written; raises sqlite3.Error."""
     uri = f"{path.absolute().as_uri()}?mode=ro"
     with closing(sqlite3.connect(uri, uri=True, timeout=5.0)) as db:
         blocks = db.execute("SELECT stream, tick, samples FROM block").fetchall()
@@ -131,7 +131,7 @@ def run_folders(folder: str | Path) -> list[Path]:
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     try:
-        # A hidden folder is an export whose process was killed.
+        # A hidden folder is an incomplete one whose process was killed.
         if is_run(root):
             return [root]
         return [c for c in root.glob("[!.]*") if is_run(c) and not is_crate(c)]

@@ -1,1 +1,1 @@
-"""A damaged journal: found as such, read as far as it can be, rebuilt beside itself."""
+"""Damaged journals: detection, reading of the intact part, and rebuilding."""

@@ -1,8 +1,8 @@
-"""Distinguish damaged journals from whole ones, and rebuild a whole one from what can be read.
+"""Detects damaged journals, and rebuilds a journal from the readable part.
 
-A damaged journal's files are read only. What counts as lost: the gaps that the readable blocks
-leave between them (less what was lost on the wire, which the events say), the blocks before the
-first by its number, and what the events and marks say was measured after the last.
+The files of a damaged journal are not changed. Lost samples are: the gaps between readable blocks
+(without those lost on the wire, which the events state), the blocks before the first readable one
+(by its number), and samples after the last readable one according to events and marks.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ REBUILT: Final = "journal.rebuilt.sqlite"
 DAMAGED: Final = "journal.damaged"
 _FILES: Final = ("", "-wal", "-shm")
 _WAL_HEADER, _FRAME_HEADER = 32, 24
-_AT_ONCE = 256  # rows asked for together; where one is unreadable each is tried alone
+_AT_ONCE = 256  # rows per query; if one is unreadable, each is read alone
 _UNREADABLE = (sqlite3.Error, ValueError, TypeError, KeyError, AttributeError, OverflowError)
 
 
 @dataclass(frozen=True)
 class Salvage:
-    """What a damaged journal still holds; `lost` samples are known to be missing."""
+    """Contents of a damaged journal; `lost`: samples known to be missing."""
 
     what: str
     blocks: int
@@ -47,7 +47,7 @@ class Salvage:
 
 
 def find_damage(path: Path, rig: Rig) -> str | None:
-    """Return what is wrong with a journal in a few words, None if all of it can be read."""
+    """Return the damage of a journal in words, None if it is intact."""
     log_file = path.with_name(path.name + "-wal")
     try:
         with closing(_open(path)) as db:
@@ -67,12 +67,12 @@ def find_damage(path: Path, rig: Rig) -> str | None:
 
 
 def _open(path: Path) -> sqlite3.Connection:
-    """Open a journal so that its files stay as they are: no log is written back."""
+    """Open a journal without changing its files: no log is written back."""
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
 
 
 def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tuple[int, int]:
-    """Return what is wrong with the rows, or the newest block as (stream, tick)."""
+    """Return the damage of the rows in words, or the newest block as (stream, tick)."""
     for key, value, what in (
         ("columns", list(rig.recorded), "its columns are not those"),
         ("measured", len(rig.channels), "its count of sensors is not that"),
@@ -81,7 +81,7 @@ def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tup
         if journal.meta(key) != value:
             return f"{what} of the run's rig"
     if not all(describes_record(mark.meta) for mark in journal.marks()):
-        return "what a record is cannot be read"
+        return "the description of a record cannot be read"
     newest, count = (-1, -1), 0
     for _, block in journal.blocks():
         if block is None:
@@ -112,7 +112,7 @@ def _as_block(row: tuple[Any, ...], rig: Rig) -> Block | None:
 
 
 def rebuild(path: Path, rig: Rig, what: str) -> tuple[Journal, Salvage]:
-    """Write what a damaged journal still holds into a new one beside it, open to be finished.
+    """Write the readable part of a damaged journal into a new, open journal beside it.
 
     Raises RecordingFailed if the disk fails.
     """
@@ -156,7 +156,7 @@ def _keep(
 
 
 def _rows_by_number(path: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
-    """Yield the rows that SQLite can still read, many at once, then those around a fault alone."""
+    """Yield the rows that SQLite can read, in groups, and one by one around a fault."""
     sql = (
         "SELECT id, stream, sequence, tick, samples, late, crc, data, saturated FROM block "
         "WHERE id BETWEEN ? AND ?"
@@ -187,7 +187,7 @@ def _account(
     places: dict[tuple[int, int], tuple[int, int]],
     chosen: Sequence[Mark],
 ) -> Salvage:
-    """Count what is there and what is known to be missing."""
+    """Count the samples present and those known to be missing."""
     events = read_events(folder)
     names = {str(mark.meta["name"]) for mark in chosen}
     begun = {str(e["record"]) for e in events if e.get("event") == "record begins"}
@@ -205,7 +205,7 @@ def _account(
     lost_blocks = 0 if not numbers else max(0, numbers[-1] - len(places))
     if numbers and places[keys[0]][1] > 1:
         lost += (places[keys[0]][1] - 1) * usual
-    # A record may be announced before its first sample is taken.
+    # A mark may be written before the record's first sample.
     other_events = [e for e in events if e.get("event") != "record begins"]
     known = [int(e["tick"]) for e in other_events if isinstance(e.get("tick"), int)]
     known += [m.start + m.ticks for m in chosen if m.state == "complete" and m.ticks is not None]
@@ -221,7 +221,7 @@ def _account(
 
 
 def set_aside(path: Path) -> Path:
-    """Give a damaged journal and its log another name, which no other has; returns it."""
+    """Rename a damaged journal and its log to an unused name; return the name."""
     number, target = 1, path.with_name(f"{DAMAGED}.sqlite")
     while target.exists() or target.with_name(target.name + "-wal").exists():
         number += 1

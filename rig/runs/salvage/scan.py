@@ -1,10 +1,10 @@
-"""Find rows of a journal in the raw bytes of its files, whatever SQLite still makes of them.
+"""Finds rows of a journal in the raw bytes of its files, independently of SQLite.
 
 A row of a table is stored as (lengths of) payload and rowid, a header that gives one type per
 column, then the columns ("Database File Format", sqlite.org, section 2.1). A header of the block
-table is easily told from samples, and the block's checksum proves what follows it; so no page
-structure is needed, and the write-ahead log is read like the database. A row longer than a page is
-stored in pieces and not found here.
+table differs clearly from samples, and the block's checksum verifies the row; so no page structure
+is needed, and the write-ahead log is read like the database. A row longer than a page is stored in
+pieces and is not found.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Bytes = NDArray[np.uint8]
 Like = Callable[[list[Bytes]], Any]  # to a mask, one flag per place
 
 _CHUNK = 1 << 24
-_OVERLAP = 1 << 16  # the largest page: no row that is whole reaches further
+_OVERLAP = 1 << 16  # the largest page: an undivided row is not longer
 _INTEGER = (0, 1, 2, 3, 4, 6, 8)  # bytes of the integer types 0 (NULL) to 6
 _NULL, _REAL, _ZERO, _ONE = 0, 7, 8, 9
 _STATES = {"open": 21, "complete": 29, "partial": 27, "discarded": 31}  # type of each text
@@ -47,7 +47,7 @@ def raw_bytes(path: Path) -> Bytes:
 
 
 def block_rows(raw: Bytes) -> Iterator[SalvagedRow]:
-    """Yield what looks like a row of the block table; only its checksum tells whether it is."""
+    """Yield candidate rows of the block table; the checksum has to confirm them."""
 
     def like(types: list[Bytes]) -> Any:
         return np.logical_and.reduce([kind <= _ONE for kind in types[1:]])
@@ -56,7 +56,7 @@ def block_rows(raw: Bytes) -> Iterator[SalvagedRow]:
 
 
 def marks(raw: Bytes) -> Iterator[Mark]:
-    """Yield the marks found, in every version that is left of each."""
+    """Yield the marks found, including older versions of each."""
 
     def like(types: list[Bytes]) -> Any:
         number = [t <= _ONE for t in types[1:4]]
@@ -74,9 +74,9 @@ def marks(raw: Bytes) -> Iterator[Mark]:
 
 
 def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[SalvagedRow]:
-    """Yield rows of so many columns, of which the first is NULL (it is the rowid).
+    """Yield rows with `columns` columns, of which the first is NULL (the rowid).
 
-    `like` judges the types of the first `short` columns, each one byte in the header.
+    `like` tests the types of the first `short` columns, each one byte in the header.
     """
     for begin in range(0, len(raw), _CHUNK):
         part = np.asarray(raw[begin : begin + _CHUNK + _OVERLAP])
@@ -118,7 +118,7 @@ def _row(part: Bytes, place: int, columns: int) -> tuple[int | None, tuple[Any, 
 
 
 def _varint(part: Bytes, at: int) -> tuple[int, int]:
-    """Return a number of seven bits a byte, high ones first, and where it ends."""
+    """Return a number of seven bits per byte, most significant first, and its end."""
     value = 0
     for k in range(at, min(at + 9, len(part))):
         byte = int(part[k])
@@ -157,7 +157,7 @@ def _value(kind: int, raw: bytes) -> Any:
 
 
 def _number(part: Bytes, place: int, payload: int) -> int | None:
-    """Return the rowid that stands before a payload, behind the payload's own length."""
+    """Return the rowid, stored between the payload's length and the payload."""
     length = _as_varint(payload)
     for size in range(1, 6):
         begin = place - size - len(length)
@@ -170,7 +170,7 @@ def _number(part: Bytes, place: int, payload: int) -> int | None:
 
 
 def best_marks(marks: Sequence[Mark]) -> list[Mark]:
-    """Return one version of each mark, the closed one where it is left, in the order of start."""
+    """Return one version of each mark, the closed one if present, in order of start."""
     best: dict[tuple[int, int, str], Mark] = {}
     for mark in marks:
         key = (mark.stream, mark.start, str(mark.meta["name"]))

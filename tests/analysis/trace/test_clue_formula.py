@@ -70,7 +70,7 @@ def test_drag_by_the_square_of_the_speed_is_read_off(quiet: tuple[Run, Run]) -> 
 def test_it_is_told_as_a_clue_and_no_name(sprung: Trace) -> None:
     assert sprung.effects == ()
     assert "2e+07 piston_2³" in sprung.sentence
-    assert "a clue, not a name" in trace_text(sprung)
+    assert "a clue, not a named effect" in trace_text(sprung)
     (told,) = to_json(sprung)["unexplained"]["formulas"]
     assert told["terms"]["piston_2³"] == sprung.formulas[0].terms["piston_2³"]
     assert sprung.moves_with[0] == "piston_2"

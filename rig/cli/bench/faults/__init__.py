@@ -1,1 +1,1 @@
-"""Bench of injected faults: what is noticed, how fast, and that nothing is lost."""
+"""Benchmark of injected faults: detection, delay of detection, and loss of samples."""

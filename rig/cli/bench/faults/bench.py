@@ -1,4 +1,4 @@
-"""A simulated bench in a process of its own whose faults a figure can switch on and read back."""
+"""A simulated bench in a separate process, with faults that the caller switches on."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.scenario.file import Scenario
 from rig.model.rig import Rig
 
-SILENCE: Final = 2.0  # [s] after which a device in virtual time misses its host
-_PATIENCE: Final = 300.0  # [s]: a busy computer may take long to begin
+SILENCE: Final = 2.0  # [s] without a host, after which a device in virtual time zeroes its outputs
+_PATIENCE: Final = 300.0  # [s] for the process to start, on a busy computer
 
 
 @dataclass(frozen=True)
 class FaultBenchState:
-    """What the device says of itself, past the driver and the wire."""
+    """State of the device, read in its process and not over the wire."""
 
-    driven: bool  # an output is not zero, or a law may move one
-    seconds: float  # of device time since it was made
-    struck: int  # frames struck by faults of the wire
+    driven: bool  # an output is not zero, or an active law may change one
+    seconds: float  # of device time since the device was created
+    struck: int  # number of frames that faults of the wire have affected
 
 
 class FaultBench:
-    """The host's side of that process: a fresh bench at a time."""
+    """The host's handle of the process, which serves one bench at a time."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
@@ -40,20 +40,20 @@ class FaultBench:
     def begin(
         self, rig: Rig, wire: str, faults: Sequence[Fault], seed: int, *, realtime: bool
     ) -> str:
-        """Serve a fresh bench with faults of machine and device; returns its endpoint."""
+        """Serve a new bench with faults of machine and device; return its endpoint."""
         return str(self._ask("begin", rig, wire, tuple(faults), seed, realtime))
 
     def strike(self, faults: Sequence[WireFault]) -> None:
-        """Let faults of the wire act from now on; `at` and `until` count from now."""
+        """Start faults of the wire; their `at` and `until` [s] count from now."""
         self._ask("strike", tuple(faults))
 
     def state(self) -> FaultBenchState:
-        """Return what the device says of itself."""
+        """Return the state of the device."""
         answer: FaultBenchState = self._ask("state")
         return answer
 
     def end(self) -> None:
-        """End the bench; another one may begin."""
+        """End the bench; another one can then be started."""
         self._ask("end")
 
     def _ask(self, *words: Any) -> Any:
@@ -77,7 +77,7 @@ class FaultBench:
 
 @contextmanager
 def fault_bench() -> Iterator[FaultBench]:
-    """Start the process, end it afterwards; it also ends when this one is gone."""
+    """Start the process and end it afterwards; it also ends when the calling process ends."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), daemon=True)
@@ -93,7 +93,7 @@ def fault_bench() -> Iterator[FaultBench]:
 
 
 class _Child:
-    """The process's side: one served device, or none."""
+    """The served device, in its process: one or none."""
 
     def __init__(self) -> None:
         self._served: ServedDevice | None = None

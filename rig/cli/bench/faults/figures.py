@@ -1,4 +1,4 @@
-"""The figures of faults, for `bramah bench`: group `faults`."""
+"""Figures of the group `faults` of `bramah bench`."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ GROUP: Final = "faults"
 LEAST: Final = 500  # faults
 TIMEOUT: Final = 0.1  # [s]: a device in virtual time may take ten times as long
 REAL_TIME_ONLY: Final = frozenset({"clock_drift"})
-_WITHIN: Final = 2.0  # [s] of excitation after which a frozen or stuck signal is noticed
+_WITHIN: Final = 2.0  # [s] of excitation within which a frozen or stuck signal must be detected
 _FROZEN: Final = ("sensor_stuck", "valve_stuck", "broken_wire")
 Say = Callable[[str], None]
 
 
 def impatient(rig: Rig) -> Rig:
-    """Return the rig with a wire whose device counts as lost soon, for virtual time."""
+    """Return the rig with a short time-out of its device, for virtual time."""
     return rig.model_copy(update={"wire": rig.wire.model_copy(update={"timeout": TIMEOUT})})
 
 
 def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
-    """Yield (seed, fault) for trials of every fault on a wire, its part of at least `least`."""
+    """Yield (seed, fault) for a wire's share of at least `least` trials, every fault in turn."""
     names = [name for name in kinds() if name not in REAL_TIME_ONLY]
     rounds = -(-least // (len(names) * len(wires())))
     for number in range(rounds * len(names)):
@@ -41,8 +41,8 @@ def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
 
 
 def fault_trials(folder: Path, least: int, say: Say) -> list[TrialOutcome]:
-    """Run at least `least` trials in virtual time, each with a fault of its own."""
-    with quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
+    """Run at least `least` trials in virtual time, each with one fault."""
+    with quiet(), ThreadPoolExecutor(len(wires())) as pool:  # trials wait more than they compute
         outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
         return [outcome for part in outcomes for outcome in part]
 
@@ -60,7 +60,7 @@ def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[TrialOutcome
 
 
 def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:
-    """Inject faults on every wire and count what was left on, lost, and named."""
+    """Inject faults on every wire; count outputs left on, samples lost, faults named."""
     say(f"faults: at least {least} trials on {', '.join(wires())}")
     return counted(fault_trials(folder, least, say))
 
@@ -91,7 +91,7 @@ def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep hundreds of provoked warnings off the terminal; they are in the outcomes."""
+    """Suppress the log meanwhile: the outcomes hold the hundreds of warnings that faults cause."""
     root = logging.getLogger()
     handlers, root.handlers = root.handlers, [logging.NullHandler()]
     try:

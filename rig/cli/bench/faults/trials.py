@@ -1,4 +1,4 @@
-"""One fault on one wire: a session that moves a joint, what ended it, what the run then holds.
+"""Trial of one fault on one wire: a session moves a joint; its end and its data are recorded.
 
 A trial is a real session: driver, guard and recorder of `bramah run` against a simulated bench in
 another process. Joint 1 follows a sine, joint 2 is locked.
@@ -39,18 +39,18 @@ from rig.runs.recorder import Recorder
 from rig.runs.runstate import BETWEEN
 
 BEGIN: Final = 1.0  # [s] of device time before a fault begins
-REAL_BEGIN: Final = 3.0  # in real time, in which the clock runs while the session is begun
+REAL_BEGIN: Final = 3.0  # [s], in real time: the clock runs while the session starts
 WATCHED: Final = 3.0  # [s] of device time that a fault is watched for
-SHARE: Final = 0.1  # of the frames struck, for `STRIKING` [s]
-BUS_SHARE: Final = 0.01  # on a CAN bus, where a block is some thirty frames
+SHARE: Final = 0.1  # of the frames are affected, for `STRIKING` [s]
+BUS_SHARE: Final = 0.01  # the same on a CAN bus, where a block has about thirty frames
 STRIKING: Final = 1.0
-STALE: Final = "stale data"  # the guard's limit that is one of the wall's clock
-LATE: Final = ("sample gap", STALE)  # limits that a busy computer passes, whatever else is wrong
-_TRIES: Final = 5  # at connecting, on a busy computer
+STALE: Final = "stale data"  # the guard's only limit on wall-clock time
+LATE: Final = ("sample gap", STALE)  # limits that a busy computer can exceed without a fault
+_TRIES: Final = 5  # attempts to connect, on a busy computer
 _AMPLITUDE, _PULL = 0.8, 20.0  # [V], [V/m]
 _LOCK: Final = 2e-3  # [m]
 
-# What a fault needs to be said beside its name; the others stand by their defaults.
+# Settings of faults without a default for them.
 KEYS: Final[Mapping[str, Mapping[str, Any]]] = {
     "sensor_stuck": {"channel": "cap_pressure_1"},
     "sensor_drift": {"channel": "cap_pressure_1", "rate": 0.1},
@@ -65,22 +65,22 @@ _ONCE: Final = frozenset({"stall", "link_half_closed", "link_closed"})
 
 
 class Diagnosis(StrEnum):
-    """How well what the operator reads fits what was done."""
+    """Agreement of the message that the operator reads with the injected fault."""
 
-    HARMLESS = "harmless"  # every sample there, nothing to say
-    COUNTED = "counted"  # what is missing is counted in the run
+    HARMLESS = "harmless"  # every sample is there and no message was needed
+    COUNTED = "counted"  # the run counts the missing samples
     NAMED = "named"
-    UNKNOWN = "unknown"  # ended, by a message that names another possible cause or none
+    UNKNOWN = "unknown"  # ended; the message names no cause, or another possible one
     UNNOTICED = "unnoticed"
     WRONG = "wrong"
 
 
 @dataclass
 class TrialOutcome:
-    """What one trial showed; `seconds` from the fault's begin to the end, None without an end.
+    """Result of one trial; `seconds` from the fault to the session's end, None if it did not end.
 
-    `blocks` were given to the guard, `lost_blocks` of them are not in records.h5 as they came;
-    `missing` samples never came, and the run counts them.
+    The guard received `blocks`; `lost_blocks` of them are missing or altered in records.h5.
+    `missing` samples never arrived; the run counts them.
     """
 
     fault: str
@@ -94,25 +94,25 @@ class TrialOutcome:
     zeroed: bool = True
     diagnosis: Diagnosis = Diagnosis.UNKNOWN
     warnings: list[str] = field(default_factory=list)
-    alarm: Alarm | None = None  # the first warning of the guard after the fault's begin
+    alarm: Alarm | None = None  # the guard's first warning after the fault began
 
     @property
     def message(self) -> str:
-        """What the operator reads, '' where nothing is said."""
+        """The message that the operator reads, '' if there is none."""
         if self.error is not None:
             return " ".join(str(self.error).split())
         return "" if self.alarm is None else f"warning: {self.alarm.sentence}"
 
 
 def kinds() -> dict[str, type[Fault]]:
-    """Return every fault of the scenario file by its name."""
+    """Return the class of every fault of a scenario file by the fault's name."""
     return {kind.fault_name(): kind for kind in CLASSES}
 
 
 def example(name: str, at: float = BEGIN, wire: str = TCP) -> Fault:
-    """Return a fault of a name as the trials on a wire use it: of a size that a bench may show.
+    """Return the fault that trials on a wire use for a name, of a realistic size.
 
-    A fault of machine, sensor or device begins at `at` [s], one of the wire at once.
+    A fault of machine, sensor or device begins at `at` [s]; a fault of the wire at once.
     """
     kind, keys = kinds()[name], dict(KEYS.get(name, {}))
     if not issubclass(kind, WireFault):
@@ -123,7 +123,7 @@ def example(name: str, at: float = BEGIN, wire: str = TCP) -> Fault:
 
 
 class _Collector:
-    """Keeps every block that the guard saw."""
+    """Collects every block that the guard checked."""
 
     def __init__(self) -> None:
         self.blocks: list[SampleBlock] = []
@@ -139,7 +139,7 @@ class _Collector:
 
 
 class _Warnings(logging.Handler):
-    """Collects what a program's log says meanwhile."""
+    """Collects the program's log."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -152,9 +152,9 @@ class _Warnings(logging.Handler):
 def try_fault(
     bench: FaultBench, rig: Rig, wire: str, name: str, folder: Path, seed: int, *, realtime: bool
 ) -> TrialOutcome:
-    """Run one trial; the fault begins at an instant that the seed draws.
+    """Run one trial; `seed` draws the time at which the fault begins.
 
-    Raises DeviceError where no session could be begun before the fault.
+    Raises DeviceError if no session could start before the fault.
     """
     fault = example(name, REAL_BEGIN if realtime else BEGIN, wire)
     early = () if isinstance(fault, WireFault) else (fault,)
@@ -167,7 +167,7 @@ def try_fault(
             try:
                 _session(bench, reached, fault, folder / f"{tries_left}", outcome, seed, realtime)
                 break
-            except (DeviceError, SafetyTrip):  # before the fault: a computer too busy
+            except (DeviceError, SafetyTrip):  # before the fault, so caused by a busy computer
                 if not tries_left:
                     raise
                 rig = _more_patient(rig)
@@ -200,7 +200,7 @@ def _session(
     wave = _AMPLITUDE * np.sin(2.0 * np.pi * np.arange(period) / period)
     off = [OutputLaw()] * (len(rig.joints) - 1)
     rng = np.random.default_rng(seed)
-    began: tuple[float, float] | None = None  # [s] of the wall's clock and of the device's
+    began: tuple[float, float] | None = None  # [s] of wall-clock time and of device time
     recorder = Recorder(folder / "run", rig)
     driver = make_driver(rig.wire, rig)
     state = BenchState(rig.wire, folder / "state")
@@ -258,7 +258,7 @@ def _locked(rig: Rig, block: SampleBlock) -> list[JointRole]:
 
 
 def _not_in(archive: Path, rig: Rig, blocks: Sequence[SampleBlock]) -> int:
-    """Return how many blocks are not in an archive, sample by sample."""
+    """Return how many blocks are missing or altered in an archive."""
     kept: dict[int, np.ndarray] = {}
     with h5py.File(archive, "r") as file:
         for group in file[BETWEEN].values():
@@ -274,15 +274,15 @@ def _not_in(archive: Path, rig: Rig, blocks: Sequence[SampleBlock]) -> int:
     )
 
 
-# -- what the operator reads against what was done ----------------------------------------------
+# -- comparison of the operator's message with the injected fault -------------------------------
 
 
 def diagnosis(fault: Fault, outcome: TrialOutcome) -> Diagnosis:
-    """Return how well the end of a trial fits its fault.
+    """Return whether the end of a trial names its fault.
 
-    A message names a fault of a sensor or of the machine by its channel, joint or supply, one of
-    the device or of the wire by saying that it is there. A limit of the machine named for a fault
-    of wire or device is wrong, and so is one of another joint. Late data are true, and unknown.
+    For a fault of sensor or machine, the message must name its channel, joint or supply. For a
+    fault of device or wire, it must name device or wire; a limit of the machine is then wrong.
+    A limit of another joint is always wrong. Late data leave the cause open.
     """
     error = outcome.error
     if error is None:
@@ -331,5 +331,5 @@ def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Diagnosis:
 
 
 def wires() -> tuple[str, ...]:
-    """Name the wires that trials are made on: those that a faulty link stands on."""
+    """Return the names of the wires that the simulated bench can disturb."""
     return SERVED

@@ -1,1 +1,1 @@
-"""Figures of the operator's screen: its cost, its stop, the age of its numbers."""
+"""Figures of the operator's screen: processor load, delay of a stop, age of its values."""

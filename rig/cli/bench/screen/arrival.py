@@ -1,8 +1,8 @@
-"""How late blocks come while screens open, close and are killed, and how old the drawn numbers are.
+"""Lateness of blocks while screens open, close and are killed, and age of the drawn values.
 
-The screen shows its page of diagnostics, which writes the device's tick of the newest sample. The
-text is read from the terminal and stamped there, so that an age spans the whole way: device, wire,
-run, socket, screen, terminal.
+The screen shows its page of diagnostics, which prints the device's tick of the newest sample. The
+text is time-stamped where it is read from the terminal, so that an age includes device, wire, run,
+socket, screen and terminal.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ from rig.runs.rigs import load_rig
 
 Array = NDArray[np.float64]
 
-AGE_LIMIT: Final = 250.0  # [ms] of the newest sample on the screen, 99 % of the time
-NOISE: Final = 1.0  # second-to-second deviations without a screen, by which one may add lateness
-SLICE: Final = 1.0  # of a phase, whose medians are compared [s]
-SETTLE: Final = 3.0  # after a screen came or went, before a phase is measured [s]
-PAGE: Final = "4"  # of diagnostics
-_LINE: Final = 40  # characters that hold a tick
+AGE_LIMIT: Final = 250.0  # [ms], age of the newest sample on the screen, 99 % of the time
+NOISE: Final = (
+    1.0  # lateness that a screen may add, in standard deviations of the lateness without one
+)
+SLICE: Final = 1.0  # length of the slices of a phase whose medians are compared [s]
+SETTLE: Final = 3.0  # wait after a screen was opened or closed, before a phase is measured [s]
+PAGE: Final = "4"  # key of the page of diagnostics
+_LINE: Final = 40  # number of characters that contain a tick
 _TICK: Final = re.compile(r"\btick (\d+)")
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of a run, between two monotonic times [s], with a screen or without one."""
+    """Part of a run between two monotonic times [s], with or without a screen."""
 
     name: str
     first: float
@@ -54,12 +56,12 @@ def ages_on_glass(
 ) -> tuple[Array, Array]:
     """Return (age when drawn, time until the next) [s], each (n,), of the ticks in drawn text.
 
-    A number grows older on the screen until the next one is drawn.
+    A value ages on the screen until the next one is drawn.
     """
     seen: list[tuple[float, float]] = []
     newest, before = -1, ""
     for at, piece in drawn:
-        text = before + piece  # a line may come in two pieces
+        text = before + piece  # a line may arrive in two pieces
         before = text[-_LINE:]
         for match in _TICK.finditer(text):
             tick = int(match[1])
@@ -71,10 +73,11 @@ def ages_on_glass(
 
 
 def age_quantile(ages: Array, stays: Array, share: float) -> float:
-    """Return the age [s] that the numbers on the screen do not pass for a `share` of the time.
+    """Return the age [s] that the values on the screen do not exceed for a `share` of the time.
 
-    Number k is shown from the age `ages[k]` on for `stays[k]` [s], so the time spent below an age x
-    is the sum of clip(x - ages, 0, stays), which rises with x and is inverted at its corners.
+    Value k has the age `ages[k]` when drawn and is shown for `stays[k]` [s]. The time spent below
+    an age x is therefore the sum of clip(x - ages, 0, stays); this piecewise linear function of x
+    is inverted.
     """
     corners = np.sort(np.concatenate((ages, ages + stays)))
     below = np.array([np.clip(x - ages, 0.0, stays).sum() for x in corners])
@@ -82,7 +85,7 @@ def age_quantile(ages: Array, stays: Array, share: float) -> float:
 
 
 def phase_medians(phase: Phase, arrivals: Array, late: Array) -> Array:
-    """Return the median lateness [s] of every whole slice of a phase."""
+    """Return the median lateness [s] of every complete slice of a phase."""
     count = max(int((phase.last - phase.first) / SLICE), 1)
     edges = np.searchsorted(arrivals, phase.first + SLICE * np.arange(count + 1))
     pairs = itertools.pairwise(edges)
@@ -90,7 +93,7 @@ def phase_medians(phase: Phase, arrivals: Array, late: Array) -> Array:
 
 
 def arrival_figures(runtime: Path, say: Callable[[str], None], seconds: float) -> list[Figure]:
-    """Measure one run's blocks, `seconds` per phase, and the ages while a screen is open."""
+    """Measure lateness of a run's blocks, `seconds` per phase, and ages on an open screen."""
     say(f"screen: arrival of blocks with the screen closed, open, killed, restarted: {seconds:g} s")
     phases: list[Phase] = []
 
@@ -104,7 +107,7 @@ def arrival_figures(runtime: Path, say: Callable[[str], None], seconds: float) -
         place = RunPlace(endpoint, runtime, runtime / "watched")
         with played(place, driven=False) as run:
             measure("closed", None)
-            drawn: list[list[tuple[float, str]]] = []  # of each screen
+            drawn: list[list[tuple[float, str]]] = []  # drawn text of each screen
             for name, after in (("open", "killed"), ("restarted", "closed again")):
                 with Screen(runtime) as screen:
                     if not run.said("watched", ATTACH):

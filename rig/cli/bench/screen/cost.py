@@ -1,4 +1,4 @@
-"""What the operator's screen costs: processor time while a run lives and after it has ended."""
+"""Processor time of the operator's screen during a run and after it has ended."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from rig.runs.rigs import load_rig
 
 RIG: Final = "digger-3dof"  # three joints: 17 channels
 WARM: Final = 4.0  # until the screen has started and its caches are filled [s]
-SETTLE: Final = 3.0  # until the screen has noticed the end of the run [s]
-BLOCK: Final = 0.01  # of samples handed over at once [s]
+SETTLE: Final = 3.0  # until the screen shows that the run has ended [s]
+BLOCK: Final = 0.01  # length of a published block [s]
 LIVE_LIMIT: Final = 15.0  # [% of one core]
 IDLE_LIMIT: Final = 1.0  # [% of one core]
 
 
 def publish(seconds: float, folder: str) -> None:
-    """Show a synthetic run of 17 channels at 1 kHz to screens, in real time, then end it."""
+    """Publish a synthetic run of 17 channels at 1 kHz to screens, in real time, then end it."""
     rig = load_rig(RIG)
     publisher = Publisher(rig.name, Path(folder))
     display = Display(rig, publisher, "", time.monotonic)

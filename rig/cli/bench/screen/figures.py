@@ -1,4 +1,4 @@
-"""All figures of the screen: its cost, its stop, the age of its numbers, what the run notices."""
+"""All figures of the screen: processor load, delay of a stop, age of values, effect on the run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUICK_SECONDS: Final = 4.0
 
 
 def screen_figures(say: Callable[[str], None], seconds: float, *, quick: bool) -> list[Figure]:
-    """Measure the screen, `seconds` at a time; a quick measurement is shorter and judges less."""
+    """Measure the screen, `seconds` per part; `quick` measures fewer parts and repetitions."""
     # A socket's address holds about 100 bytes: the folder's name must be short.
     with tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as folder:
         runtime = Path(folder)

@@ -1,13 +1,13 @@
-"""Runs in processes of their own for a screen to watch and stop, timed on the device's clock.
+"""Runs in separate processes for a screen to watch and stop, timed on the device's clock.
 
-The simulated bench is on the same computer and its sample clock keeps pace with the monotonic
-clock of all processes here, so that sample n was taken at `origin` + n / rate. A block arrives
-after its last sample, hence
+The simulated bench runs on the same computer, and its sample clock follows the monotonic clock
+of all processes, so that sample n was taken at `origin` + n / rate. A block arrives after its
+last sample, hence
 
     origin <= min over blocks of (arrival - ticks at its end / rate),
 
-and the minimum stands for the origin: it is late by the fastest block's way over the wire, 1 to
-2 ms, so that times after a key and ages are never measured too short by it.
+and this minimum serves as the origin. It is late by the shortest transmission time of a block,
+1 to 2 ms, so that delays after a key and ages are never underestimated.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ Array = NDArray[np.float64]
 
 RIG: Final = "digger-3dof"  # three joints: 17 values a sample
 SQUARE: Final = 0.05  # [V] of a square wave that is never zero
-HALF_PERIOD: Final = 0.02  # of it [s]
+HALF_PERIOD: Final = 0.02  # half period of the square wave [s]
 AFTER: Final = 0.1  # recorded with the outputs at zero [s]
-ENDS: Final = 20.0  # a run's process ends within this time of being asked to [s]
+ENDS: Final = 20.0  # time in which a run's process ends on request [s]
 
 
 @dataclass(frozen=True)
 class RunPlace:
-    """Where a run is played: its device, the folder of sockets' parent, the run's own folder."""
+    """Device of a run, parent of the folder of sockets, and the run's folder."""
 
     endpoint: str
     runtime: Path
@@ -58,9 +58,9 @@ class RunPlace:
 class RunTimes:
     """Blocks of a run: `ends` [s of device time], `arrivals` [monotonic s], each shape (blocks,).
 
-    `zeroed` is the device time [s] from which on every output was zero, NaN where it never was;
-    `zeroings` are the monotonic times [s] at which the run asked the device for it; `lost` counts
-    samples; `reason` says how the run ended, `held` whether a screen was in command.
+    `zeroed`: device time [s] from which on all outputs were zero, NaN if never. `zeroings`:
+    monotonic times [s] at which the run commanded zero outputs. `lost`: number of lost samples.
+    `reason`: how the run ended. `held`: whether a screen was in command.
     """
 
     ends: Array
@@ -73,12 +73,12 @@ class RunTimes:
 
     @property
     def origin(self) -> float:
-        """The monotonic time [s] of device time 0, late by the fastest block's way at most."""
+        """The monotonic time [s] of device time 0, late by the shortest transmission of a block."""
         return float((self.arrivals - self.ends).min())
 
 
 class StampedDriver:
-    """A driver that notes when each block came and when an output was last not zero."""
+    """A driver that records when each block arrived and when an output was last not zero."""
 
     def __init__(self, driver: Driver, inputs: int, rate: float) -> None:
         self._driver, self._inputs, self._rate = driver, inputs, rate
@@ -106,7 +106,7 @@ class StampedDriver:
         self._driver.zero_outputs()
 
     def times(self, lost: int, reason: str, *, held: bool) -> RunTimes:
-        """Return what was noted."""
+        """Return the recorded times."""
         known = self.last_output >= 0
         zeroed = (self.last_output + 1) / self._rate if known else float("nan")
         ends, arrivals = np.array(self.ends), np.array(self.arrivals)
@@ -114,10 +114,10 @@ class StampedDriver:
 
 
 def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
-    """Play one run until it is stopped, or until something comes in by `pipe`; a process's work.
+    """Play one run, in its process, until it is stopped or `pipe` receives anything.
 
-    `driven` puts a square wave on the first joint. Says "watched" once a screen is attached, "held"
-    once it is in command, and at the end the RunTimes.
+    `driven` puts a square wave on the first joint. Sends "watched" once a screen is attached,
+    "held" once it is in command, and the RunTimes at the end.
     """
     rig = load_rig(RIG)
     rig = reached_at(rig, place.endpoint)
@@ -150,7 +150,7 @@ def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
 
 
 class PlayedRun:
-    """A run in a process of its own, and what it says."""
+    """A run in a separate process, and its messages."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
@@ -158,19 +158,19 @@ class PlayedRun:
         self.times: RunTimes | None = None
 
     def said(self, word: str, within: float) -> bool:
-        """Whether the run has said a word, waiting for it at most `within` [s]."""
+        """Return whether the run has sent a word; waits for it at most `within` [s]."""
         self._hear(within, lambda: word in self._words)
         return word in self._words
 
     def ended(self, within: float = ENDS) -> RunTimes:
-        """Return the times of a run that ended; raises WorkError where it does not."""
+        """Return the times of a run that ends by itself; raises WorkError if it does not."""
         self._hear(within, lambda: self.times is not None)
         if self.times is None:
             raise WorkError(f"bench --only screen: a run did not end within {within:g} s")
         return self.times
 
     def end(self) -> RunTimes:
-        """End the run from here and return its times."""
+        """End the run and return its times."""
         with suppress(OSError):
             self._pipe.send("end")
         return self.ended()
@@ -192,8 +192,8 @@ class PlayedRun:
 
 @contextmanager
 def played(place: RunPlace, *, driven: bool) -> Iterator[PlayedRun]:
-    """Play a run in a process of its own, which is gone in the end."""
-    context = get_context("forkserver")  # a new process in 20 ms, with everything imported
+    """Play a run in a separate process, and end the process afterwards."""
+    context = get_context("forkserver")  # starts a process with all imports in 20 ms
     context.set_forkserver_preload([__name__])
     ours, its = context.Pipe()
     process = context.Process(target=play, args=(place, its), kwargs={"driven": driven})

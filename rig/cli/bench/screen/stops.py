@@ -1,4 +1,4 @@
-"""From the key to the outputs at zero, on the device's clock, with every core busy."""
+"""Delay from the stop key to zero outputs, on the device's clock, with every core busy."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from rig.cli.bench.screen.terminal import Screen
 from rig.cli.errors import WorkError
 from rig.cli.simulated_bench import simulated_bench
 
-STOP_LIMIT: Final = 100.0  # [ms] from key to zero, 99 %
-ATTACH: Final = 30.0  # a screen attaches to a run within this time, however busy the machine [s]
-AGAIN: Final = 1.0  # the key that takes the controls is pressed again after this time [s]
-SOON, LATE = 0.2, 0.5  # the stop is pressed so long after the controls were taken [s]
+STOP_LIMIT: Final = 100.0  # [ms] from key to zero outputs, 99 %
+ATTACH: Final = 30.0  # time in which a screen attaches to a run on a busy machine [s]
+AGAIN: Final = 1.0  # time after which the key that takes control is pressed again [s]
+SOON, LATE = 0.2, 0.5  # time from taking control to the stop key [s]
 SEED: Final = 100
-FAILURES, FAILURE_SHARE = 3, 0.1  # runs that may fail before their stop, at most
-FROM_SCREEN: Final = "from the screen"  # in the reason of a run that a screen stopped
+FAILURES, FAILURE_SHARE = 3, 0.1  # largest number of runs that may fail before their stop
+FROM_SCREEN: Final = "from the screen"  # part of the reason of a run that a screen stopped
 _BUSY: Final = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: sum(range(100000))"
 
 
 class RunFailed(Exception):
-    """A run ended before the key that was to stop it; the message is its reason."""
+    """A run ended before the stop key was pressed; the message is its reason."""
 
 
 @contextmanager
 def busy_cores(count: int) -> Iterator[None]:
-    """Keep `count` cores busy with processes of this one's priority."""
+    """Keep `count` cores busy with processes of the same priority as this one."""
     working = [subprocess.Popen([sys.executable, "-c", _BUSY]) for _ in range(count)]
     try:
         yield
@@ -48,10 +48,10 @@ def busy_cores(count: int) -> Iterator[None]:
 
 
 def one_stop(screen: Screen, place: RunPlace, wait: float) -> tuple[float, float]:
-    """Return the times [s] from a stop key to the run's act and to the outputs at zero.
+    """Return the delays [s] from a stop key to the run's zero command and to zero outputs.
 
-    The run is begun for it, the screen takes the controls, and the key comes `wait` [s] after. Both
-    are infinite for a key that did not stop its run. Raises RunFailed where the run ends before.
+    Starts a run, takes control by the screen and presses the key `wait` [s] later. Both delays
+    are infinite if the key did not stop the run. Raises RunFailed if the run ends before the key.
     """
     with played(place, driven=True) as run:
         if not run.said("watched", ATTACH) and run.times is None:
@@ -75,9 +75,9 @@ def one_stop(screen: Screen, place: RunPlace, wait: float) -> tuple[float, float
 def many_stops(
     runtime: Path, say: Callable[[str], None], count: int
 ) -> tuple[list[tuple[float, float]], int]:
-    """Return the times of `count` stops, and how many runs failed before theirs.
+    """Return the delays [s] of `count` stops, and how many runs failed before the key.
 
-    A bench that has tripped for want of a processor is left for a new one.
+    A bench that tripped because the computer was busy is replaced.
     """
     rng = np.random.default_rng(SEED)
     delays: list[tuple[float, float]] = []

@@ -1,4 +1,4 @@
-"""`bramah monitor` as a process in a pseudo-terminal, read as a terminal reads it."""
+"""`bramah monitor` as a process in a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _CONTROL: Final = re.compile(rb"\x1b\[[0-9;?<>=]*[a-ln-zA-Z]|\x1b[()][0-9A-B]|\x
 
 @dataclass
 class Screen:
-    """A running screen: its process, and what it has drawn, with the time of each piece.
+    """A running screen: its process, and its output with the arrival time of each piece.
 
-    `runtime` is the folder that holds the sockets of its runs; a context manager that kills it.
+    `runtime` is the folder of its runs' sockets. As a context manager, kills the process.
     """
 
     runtime: Path
@@ -66,11 +66,11 @@ class Screen:
 
     @property
     def pid(self) -> int:
-        """The process of the screen."""
+        """The id of the screen's process."""
         return self._process.pid
 
     def press(self, key: str) -> float:
-        """Write a key to the terminal; returns the monotonic time [s] just before."""
+        """Write a key to the terminal; return the monotonic time [s] just before."""
         at = time.monotonic()
         os.write(self._terminal, key.encode())
         return at
@@ -81,21 +81,21 @@ class Screen:
                 continue
             try:
                 piece = os.read(self._terminal, 1 << 16)
-            except OSError:  # its other end is closed: the screen is gone
+            except OSError:  # the screen has closed the other end
                 return
             self.drawn.append((time.monotonic(), piece))
 
     def bytes_since(self, moment: float) -> int:
-        """Return how many bytes it has drawn since a monotonic time [s]."""
+        """Return the number of bytes written since a monotonic time [s]."""
         return sum(len(piece) for at, piece in list(self.drawn) if at >= moment)
 
     def texts(self, first: float, last: float) -> list[tuple[float, str]]:
-        """Return (monotonic time [s], text) of what was drawn between two times, styles removed."""
+        """Return (monotonic time [s], text without styles) of the output between two times."""
         pieces = [(at, piece) for at, piece in list(self.drawn) if first <= at <= last]
         return [(at, _plain(piece)) for at, piece in pieces]
 
     def processor_seconds(self) -> float:
-        """Return the processor time [s] that its process has used (Linux)."""
+        """Return the processor time [s] of the process (Linux)."""
         fields = Path(f"/proc/{self.pid}/stat").read_text("ascii").rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

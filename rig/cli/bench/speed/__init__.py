@@ -1,1 +1,1 @@
-"""Figures of speed, each beside what the same work costs otherwise, measured in the same run."""
+"""Figures of speed, each with the time of a reference program, measured in the same run."""

@@ -1,6 +1,6 @@
-"""The free run by SUNDIALS' CVODES, from C that CasADi generates of the same equations.
+"""The free run by SUNDIALS' CVODES, with C code that CasADi generates from the same equations.
 
-CasADi makes the right-hand side and its Jacobian as C code, which is compiled by `zig cc`; CVODES
+CasADi generates the right-hand side and its Jacobian as C code, `zig cc` compiles them, and CVODES
 is called once for all samples. Needs the extra `bench` (casadi, ziglang).
 """
 
@@ -31,11 +31,11 @@ def available() -> bool:
 def solver(
     p: Array, inputs: Array, rate: float, scale: Array, folder: Path | None
 ) -> Callable[[float, Array], Callable[[], Array]]:
-    """Return what makes a free run from a tolerance and the start (8,): its call gives (n, 8).
+    """Return a function of tolerance and start (8,) that prepares a free run: () to states (n, 8).
 
-    `p` are `hand_fused.constants`; `inputs` (n, 3) both spools [V] and the supply [Pa], sampled at
-    `rate` [Hz] and linear between samples; `scale` (8,) is what a tolerance of one means for each
-    state. With a `folder` its C code is compiled there, without one CasADi interprets it.
+    `p`: `hand_fused.constants`. `inputs` (n, 3): both spools [V] and the supply [Pa], sampled at
+    `rate` [Hz], linear between samples. `scale` (8,): absolute error of each state at a tolerance
+    of one. With a `folder` the C code is compiled there; without one CasADi interprets it.
     """
     import casadi as ca
 
@@ -49,14 +49,16 @@ def solver(
     equations = {"x": state, "t": t, "ode": rates(state * scale, held(t)) / scale}
     options: dict[str, Any] = {"max_num_steps": MOST_STEPS}
     if folder is not None:
-        # The folder is its caller's, who removes it.
+        # The caller removes the folder.
         compiling = {"compiler": COMPILER, "linker": COMPILER, "flags": ["-O3"], "cleanup": False}
         options |= {"jit": True, "compiler": "shell", "jit_cleanup": False}
         options["jit_options"] = compiling
 
     def at(tolerance: float, start: Array) -> Callable[[], Array]:
         chosen = {**options, "abstol": tolerance, "reltol": tolerance}
-        with nullcontext() if folder is None else chdir(folder):  # CasADi writes where it stands
+        with (
+            nullcontext() if folder is None else chdir(folder)
+        ):  # CasADi writes into the current folder
             run = ca.integrator("run", "cvodes", equations, 0.0, grid, chosen)
         return lambda: np.asarray(run(x0=start / scale)["xf"]).T * scale
 

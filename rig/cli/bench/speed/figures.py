@@ -1,4 +1,4 @@
-"""Times beside their anchors, as figures."""
+"""Times and those of their reference programs, as figures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def ratio_figures(
     anchor: tuple[str, ProcessorTime] | None,
     limit: float | None,
 ) -> list[Figure]:
-    """Return a time, its anchor and their ratio; `limit` bounds that, or the time without one."""
+    """Return a time, its reference and their ratio; `limit` bounds the ratio, else the time."""
     bound = None if anchor else limit
     figures = [
         Figure(group, name, 1e3 * own.least, "ms", bound),
@@ -40,7 +40,7 @@ def ratio_figures(
 
 
 def free_run_figures(rig: Rig) -> list[Figure]:
-    """Measure a free run of 10 s beside what else solves the same equations."""
+    """Measure a free run of 10 s and other solvers of the same equations."""
     group, times = "analysis", free_run_times(rig)
     own, hand = times["own"], times["hand"]
     figures = [
@@ -71,7 +71,7 @@ def free_run_figures(rig: Rig) -> list[Figure]:
 
 
 def plant_over_kernel(rig: Rig) -> list[Figure]:
-    """Measure the plant in blocks as they are served beside one call of its compiled loop."""
+    """Measure the plant in blocks of 10 ticks, as served, and in one call of its compiled loop."""
 
     def run(ticks: int) -> Callable[[], None]:
         plant, laws = Plant(rig, Scenario(), 1), hard_laws(rig)

@@ -1,4 +1,4 @@
-"""A free run of the model beside the same equations written by hand, odeint and CVODES."""
+"""Times of a free run: by the model, by the same equations written by hand, odeint and CVODES."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ Array = NDArray[np.float64]
 
 SPOOL_RMS: Final = 0.006  # [V] moves both joints by some centimetres
 SCALE: Final = np.array([1.0, 1.0, 1.0, 1.0, 1e6, 1e6, 1e6, 1e6])  # rad, rad/s, Pa
-# A quarter of a decade apart: a coarser choice would let an anchor solve more exactly than asked.
+# A quarter of a decade apart: with coarser steps a reference would solve more exactly than needed.
 TOLERANCES: Final = tuple(10.0 ** (-exponent / 4.0) for exponent in range(16, 41))
 
 
 def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
-    """Return what a free run of 10 s with both joints moving takes, beside what it is held against.
+    """Return the processor times of a free run of 10 s with both joints moving, by four solvers.
 
-    `own`, `hand`, `odeint`, `cvodes`: processor time of this program, of the same equations and
-    steps written by hand (`hand_fused`), of scipy's odeint over the same compiled right-hand side,
-    and of CVODES from generated C (with the extra `bench`), both at the loosest tolerance at which
-    no state is less exact (largest error over its range, LSODA at rtol 1e-12 being the truth). All
-    have the same output: states, pistons, their speeds.
+    `own`: this program. `hand`: the same equations and steps written by hand (`hand_fused`).
+    `odeint`: scipy's, with the same compiled right-hand side. `cvodes`: with generated C code
+    (extra `bench`). The last two run at the loosest tolerance at which no state is less accurate
+    (largest error over its range, against LSODA at rtol 1e-12). All return states, piston
+    positions and piston velocities.
     """
     model, drive, start = both_moving(rig)
     ready = compiled(model)
@@ -112,7 +112,7 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
 
 
 def _compiled_callback(ready: Compiled, drive: DrivingInput) -> Callable[[float, Array], Array]:
-    """Return dy/dt(t, y) as one compiled call of two arguments: Python's share is odeint's own."""
+    """Return dy/dt(t, y) as one compiled function: the Python overhead is then odeint's alone."""
     work, address, n, rate = ready.work(), ready.address, len(drive.u), drive.rate
     arrays = (drive.inputs, drive.locked, ready.geometry, ready.par, ready.context, work)
     inputs, locked, geometry, par, context, room = (int(a.ctypes.data) for a in arrays)
@@ -126,13 +126,13 @@ def _compiled_callback(ready: Compiled, drive: DrivingInput) -> Callable[[float,
         )  # fmt: skip
         return dy
 
-    # The arrays live as long as whoever calls.
+    # The callback keeps the arrays alive.
     rates.held = arrays
     return rates  # type: ignore[no-any-return]
 
 
 def both_moving(rig: Rig) -> tuple[Model, DrivingInput, State]:
-    """Return the nominal model, 10 s of a spool that moves all joints, and a state at rest."""
+    """Return the nominal model, 10 s of spool signals that move all joints, and a state at rest."""
     model = nominal_model(rig, tuple(Used(term) for term in baseline_of(rig)))
     start = holding_state(rig, model, np.zeros(len(rig.joints)))
     rng, n = np.random.default_rng(0), round(10.0 * rig.sample_rate) + 1

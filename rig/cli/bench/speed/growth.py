@@ -1,4 +1,4 @@
-"""How processor time grows: with records, their length, joints, and candidates of a trace."""
+"""Processor time against the number of records, their length, joints and candidate effects."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ GROUP: Final = "growth"
 RECORDS: Final = (3, 6, 12, 24)
 SECONDS: Final = (5.0, 10.0, 20.0, 40.0)
 RIGS: Final = ("boom-1dof", "shinshu-2dof", "digger-3dof")
-CANDIDATES: Final = 4  # effects added to the model at most, as a trace does with its candidates
+CANDIDATES: Final = (
+    4  # largest number of effects added to the model, as a trace adds its candidates
+)
 Say = Callable[[str], None]
 
 
 def growth_figures(say: Say) -> list[Figure]:
-    """Measure how identification and simulation grow, in processor time, least of five."""
+    """Measure processor times of identification and simulation for growing sizes, least of five."""
     figures = []
     for name, work in _works(load_rig("shinshu-2dof")):
         say(f"growth: {name}")
-        work()  # what loads or compiles first is not growth
+        work()  # excludes imports and compilation
         figures.append(Figure(GROUP, name, 1e3 * processor_time(work).least, "ms"))
     return figures
 
@@ -59,7 +61,7 @@ def _joints() -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _linear_effects() -> list[str]:
-    """Name the effects of a joint that have coefficients alone, no shape, in their order."""
+    """Return the names of the joint effects without shape parameters, in catalogue order."""
     return sorted(
         name
         for name, term in known().items()
@@ -80,8 +82,9 @@ def _candidates(rig: Rig) -> Iterator[tuple[str, Callable[[], Any]]]:
 def four_joints(rig: Rig) -> Rig:
     """Return a rig of three joints with a light fourth link at the end of its chain.
 
-    A link of mass m, whose centre lies c behind its joint, adds m L_i L_j to R_ij, m L_i to W_i
-    and has R_i4 = m c L_i, R_44 = m c^2 + I, W_4 = m c; L_i are the lengths of the links before.
+    A link of mass m, with its centre of mass at the distance c from its joint, adds m L_i L_j to
+    R_ij and m L_i to W_i, and has R_i4 = m c L_i, R_44 = m c^2 + I, W_4 = m c; L_i are the lengths
+    of the preceding links.
     """
     mass, centre, own = 1.0, 0.15, 0.03
     lengths = (0.8, 0.45, 0.4)

@@ -1,8 +1,8 @@
-"""The limit for the model's free run: the same equations written by hand, for two joints only.
+"""Reference for the speed of a free run: the same equations written by hand, for two joints only.
 
-The paper's model with both joints free, its state in local variables, the same Runge-Kutta pair
-with the same choice of steps and the same output. Nothing of the program's own simulation is used,
-and nothing of it could be general: what it takes is what a model-independent program may aim at.
+The paper's model with both joints free, its state in local variables, with the same Runge-Kutta
+pair, step control and output as the simulation, from which it uses no code. A simulation of any
+model can at best be as fast.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def constants(rig: Rig, values: Mapping[str, float]) -> Array:
-    """Return the parameters (13 + 2 x 9,) in the order that `_rates` reads them."""
+    """Return the parameters (13 + 2 x 9,) in the order in which `_rates` reads them."""
     g = rig.gravity
     names = ("M1", "M2", "R12", "Fv1", "Fv2")
     gains = [values[f"C_{edge}_{i}"] for i in (1, 2) for edge in ("pp", "pm", "mp", "mm")]
@@ -42,7 +42,7 @@ def _root(drop):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy", inline="always")
 def _linkage(q, squares, product, mid, offset):  # type: ignore[no-untyped-def]
-    """Return the piston's place and dl/dq."""
+    """Return the piston position l [m] and dl/dq."""
     length = math.sqrt(squares - 2.0 * product * math.cos(q + offset))
     return length - mid, product * math.sin(q + offset) / length
 
@@ -106,10 +106,10 @@ _D = (
 
 @njit(error_model="numpy")
 def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-untyped-def]  # noqa: PLR0912  unrolled
-    """Fill out (n, 12) with the state, both pistons and both speeds; return the evaluations.
+    """Fill out (n, 12) with states, piston positions, velocities; return the count of evaluations.
 
-    `start` (8,) q, q', p_cap, p_rod; `u` (n, 2), `supply` (n,) sampled at `rate`; the error of a
-    step is kept below `atol` (8,) + `rtol` |y|, root mean square.
+    `start` (8,): q, q', p_cap, p_rod. `u` (n, 2) and `supply` (n,) are sampled at `rate`. The
+    root mean square error of a step stays below `atol` (8,) + `rtol` |y|.
     """
     n = len(out)
     k1, k2, k3, k4, k5, k6, k7 = (

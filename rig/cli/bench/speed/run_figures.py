@@ -1,8 +1,8 @@
-"""A run over the wire beside bare pymodbus that asks the same device for the same.
+"""Times of a run over the wire, and of bare pymodbus with the same requests to the same device.
 
-In virtual time pymodbus sends the very requests of the run, so that the device does the same work
-and answers the same bytes: a machine at rest would cost it less. In real time both take blocks of a
-machine at rest, each when it is due.
+In virtual time pymodbus sends the requests of the run, so that the device does the same work and
+answers with the same bytes; a machine at rest would take less time to simulate. In real time both
+read blocks of a machine at rest, each when it is due.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class _Cost:
-    """What one block cost: processor time of this process and wall time [s]."""
+    """Processor time of this process and wall time of one block [s]."""
 
     processor: float
     wall: float
@@ -57,7 +57,7 @@ class _Cost:
 
 @dataclass(frozen=True)
 class _Conversation:
-    """What a host asked for, before, while and after its cost was measured, and the blocks then."""
+    """Requests of a host before, during and after the measurement, and the blocks during it."""
 
     before: list[bytes]
     measured: list[bytes]
@@ -66,7 +66,7 @@ class _Conversation:
 
 
 def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
-    """Measure a run in virtual time, and `seconds` of streaming in real time, beside pymodbus."""
+    """Measure a run in virtual time, `seconds` of streaming in real time, and pymodbus in both."""
     say(f"run: {PROTOCOL}, {STEP}, in virtual time, {ROUNDS} times")
     rig = load_rig(RIG)
     pairs = []
@@ -84,7 +84,7 @@ def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
 
 
 def journal_figures(folder: Path, rig: Rig) -> list[Figure]:
-    """Measure the wall time until a block of 100 ms is safe in the journal of a run."""
+    """Measure the wall time to write a block of 100 ms to the journal of a run."""
     n, measured = round(JOURNAL_BLOCK * rig.sample_rate), len(rig.channels)
     rng, saturated, times = np.random.default_rng(0), np.zeros((n, measured), dtype=bool), []
     folder.mkdir(parents=True, exist_ok=True)
@@ -105,10 +105,10 @@ def journal_figures(folder: Path, rig: Rig) -> list[Figure]:
 
 
 def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[Figure]:
-    """Return least and median of a block's times, and what the wish is about.
+    """Return least and median of a block's times, and their ratio to pymodbus with its limit.
 
-    In virtual time nobody waits, so a run takes as long as its wall time; in real time what counts
-    is the processor.
+    The ratio is of wall time in virtual time, where nothing waits, and of processor time in real
+    time.
     """
     figures = []
     own_costs, bare_costs = zip(*pairs, strict=True)
@@ -133,7 +133,7 @@ def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[
 
 
 def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
-    """Return what a block costs in work that returns how many it moved, and that number."""
+    """Return the cost of a block and the number of blocks, which `work` returns."""
     began, busy = time.perf_counter(), time.process_time()
     blocks = work()
     busy, wall = time.process_time() - busy, time.perf_counter() - began
@@ -141,7 +141,7 @@ def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
 
 
 def _recording_driver(rig: Rig) -> tuple[ModbusTcpDriver, list[bytes]]:
-    """Return a driver, and the list that gets what it asks for from now on."""
+    """Return a driver, and the list to which it appends its requests."""
     requests: list[bytes] = []
 
     class Connection(TcpConnection):
@@ -159,7 +159,7 @@ def _recording_driver(rig: Rig) -> tuple[ModbusTcpDriver, list[bytes]]:
 
 
 def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
-    """Run one step with guard, journal and a publisher, as `bramah run` does."""
+    """Run one step with guard, journal and publisher, as `bramah run` does."""
     plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
     with simulated_bench(RIG, seed=0) as endpoint:
         reached = reached_at(rig, endpoint)
@@ -181,7 +181,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
 
 
 def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
-    """Ask the same with pymodbus and nothing else."""
+    """Send the same requests with pymodbus alone."""
     with simulated_bench(RIG, seed=0) as endpoint:
         at = TcpSettings.of(reached_at(rig, endpoint).wire)
         client: Any = ModbusTcpClient(at.host, port=at.port, timeout=2.0)
@@ -204,7 +204,7 @@ def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
 
 
 def _pymodbus_call(client: Any, request: bytes) -> Callable[[], object]:
-    """Return the call of pymodbus that sends a request."""
+    """Return the pymodbus call that sends a request."""
     function, at = request[0], int.from_bytes(request[1:3], "big")
     words = np.frombuffer(request[1:], ">u2", len(request[1:]) // 2).tolist()
     if function == READ_HOLDING:
@@ -226,12 +226,12 @@ def _pymodbus_call(client: Any, request: bytes) -> Callable[[], object]:
 
 
 def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
-    """Take blocks in real time with guard, journal and a publisher."""
+    """Read blocks in real time with guard, journal and publisher."""
     with simulated_bench(RIG, seed=0, real_time=True) as endpoint:
         reached = reached_at(rig, endpoint)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
         driver = make_driver(reached.wire, reached)
-        # A busy computer is late, and then to be measured: nothing moves, so nothing need trip.
+        # Late blocks of a busy computer are to be measured; at rest no trip is needed.
         late = GuardSettings(stale_after=60.0)
         with Bench(reached, driver, recorder, publisher, signals=False, settings=late) as bench:
             bench.run_for(0.5)
@@ -245,7 +245,7 @@ def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
 
 
 def _bare(rig: Rig, blocks: int) -> _Cost:
-    """Take blocks in real time with pymodbus and nothing else, each when it is due."""
+    """Read blocks in real time with pymodbus alone, each when it is due."""
     with (
         simulated_bench(RIG, seed=0, real_time=True) as endpoint,
         bare_modbus(reached_at(rig, endpoint)) as ask,
