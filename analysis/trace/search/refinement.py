@@ -100,9 +100,10 @@ def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
 def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
     """Return the fit with the shapes of all effects that are not among the data's own terms.
 
-    The search starts from the shapes given. Of the forms of an effect the one that leaves least is
-    used. Then details of the form are added that remove more than chance (`SEARCH.number_price`)
-    and more than `SEARCH.detail_share` of the remaining energy above noise.
+    The search starts from the shapes given. Of the forms of an effect the one that leaves least, at
+    a price for each free number, is used. Then details of the form are added that remove more than
+    chance (`SEARCH.number_price`) and more than `SEARCH.detail_share` of the remaining energy above
+    noise.
     """
     fit = _with_searched_shapes(data, terms, steps)
     for k in range(len(terms)):
@@ -151,7 +152,15 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
 
 
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
-    """Return the fit with the term number `place` in the form that leaves least."""
+    """Return the fit with the term number `place` in the form that leaves least.
+
+    Each further free number that a form has must remove `SEARCH.number_price`: an exponent that
+    removes less is not determined, and would widen the interval of the size tenfold.
+    """
+
+    def priced(model: ExactFit) -> float:
+        return model.energy + SEARCH.number_price * len(_free_shapes(data, model.terms))
+
     while True:
         used = fit.terms[place]
         assert isinstance(used.term, Effect)
@@ -159,8 +168,8 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
             _with_searched_shapes(data, _with_term(fit.terms, used, Used(used.term, shape)), steps)
             for shape in used.term.other_forms(data.rig, used.shape)
         ]
-        best = min(others, key=lambda other: other.energy, default=fit)
-        if best.energy >= fit.energy:
+        best = min(others, key=priced, default=fit)
+        if priced(best) >= priced(fit):
             return fit
         fit = best
 
