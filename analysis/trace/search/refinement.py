@@ -154,12 +154,13 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
     """Return the fit with the term number `place` in the form that leaves least.
 
-    Each further free number that a form has must remove `SEARCH.number_price`: an exponent that
-    removes less is not determined, and would widen the interval of the size tenfold.
+    Each further free number that a form has must be significant (`TRACE.standard_errors`): an
+    exponent that is not would widen the interval of the size tenfold.
     """
+    price = TRACE.standard_errors**2
 
     def priced(model: ExactFit) -> float:
-        return model.energy + SEARCH.number_price * len(_free_shapes(data, model.terms))
+        return model.energy + price * len(_free_shapes(data, model.terms))
 
     while True:
         used = fit.terms[place]
