@@ -96,7 +96,9 @@ def test_pause_resume_skip_answer_and_abort_on_a_run_of_another_process(tmp_path
             assert desk.ask("resume") == "the run is not paused but exciting"
             assert "nothing is asked now" in str(desk.ask("answer", "yes"))
             assert desk.ask("pause") is None
-            assert "held by operator at desk 1" in str(desk.ask("skip", holder="somebody else"))
+            assert "operator at desk 1 is in control" in str(
+                desk.ask("skip", holder="somebody else")
+            )
             desk.until_state(EngineState.PAUSED)
             assert "paused already" in str(desk.ask("pause"))
             assert desk.ask("resume") is None

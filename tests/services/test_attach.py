@@ -348,11 +348,11 @@ def test_the_controls_are_taken_over_explicitly_and_every_screen_sees_whose_they
     holder = CommandHolder()
     one, two = (Command("pause", holder=name) for name in ("one", "two"))
     assert holder.judge(one, lambda _: None) is None
-    assert "held by one" in str(holder.judge(two, lambda _: None))
+    assert "one is in control" in str(holder.judge(two, lambda _: None))
     assert holder.judge(Command("take", holder="two"), None) is None
     assert holder.held is not None
     assert holder.held.holder == "two"
-    assert "held by two" in str(holder.judge(one, lambda _: None))
+    assert "two is in control" in str(holder.judge(one, lambda _: None))
     assert holder.judge(Command("stop"), None) is None
     assert holder.judge(Command("release", holder="two"), None) is None
     assert holder.held is None

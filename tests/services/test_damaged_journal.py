@@ -161,7 +161,7 @@ def test_a_record_whose_description_lost_a_key_stands_outside_of_records(run: Pa
     assert raw.count(b'"locked"') > 0
     path.write_bytes(raw.replace(b'"locked"', b'"l#cked"'))
     report = recover(run)
-    assert "what a record is cannot be read" in report.message
+    assert "the description of a record cannot be read" in report.message
     assert report.missing == 0
     assert report.damaged is not None
     assert assert_only_what_was_measured(run) == BLOCKS * 10
@@ -180,7 +180,7 @@ def test_a_journal_of_nothing_but_zeros_is_no_run_of_0_samples(run: Path) -> Non
     for path in run.glob("journal.sqlite*"):
         path.write_bytes(bytes(path.stat().st_size))
     before = (run / "journal.sqlite").stat().st_size
-    with pytest.raises(RecordingFailed, match="no block of samples in it can be read"):
+    with pytest.raises(RecordingFailed, match="none of its blocks can be read"):
         recover(run)
     assert (run / "journal.sqlite").stat().st_size == before
     assert (run / "state").exists()

@@ -50,7 +50,7 @@ def test_a_file_that_is_no_rig_is_refused_with_the_reason(
 
 
 def test_a_folder_a_device_and_an_impossible_path_are_refused(tmp_path: Path) -> None:
-    for path, said in ((tmp_path, "is a folder"), (Path("/dev/zero"), "no regular file")):
+    for path, said in ((tmp_path, "is a folder"), (Path("/dev/zero"), "is not a regular file")):
         with pytest.raises(InputError, match=said) as error:
             load_rig(path)
         assert str(error.value).count("expected") == 1
