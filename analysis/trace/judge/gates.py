@@ -13,9 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
-from analysis.regression.solve import half_width
-from analysis.simulation.model import Estimate
+from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
@@ -101,13 +99,18 @@ def judge_effects(
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences_in_words(differing)),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
-            Gate(NO_RIVAL, not (tied or twins), _rivals_in_words([*twins, *rivals])),
+            Gate(
+                NO_RIVAL,
+                not (tied or twins),
+                _rivals_in_words([*twins, *rivals])
+                + _composites_in_words(hypotheses, winner, used, holdout_data, tie_test),
+            ),
         )
         out.append(
             JudgedEffect(
                 used.term.name,
                 _place(used.term),
-                _parameters(train_data, used, errors, shift),
+                inference.estimates(train_data, used, errors, shift),
                 p,
                 removed,
                 (*twins, *rivals),
@@ -333,6 +336,7 @@ def _rivals(
         alternative.fit.residual,
     )
     out = []
+    assert isinstance(judged_effect, Effect)
     for hypothesis in hypotheses.fitted.values():
         fresh = [
             u.term for u in hypothesis.effects if (u.term.name, u.term.where) not in winner.keys
@@ -342,7 +346,6 @@ def _rivals(
         (other,) = fresh
         more = hypothesis.size[1] - winner.size[1]  # further free numbers, each with its price
         assert isinstance(other, Effect)
-        assert isinstance(judged_effect, Effect)
         if (
             (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
             or of_one_law(judged_effect, other)
@@ -372,6 +375,44 @@ def _rivals(
         )
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: TRACE.most_rivals]
+
+
+def _composites_in_words(
+    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData,
+    held_out_test: _TieTest,
+) -> str:  # fmt: skip
+    """Name two effects that together leave as little as one ('' if none do).
+
+    A simpler name of its law is tried with a confounder of another mechanism: for levels of
+    friction by direction one level and an offset torque, which differ by the lever arm only. They
+    make no rival, since one effect is the simpler explanation.
+    """
+    own, rig = used.term, hypotheses.train_data.rig
+    assert isinstance(own, Effect)
+    known = winner.keys | {(u.term.name, u.term.where) for u in hypotheses.base}
+    others = [u for u in winner.effects if u is not used]
+    for simple in (effect_of(name, own.where) for name in own.includes):
+        for other in hypotheses.effects:
+            if (
+                other.name not in own.confounders
+                or other.where != own.where
+                or other.mechanism == own.mechanism
+                or {(simple.name, own.where), (other.name, own.where)} & known
+                or len(others) + 2 > SEARCH.largest_set
+            ):
+                continue
+            pair = [Used(e, e.shape_of(rig, ())) for e in (simple, other)]
+            both = hypotheses.refined([*others, *pair])
+            residual = held_out_residual(holdout_data, both.fit)
+            if not hypotheses.physical_problem(both) and held_out_test.ties(
+                residual, TRACE.tie_ratio
+            ):
+                ratio = held_out_test.ratio(residual)
+                return (
+                    f"; {simple.name} and {other.name} together would leave {ratio:.2f} times the "
+                    "held-out rms"
+                )
+    return ""
 
 
 def _is_refused_simpler_name(
@@ -423,23 +464,6 @@ class _TieTest:
         return (
             lost < share or loss_in_deviations(other[self.rows], self.left) <= TRACE.standard_errors
         )
-
-
-def _parameters(
-    train_data: RegressionData,
-    used: Used,
-    errors: inference.EffectErrors,
-    shift: Mapping[str, float],
-) -> dict[str, Estimate]:
-    units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
-    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
-    more = np.array([shift.get(name, 0.0) for name in errors.names])
-    half = np.hypot(half_width(errors.std, errors.dof), TRACE.normal_quantile * more)
-    std = np.hypot(errors.std, more)
-    return {
-        name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
-        for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
-    }
 
 
 def _differences_in_words(differing: Sequence[Difference]) -> str:

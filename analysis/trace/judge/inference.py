@@ -15,7 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import shape_values
+from analysis.effects.base import shape_values, shapes_of
+from analysis.regression.solve import half_width
+from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.scatter import parameter_covariance
@@ -121,6 +123,21 @@ def effect_errors(
     known = {**shape_values(train_data.rig, used), **values}
     value = np.array([known.get(n, np.nan) for n in names])
     return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
+
+
+def estimates(
+    train_data: RegressionData, used: Used, errors: EffectErrors, shift: Mapping[str, float]
+) -> dict[str, Estimate]:
+    """Return an effect's parameters with 95 % intervals, those of the forms (`shift`) included."""
+    units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
+    more = np.array([shift.get(name, 0.0) for name in errors.names])
+    half = np.hypot(half_width(errors.std, errors.dof), TRACE.normal_quantile * more)
+    std = np.hypot(errors.std, more)
+    return {
+        name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
+        for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
+    }
 
 
 def basis_of_others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:

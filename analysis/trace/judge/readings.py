@@ -13,10 +13,12 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
+from analysis.trace.judge.inference import effect_errors, estimates
+from analysis.trace.judge.scatter import form_shift
 from analysis.trace.search.hypothesis import Hypothesis, Key, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
@@ -103,7 +105,8 @@ def _needs_richer(
     In training `other` must remove: with the same number of effects `TRACE.richer_name_share` of
     what `hypothesis` leaves, more than noise for each number, and `_form_error_energy`; with one
     more effect what a further effect must. In held-out records `hypothesis`, whose residual there
-    is `held` (M,), must lose more than `TRACE.standard_errors`.
+    is `held` (M,), must lose more than `TRACE.standard_errors`. The training rows must determine
+    an effect that is added (`_is_determined`).
     """
     more = other.size[1] - hypothesis.size[1]
     if len(other.effects) > len(hypothesis.effects):
@@ -115,8 +118,35 @@ def _needs_richer(
         least = max(noise, share, _form_error_energy(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
+    if not all(_is_determined(hypotheses, other, u) for u in _added(other, hypothesis)):
+        return False
     return (
         loss_in_deviations(held, held_out_residual(holdout_data, other.fit)) > TRACE.standard_errors
+    )
+
+
+def _added(other: Hypothesis, hypothesis: Hypothesis) -> list[Used]:
+    """Return the effect that a set has beside all those of another; none where it replaces one."""
+    if not hypothesis.keys < other.keys:
+        return []
+    return [u for u in other.effects if (u.term.name, u.term.where) not in hypothesis.keys]
+
+
+def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> bool:
+    """Return whether no 95 % interval of an effect's numbers holds 0, details of its form aside.
+
+    A Stribeck speed far above those of the records makes of it a second level by Coulomb, whose
+    size the two levels share in any proportion.
+    """
+    data, fit = hypotheses.train_data, hypothesis.fit
+    values = parameter_values(data.rig, fit.terms, dict(fit.beta))
+    errors = effect_errors(data, fit, used, values)
+    numbers = estimates(data, used, errors, form_shift(data, fit))
+    details = {s.parameter for s in shapes_of(data.rig, used) if s.detail or s.resolution}
+    return all(
+        not low <= 0.0 <= high
+        for name, (low, high) in ((n, e.ci95) for n, e in numbers.items())
+        if name not in details
     )
 
 

@@ -26,3 +26,28 @@ def test_one_level_in_the_same_noise_stays_coulomb_friction(rig: Rig) -> None:
     s = searched(rig, *runs, "coulomb_friction", "asymmetric_friction")
     settled = readings.best_readings(s.hypotheses, s.winner, s.holdout_data)
     assert [u.term.name for u in settled.effects] == ["coulomb_friction"]
+
+
+@pytest.mark.parametrize(("breakaway", "determined"), [(0.0, False), (16.0, True)])
+def test_a_breakaway_is_added_only_where_records_determine_all_its_numbers(
+    rig: Rig, breakaway: float, determined: bool
+) -> None:
+    runs = pair_of_runs(rig, Hidden(40.0, 40.0, breakaway=breakaway), noise=2.0)
+    s = searched(rig, *runs, "coulomb_friction", "stribeck_friction")
+    both = s.set_of("coulomb_friction", "stribeck_friction")
+    (stribeck,) = (u for u in both.effects if u.term.name == "stribeck_friction")
+    assert readings._is_determined(s.hypotheses, both, stribeck) is determined
+    settled = readings.best_readings(s.hypotheses, s.winner, s.holdout_data)
+    assert ("stribeck_friction" in {u.term.name for u in settled.effects}) is determined
+
+
+def test_one_level_with_an_offset_torque_is_said_to_fit_as_well_as_levels_by_direction(
+    rig: Rig,
+) -> None:
+    """About one place of the stroke the lever arm hardly changes, and both are one torque."""
+    runs = pair_of_runs(rig, Hidden(21.0, 38.0))
+    s = searched(rig, *runs, "coulomb_friction", "asymmetric_friction", "torque_offset")
+    (effect,) = s.judged("asymmetric_friction")
+    (gate,) = (g for g in effect.gates if g.name == "no rival")
+    assert gate.ok
+    assert "coulomb_friction and torque_offset together would leave" in gate.detail
