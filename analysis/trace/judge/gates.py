@@ -403,10 +403,10 @@ def _composites_in_words(
                 continue
             pair = [Used(e, e.shape_of(rig, ())) for e in (simple, other)]
             both = hypotheses.refined([*others, *pair])
+            if hypotheses.physical_problem(both):
+                continue
             residual = held_out_residual(holdout_data, both.fit)
-            if not hypotheses.physical_problem(both) and held_out_test.ties(
-                residual, TRACE.tie_ratio
-            ):
+            if held_out_test.ties(residual, TRACE.tie_ratio):
                 ratio = held_out_test.ratio(residual)
                 return (
                     f"; {simple.name} and {other.name} together would leave {ratio:.2f} times the "

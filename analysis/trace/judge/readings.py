@@ -118,11 +118,10 @@ def _needs_richer(
         least = max(noise, share, _form_error_energy(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
-    if not all(_is_determined(hypotheses, other, u) for u in _added(other, hypothesis)):
+    lost = loss_in_deviations(held, held_out_residual(holdout_data, other.fit))
+    if lost <= TRACE.standard_errors:
         return False
-    return (
-        loss_in_deviations(held, held_out_residual(holdout_data, other.fit)) > TRACE.standard_errors
-    )
+    return all(_is_determined(hypotheses, other, u) for u in _added(other, hypothesis))
 
 
 def _added(other: Hypothesis, hypothesis: Hypothesis) -> list[Used]:
@@ -143,11 +142,8 @@ def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used
     errors = effect_errors(data, fit, used, values)
     numbers = estimates(data, used, errors, form_shift(data, fit))
     details = {s.parameter for s in shapes_of(data.rig, used) if s.detail or s.resolution}
-    return all(
-        not low <= 0.0 <= high
-        for name, (low, high) in ((n, e.ci95) for n, e in numbers.items())
-        if name not in details
-    )
+    intervals = [e.ci95 for name, e in numbers.items() if name not in details]
+    return all(not low <= 0.0 <= high for low, high in intervals)
 
 
 def _form_error_energy(

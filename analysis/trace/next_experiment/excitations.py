@@ -53,7 +53,7 @@ FAMILIES: Final = (
     Family("wide", "at all frequencies, as much as the limits allow", 0.1, 0.5, 9.5, 0.25),
     Family("slow", "slowly over the whole stroke", 0.1, 0.1, 0.9, 0.5),
     Family("creep", "very slowly in both directions over the whole stroke", 0.1, 0.1, 0.3, 1.0),
-    # Most change of pressure within the limits: twice as much shows of air as up to 15 Hz.
+    # Changes the pressures most within the limits: residuals by air are twice those up to 15 Hz.
     Family("brisk", "up to 10 Hz with equal amplitudes", 0.2, 0.6, 10.0, 0.0),
     # Its few slow lines move the piston, which the bench needs to centre it.
     # Much faster, a joint that is held and one behind a closed valve resonate otherwise.
