@@ -33,7 +33,7 @@ from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.parse import InputError, first_problem
 from rig.model.records import Record, Run
-from rig.runs.files import replace_bytes, replace_text
+from rig.runs.files import replace_bytes, write_text
 from rig.runs.rigs import load_bench, load_rig
 from rig.runs.store import load_run
 
@@ -219,8 +219,7 @@ def take(
     folder = Path(out)
     if isinstance(protocol, Protocol):
         file = folder.with_name(f"{folder.name}.yaml")
-        file.parent.mkdir(parents=True, exist_ok=True)
-        replace_text(file, protocol_text(protocol, "Made in a notebook."))
+        write_text(file, protocol_text(protocol, "Made in a notebook."))
         protocol = str(file)
     job = ProtocolJob(protocol, rig, folder, endpoint, overrides or Overrides())
     return load_run(run_protocol(job, log.info))

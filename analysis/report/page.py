@@ -11,7 +11,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from rig.model.parse import InputError
-from rig.runs.files import replace_text
+from rig.runs.files import write_text
 
 
 def page(template: str, context: Mapping[str, Any]) -> str:
@@ -27,8 +27,7 @@ def page(template: str, context: Mapping[str, Any]) -> str:
 def write(path: Path, text: str) -> None:
     """Write a page whole or not at all; raises InputError where it cannot be written."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_text(path, text)
+        write_text(path, text)
     except OSError as error:
         raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
 

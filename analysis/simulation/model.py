@@ -21,7 +21,7 @@ from analysis.terms import make
 from analysis.terms.base import Used
 from rig.model.parse import InputError, first_problem
 from rig.model.rig import Rig
-from rig.runs.files import read_text, replace_text
+from rig.runs.files import read_text, write_text
 
 Array = NDArray[np.float64]
 
@@ -137,8 +137,7 @@ def model_json(model: Model) -> dict[str, Any]:
 def save_model(model: Model, path: str | Path) -> None:
     """Write the model file, replacing an old one only when the new one is complete."""
     text = json.dumps(model_json(model), indent=1, allow_nan=False)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    replace_text(Path(path), text + "\n")
+    write_text(Path(path), text + "\n")
 
 
 def load_model(path: str | Path) -> Model:

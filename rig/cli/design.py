@@ -41,7 +41,7 @@ def design(
     from rig.cli.output import progress, write_json
     from rig.cli.predicted_errors import design_json, design_protocol, design_text
     from rig.cli.twin_choice import load_twin, twin_source
-    from rig.runs.files import replace_text
+    from rig.runs.files import write_text
     from rig.runs.rigs import load_bench
 
     bench = load_bench(rig)
@@ -49,8 +49,7 @@ def design(
     if parameters.warning:
         progress(parameters.warning)
     designed = design_protocol(protocol, rig, criterion, budget, seed, parameters)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(out, designed.text)
+    write_text(out, designed.text)
     write_json(json, design_json(designed))
     if json != Path("-"):
         typer.echo(

@@ -13,7 +13,7 @@ from rig.cli.options import (
     RunsArgument,
     writable_file,
 )
-from rig.cli.output import Countdown, progress, write_json
+from rig.cli.output import Countdown, printed_at_end, progress, write_json
 
 if TYPE_CHECKING:
     from analysis.identify.result import Identification
@@ -209,7 +209,7 @@ def identify(
 
         result, document, consistent = make_physical(result)
         more += consistent
-    try:
+    with printed_at_end(json, lambda: identification_text(result, known) + more):
         if model is not None:
             save_identified(result.model, model, progress)
         write_json(json, document)
@@ -217,6 +217,3 @@ def identify(
             from rig.cli.reports import write_identification
 
             write_identification(report, load_runs(runs), result)
-    finally:  # a file that the disk does not take must not take the result with it
-        if json != Path("-"):
-            typer.echo(identification_text(result, known) + more)

@@ -18,7 +18,7 @@ from rig.cli.options import (
     ScaleOption,
     writable_file,
 )
-from rig.cli.output import progress, write_json
+from rig.cli.output import printed_at_end, progress, write_json
 
 
 def loop(
@@ -121,12 +121,9 @@ def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
     if not experiments.rounds:
         return
     last = experiments.rounds[-1].result.model_after
-    try:
+    text = rounds_text(experiments.rounds, experiments.stopped)
+    with printed_at_end(json, lambda: f"{text}\nreport: {report}"):
         save_identified(last, experiments.request.out / "model.json", progress)
         write_loop(
             report, experiments.train, experiments.judge, experiments.rounds, experiments.stopped
         )
-    finally:  # a file that the disk does not take must not take the result with it
-        if json != Path("-"):
-            typer.echo(rounds_text(experiments.rounds, experiments.stopped))
-            typer.echo(f"report: {report}")

@@ -6,7 +6,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -71,10 +72,22 @@ def write_json(path: Path | None, data: Any) -> None:
     if str(path) == "-":
         sys.stdout.write(text)
         return
-    from rig.runs.files import replace_text
+    from rig.runs.files import write_text
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, text)
+    write_text(path, text)
+
+
+@contextmanager
+def printed_at_end(json_file: Path | None, text: Callable[[], str]) -> Iterator[None]:
+    """Print a result after its files are written, also if one of them cannot be written.
+
+    Nothing is printed where the JSON document goes to standard output.
+    """
+    try:
+        yield
+    finally:
+        if json_file != Path("-"):
+            print(text())
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[str] = ()) -> str:

@@ -352,7 +352,7 @@ def run(
 
             try:
                 write_page(page, store, began)
-            except InputError as error:  # what the queue did, and its exit code, count more
+            except InputError as error:  # the exit code reports the queue, not its page
                 progress(f"bramah: {error}")
     document = {
         "code": report.code,

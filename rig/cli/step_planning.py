@@ -13,7 +13,7 @@ from protocols.files import library
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from rig.model.parse import InputError
-from rig.runs.files import replace_text
+from rig.runs.files import write_text
 from rig.runs.rigs import load_bench
 
 Say = Callable[[str], None]
@@ -62,6 +62,5 @@ def plan_steps(request: PlanRequest, say: Say) -> Proof:
 
 
 def _write(path: Path, protocol: Protocol, comment: str, say: Say) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, protocol_text(protocol, comment))
+    write_text(path, protocol_text(protocol, comment))
     say(f"wrote {path}")

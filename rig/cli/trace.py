@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from rig.cli.options import JsonOption, writable_file
-from rig.cli.output import Countdown, progress, write_json
+from rig.cli.output import Countdown, printed_at_end, progress, write_json
 
 FAMILIES_OF: Final = {
     "all": ("mechanical", "fluid"), "torque": ("mechanical",), "flow": ("fluid",),
@@ -75,7 +75,7 @@ def trace(
         loaded, chosen_by, seed=seed, families=FAMILIES_OF[equations], terms=known,
         progress=Countdown("tracing"), judge=judged_by,
     )  # fmt: skip
-    try:
+    with printed_at_end(json, lambda: trace_text(result)):
         write_json(json, to_json(result))
         if model is not None:
             save_identified(result.model_after, model, progress)
@@ -83,6 +83,3 @@ def trace(
             from rig.cli.reports import write_trace
 
             write_trace(report, unseen, result)
-    finally:  # a file that the disk does not take must not take the result with it
-        if json != Path("-"):
-            typer.echo(trace_text(result))

@@ -11,7 +11,7 @@ from rig.cli.options import (
     JsonOption,
     RunsArgument,
 )
-from rig.cli.output import write_json
+from rig.cli.output import printed_at_end, write_json
 
 
 def validate(
@@ -31,8 +31,5 @@ def validate(
 
     refuse_repeated(runs)
     results = validate_model(load_model(model), [load_run(folder) for folder in runs])
-    try:
+    with printed_at_end(json, lambda: validation_text(results)):
         write_json(json, to_json(results))
-    finally:  # a file that the disk does not take must not take the result with it
-        if json != Path("-"):
-            typer.echo(validation_text(results))

@@ -76,6 +76,12 @@ def no_place_for(path: Path) -> str:
     return "" if os.access(above, os.W_OK | os.X_OK) else f"the folder {above} cannot be written"
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a file as `replace_text` does, with the folders above it; raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_text(path, text)
+
+
 def replace_text(path: Path, text: str) -> None:
     """Replace a file atomically: a reader sees the old or the new text; raises OSError."""
     replace_bytes(path, text.encode("utf-8"))

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import JsonOption, writable_file
-from rig.cli.output import progress, write_json
+from rig.cli.output import printed_at_end, progress, write_json
 
 
 def bench(
@@ -39,14 +39,10 @@ def bench(
     Example: bramah bench --minutes 0.5 --seeds 2
     """
     from rig.cli.bench.figures import as_json, measure, page, text
-    from rig.runs.files import replace_text
+    from rig.runs.files import write_text
 
     figures = measure(minutes, seeds, only, progress, quick=quick)
-    try:
+    with printed_at_end(json, lambda: text(figures)):
         write_json(json, as_json(figures))
         if docs is not None:
-            docs.parent.mkdir(parents=True, exist_ok=True)
-            replace_text(docs, page(figures))
-    finally:  # a file that the disk does not take must not take the result with it
-        if json != Path("-"):
-            typer.echo(text(figures))
+            write_text(docs, page(figures))
