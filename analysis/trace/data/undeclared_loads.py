@@ -214,9 +214,11 @@ def _load_rows(
 
 
 def _steps(runs: Sequence[Run], keys: Sequence[Key]) -> list[Mask]:
-    """Return which records (U,) each step of each run has."""
+    """Return which records (U,) each step of each run has; of one step alone, each record."""
     step_of = {(n, r.name): (n, r.step) for n, run in enumerate(runs) for r in run.records}
     found = [step_of[key] for key in keys]
+    if len(set(found)) == 1:
+        return list(np.eye(len(keys), dtype=bool))
     return [np.array([step == one for step in found]) for one in dict.fromkeys(found)]
 
 
@@ -242,7 +244,7 @@ def _first_guess(rows: _LoadRows, basis: Array, residual: Array, steps: Sequence
         best = max(best, now, key=removed)
     if best @ c < 0.0:  # the mass is negative: the others carry the load
         best = ~best
-    return np.asarray(np.any([s for s, b in zip(steps, best, strict=True) if b], axis=0))
+    return np.asarray(np.array(steps)[best].any(axis=0))
 
 
 def _fit(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:

@@ -148,3 +148,18 @@ def test_runs_that_state_no_load_have_none_where_another_run_states_one(
     assert identify([before, after], terms=terms).model.values["m_payload"] == pytest.approx(
         MASS, rel=0.01
     )
+
+
+@pytest.mark.parametrize("mixed", [True, False])
+def test_a_load_in_some_repeats_of_the_only_step_is_found(
+    rig: Rig, runs: tuple[Run, Run], mixed: bool
+) -> None:
+    """Step 2 alone, two repeats of it with the load or none."""
+    kept = [r for r in runs[0].records if r.step.startswith("step2") and (mixed or not heavy(r))]
+    run = replace(runs[0], records=tuple(replace(r, step="step2") for r in kept))
+    load = undeclared_load(rig, tuple(map(Used, baseline_of(rig))), [run], [runs[1]], [])
+    if mixed:
+        assert load is not None
+        assert [r.loaded for r in load.train[0].records] == list(map(heavy, kept))
+    else:
+        assert load is None
