@@ -34,9 +34,10 @@ HEAVIEST = 200.0  # [kg] beyond what the catalogue's benches carry
 class Payload(Effect):
     """A point mass m at the tip: R_ij grows by m l_i l_j, W_i by m l_i.
 
-    Its columns are a sum of the baseline's own, so M, R and W of one run absorb it COMPLETELY: no
-    excitation of that run shows it. It is seen only against a reference: parameters of a model
-    identified without it, M, R and W held there.
+    Its columns are a sum of the baseline's own, so M, R and W of records that all carry it absorb
+    it COMPLETELY: no excitation of them shows it. It is seen only against a reference: records
+    that are known to be without it (`Signals.loaded`), where it has no columns, or parameters of a
+    model identified without it, M, R and W held there.
     """
 
     mechanism: ClassVar[str] = "gravity"
@@ -46,7 +47,7 @@ class Payload(Effect):
     variable: ClassVar[str] = "gravity and inertia alike"
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = (
-        "nothing within one run; a run without the payload, whose model is given as reference"
+        "records with and without the payload, or a model identified without it as reference"
     )
 
     @property
@@ -61,14 +62,19 @@ class Payload(Effect):
 
     def absorbed(self, rig: Rig) -> str:
         """Say that the baseline's M, R and W take it all."""
-        return "M, R and W of one run absorb a payload completely; compare with a run without it"
+        return (
+            "M, R and W of records that all carry the same payload absorb it completely; compare "
+            "with records without it"
+        )
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return m [kg]."""
         return (Coefficient("m_payload", "kg", "mechanical"),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the sum of inertia's and gravity's columns, weighted by `growth`."""
+        """Return the sum of inertia's and gravity's columns, weighted by `growth`; bare: none."""
+        if signals.loaded is False:
+            return {}
         weights = growth(rig)
         out: Columns = {}
         for term in (Inertia(), Gravity()):

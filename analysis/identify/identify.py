@@ -18,7 +18,7 @@ from analysis.regression.rows import Filtering, default_filtering
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Record, Run, with_loads_stated
 from rig.model.rig import Rig
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
@@ -50,7 +50,7 @@ def identify(
     """
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)
-    rig = ck.common_rig(runs)
+    rig, runs = ck.common_rig(runs), with_loads_stated(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     if method != "coupled":
         result = identify_by(method, runs, used, filtering, reject_noise, rng, search)

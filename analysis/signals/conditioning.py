@@ -35,7 +35,8 @@ class Signals:
     `lost` (n, N) is true where a sample of the joint that never arrived is within that reach: what
     stands there was made up by a straight line, and no row may see it. `moving` (N,) marks the
     joints whose motion is the measured one; the others stand still. `weight` (n, N), where given,
-    is what each joint's torque balance counts at a sample (see `without_rests`).
+    is what each joint's torque balance counts at a sample (see `without_rests`). `loaded` says
+    whether the last link carries a load that it has not in other records; None: not known.
     """
 
     rate: float
@@ -62,6 +63,7 @@ class Signals:
     lost: Mask | None = None
     moving: Mask | None = None
     weight: Array | None = None
+    loaded: bool | None = None
 
     @property
     def joints(self) -> int:
@@ -181,6 +183,7 @@ def condition(
         valid=_valid(rig, record, smoother.reach),
         lost=_lost(rig, record, smoother.reach + align_reach(rig, record.sample_rate)),
         moving=moving,
+        loaded=record.loaded,
     )  # fmt: skip
 
 

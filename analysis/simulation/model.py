@@ -94,6 +94,18 @@ def model_of(rig: Rig, terms: Sequence[Used], values: Mapping[str, float]) -> Mo
     return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan))
 
 
+def as_loaded(model: Model, loaded: bool | None) -> Model:
+    """Return the model of a record: without its load where the record is known to have none."""
+    of_load = [u.term for u in model.terms if getattr(u.term, "element", "") == "load"]
+    names = {c.parameter for term in of_load for c in term.parameters(model.rig)}
+    if loaded is not False or not names:
+        return model
+    parameters = {
+        name: replace(p, value=0.0) if name in names else p for name, p in model.parameters.items()
+    }
+    return replace(model, parameters=parameters)
+
+
 def finite(value: float) -> float | None:
     """Return the number, or None for what JSON cannot hold."""
     return float(value) if math.isfinite(value) else None

@@ -19,7 +19,7 @@ from analysis.regression.rows import default_filtering
 from analysis.signals.conditioning import Mask, Signals, aligned_channels, condition, lost_samples
 from analysis.signals.filters import Smoother
 from analysis.signals.locks import moving_by_step
-from analysis.simulation.model import Model, finite, refuse_other_rig
+from analysis.simulation.model import Model, as_loaded, finite, refuse_other_rig
 from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import (
     Simulation,
@@ -95,6 +95,7 @@ def validate_record(
     `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
     of this record alone.
     """
+    model = as_loaded(model, record.loaded)
     smoother = default_filtering(record).channels
     here = arrived(rig, record)
     signals = put_right(rig, model.terms, condition(rig, record, smoother, moving))

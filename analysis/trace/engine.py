@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, ordered
 from analysis.effects.free_forces import PositionForce
+from analysis.effects.payload import Payload
 from analysis.identify import checks as ck
 from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
 from analysis.identify.geometry import NAME as GEOMETRY
@@ -27,6 +28,7 @@ from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
+from analysis.trace.data.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import (
     Finding,
@@ -61,7 +63,7 @@ from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Record, Run, with_loads_stated
 from rig.model.rig import Rig
 from rig.model.units import plain
 
@@ -109,13 +111,55 @@ def trace(
     rig = ck.common_rig([*runs, *holdout, *judge])
     _refuse_same(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
+    options = _Options(
+        catalogue(rig) if effects is None else effects, known, seed, look_ahead, free_forms
+    )
+    stated = iter(with_loads_stated([*runs, *holdout, *judge]))
+    train, unseen, judging = (tuple(next(stated) for _ in x) for x in (runs, holdout, judge))
+    records = TraceRuns(train, unseen, judging, tuple(families))
+    result = _traced(rig, records, options, progress or _no_progress)
+    load = None
+    if result.verdict == UNEXPLAINED and MECHANICAL in families and options.may_be_load:
+        load = undeclared_load(rig, known, train, unseen, judging)
+    if load is None:
+        return result
+    records = TraceRuns(load.train, load.holdout, load.judge, records.families)
+    again = _traced(rig, records, options, _no_progress)
+    if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
+        seconds = time.perf_counter() - started
+        return replace(again, notes=(load.words, *again.notes), seconds=seconds)
+    return replace(result, notes=(*result.notes, load.words)) if load.resists else result
+
+
+@dataclass(frozen=True)
+class _Options:
+    """Candidates, the terms `known` to act, and further options of `trace`."""
+
+    effects: Sequence[Effect]
+    known: tuple[Used, ...]
+    seed: int
+    look_ahead: bool
+    free_forms: bool
+
+    @property
+    def may_be_load(self) -> bool:
+        """Whether a load is a candidate and not part of the model already."""
+        tried = any(effect.name == Payload.name for effect in self.effects)
+        return tried and all(used.term.name != Payload.name for used in self.known)
+
+
+def _traced(
+    rig: Rig, records: TraceRuns, options: _Options, done: Callable[[float], None]
+) -> Trace:
+    """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
+    started = time.perf_counter()
+    runs, holdout, judge = records.train, records.holdout, records.judge
+    known, seed = options.known, options.seed
     terms = ordered((*known, *temperature_terms(known, runs, [*holdout, *judge])))
-    records = TraceRuns(tuple(runs), tuple(holdout), tuple(judge), tuple(families))
     rows = trace_rows(rig, terms, records)
     moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
-    candidates = _not_in_model(catalogue(rig) if effects is None else effects, known, moving)
-    free = _not_in_model(free_mechanisms(rig), known) if free_forms else []
-    done = progress or _no_progress
+    candidates = _not_in_model(options.effects, known, moving)
+    free = _not_in_model(free_mechanisms(rig), known) if options.free_forms else []
 
     def columns(share: float) -> None:
         done(PREPARED + (COLUMNS - PREPARED) * share)
@@ -139,7 +183,9 @@ def trace(
         ((), ()) if verdict in (CLEAN, EXPLAINED) else clues_to(train_data, choosing, winner, split)
     )
     hypotheses = finding.hypotheses
-    further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
+    further = (
+        propose(hypotheses, winner, judged_effects, verdict, moves) if options.look_ahead else None
+    )
     after, from_tolerances = _identified_with_effects(runs, winner, before, finding.rows)
     shooting = shoot_hidden_states(
         runs, rows.unseen.choosing_runs, after, train_data, choosing, winner

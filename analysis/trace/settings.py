@@ -174,6 +174,12 @@ class DataSettings:
     """Least number of pairs: noise from fewer is uncertain by more than a tenth (arithmetic)."""
     neighbours_asked: int = 64
     """Number of rows nearest to a row, among which one at least `pair_time` away is searched."""
+    load_share: float = 0.5
+    """Share of the torque rows' energy above noise that a load in some of the records must remove
+    to be tried: other effects may hold the rest (tuned)."""
+    load_rounds: int = 10
+    """Largest number of alternating fits of a load and of the records that carry it: a few settle
+    it."""
     temperature_span: float = 0.05
     """[K] Least span of the oil temperature over all records for a temperature column: less changes
     b by less than a fraction of 0.001 (arithmetic)."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,13 @@ from numpy.typing import NDArray
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+
+LOADED: Final = "loaded"  # attribute of a record: 1 with a load on the last link, 0 without
+
+
+def stated_load(attributes: Mapping[str, str | float | int]) -> bool | None:
+    """Return whether a record's attributes state a load on the last link; None: not stated."""
+    return bool(attributes[LOADED]) if LOADED in attributes else None
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,11 @@ class Record:
     period: int = 0
     lines: tuple[int, ...] = ()
     attributes: Mapping[str, str | float | int] = field(default_factory=dict)
+
+    @property
+    def loaded(self) -> bool | None:
+        """Whether the last link carries a load that it has not in other records; None: unknown."""
+        return stated_load(self.attributes)
 
     @property
     def samples(self) -> int:
@@ -86,3 +99,21 @@ class Run:
     records: tuple[Record, ...]
     source: str = ""
     state: str = "done"
+
+
+def with_loads_stated(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return runs whose records all state their load, where one of them does: the others have none.
+
+    Runs in which no record states a load are returned unchanged.
+    """
+    if all(record.loaded is None for run in runs for record in run.records):
+        return tuple(runs)
+    return tuple(
+        replace(
+            run,
+            records=tuple(
+                replace(r, attributes={LOADED: 0, **r.attributes}) for r in run.records
+            ),
+        )
+        for run in runs
+    )  # fmt: skip

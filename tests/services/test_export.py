@@ -27,7 +27,8 @@ RIG = load_rig("shinshu-2dof")
 DATA = samples(RIG, np.arange(60))
 ONE = Record(
     "step1_r1", "step1", (1,), 1, 1000.0, dict(zip(RIG.recorded, DATA.T, strict=True)),
-    start=2.5, period=20, lines=(1, 3), attributes={"lost_samples": 0, "lock_1": "closed"},
+    start=2.5, period=20, lines=(1, 3),
+    attributes={"lost_samples": 0, "lock_1": "closed", "loaded": 1},
 )  # fmt: skip
 # A machine of its own, so that no shipped name can stand in for its description.
 OTHER = RIG.model_copy(update={"name": "ours", "gravity": 9.81})
@@ -46,7 +47,16 @@ def test_what_import_takes_comes_back_to_the_last_bit(run: Path, tmp_path: Path,
     back = load_run(import_records(tmp_path / "out" / "manifest.yaml", tmp_path / "back").path)
     assert back.rig == OTHER
     for one, other in zip(load_run(run).records, back.records, strict=True):
-        for name in ("name", "step", "locked", "repeat", "sample_rate", "period", "lines"):
+        for name in (
+            "name",
+            "step",
+            "locked",
+            "repeat",
+            "sample_rate",
+            "period",
+            "lines",
+            "loaded",
+        ):
             assert getattr(one, name) == getattr(other, name)
         for name, values in one.channels.items():
             np.testing.assert_array_equal(values, other.channels[name])

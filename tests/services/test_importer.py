@@ -400,3 +400,24 @@ def test_a_full_disk_is_said_and_leaves_no_half_run(
             write_run(tmp_path / "again", load_run(tmp_path / "run"))
     assert not (tmp_path / "again").exists()
     assert list(tmp_path.glob(".*")) == []
+
+
+TWO_STEPS = ONE + "  - {file: a.csv, step: heavy, repeat: 1%s}\n"
+
+
+def test_records_without_a_stated_load_have_none_where_another_states_one(tmp_path: Path) -> None:
+    bring(tmp_path, TWO_STEPS % ", loaded: true", a__csv=csv())
+    assert [r.loaded for r in load_run(tmp_path / "run").records] == [False, True]
+
+
+def test_where_no_load_is_stated_none_is_known(tmp_path: Path) -> None:
+    bring(tmp_path, TWO_STEPS % "", a__csv=csv())
+    assert [r.loaded for r in load_run(tmp_path / "run").records] == [None, None]
+
+
+def test_repeats_of_one_step_with_different_loads_are_refused(tmp_path: Path) -> None:
+    """They would not have the same motion, which repeats must have."""
+    with pytest.raises(InputError) as error:
+        bring(tmp_path, ONE + "  - {file: a.csv, step: s, repeat: 2, loaded: true}\n", a__csv=csv())
+    assert ":5: records.1.loaded: found true, expected it as in the other" in str(error.value)
+    assert not (tmp_path / "run").exists()

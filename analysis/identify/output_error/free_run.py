@@ -30,7 +30,7 @@ from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import Mask, aligned_channels
-from analysis.simulation.model import Model, model_of
+from analysis.simulation.model import Model, as_loaded, model_of
 from analysis.simulation.simulate import DrivingInput, Effort, State, compiled, drive_of, simulate
 from analysis.simulation.validate import arrived, first_state
 from analysis.terms.base import Used
@@ -53,12 +53,14 @@ class _Record:
         self.names = [
             ch.channel(rig.position_kind, i + 1) for i in map(int, np.flatnonzero(signals.excited))
         ]
+        self.loaded = record.loaded
         self.here: Mask = arrived(rig, record)
         self.measured: Array = np.column_stack([channels[n] for n in self.names])[self.here]
 
     def residual(self, model: Model) -> Array:
         """Return measured less simulated positions (n, F)."""
-        result = simulate(compiled(model, Effort.FIT), self.drive, self.start)
+        ready = compiled(as_loaded(model, self.loaded), Effort.FIT)
+        result = simulate(ready, self.drive, self.start)
         if result.failure:
             return np.full(self.measured.shape, IDENTIFY.failed_state)
         simulated = result.channels()

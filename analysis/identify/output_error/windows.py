@@ -27,7 +27,7 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
-from analysis.simulation.model import Model, model_of
+from analysis.simulation.model import Model, as_loaded, model_of
 from analysis.simulation.simulate import Effort, compiled, drive_of, hidden_paths, put_right
 from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
@@ -163,7 +163,8 @@ class Windows:
             b = abs(theta[self.names.index("b")])
             nudges[-1] = IDENTIFY.sensitivity_step * b
         rows = [theta, *(theta + n * e for n, e in zip(nudges, np.eye(len(theta)), strict=True))]
-        models = [self.model(row, source.kelvin) for row in rows]
+        loaded = source.signals.loaded
+        models = [as_loaded(self.model(row, source.kelvin), loaded) for row in rows]
         ready = [compiled(model, Effort.FIT) for model in models]
         first = hidden_paths(models[0], source.signals)
         hidden = [

@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from rig.model.parse import InputError
-from rig.model.records import Record
+from rig.model.records import LOADED, Record, stated_load
 from rig.model.rig import Rig
 from rig.runs import store
 from rig.runs.files import new_folder
@@ -168,6 +168,8 @@ def _way_back(run: Path, out: Path, head: RunHead, kind: str) -> list[str]:
         }  # fmt: skip
         if r.period:
             entry |= {"period": r.period, "lines": list(r.lines)}
+        if stated_load(r.attributes) is not None:
+            entry[LOADED] = stated_load(r.attributes)
         records.append(entry)
     manifest = {"rig": RIG_FILE, "records": records}
     written = {

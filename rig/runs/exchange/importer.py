@@ -277,4 +277,5 @@ def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> N
                 "saturated_samples": 0,
                 "file": r.entry.file,
             }
-            archive.write_group(file, meta.name, r.channels, {**about, **more}, source.rig.unit_of)
+            attributes = {**meta.attributes, **about, **more}
+            archive.write_group(file, meta.name, r.channels, attributes, source.rig.unit_of)

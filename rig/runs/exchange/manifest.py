@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rig.model import channels as ch
 from rig.model.parse import InputError, load_yaml, validate_model
 from rig.model.quantity import Frequency, Time, UnitError, unit_map
+from rig.model.records import LOADED
 from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.recorder import RecordMeta
@@ -45,7 +46,8 @@ class Column(_Part):
 class ManifestRecord(_Part):
     """One record: a file, or its part from `begin` to `end`.
 
-    `period` [samples] and `lines` describe a periodic excitation.
+    `period` [samples] and `lines` describe a periodic excitation. `loaded` says whether the last
+    link carries a load (of any unknown mass) that it has not in other records.
     """
 
     file: str = Field(min_length=1)
@@ -55,6 +57,7 @@ class ManifestRecord(_Part):
     name: str = ""
     period: int = Field(default=0, ge=0)
     lines: tuple[int, ...] = ()
+    loaded: bool | None = None
     begin: Time = Field(default=0.0, ge=0, description="first sample, from the file's start [s]")
     end: Time | None = Field(default=None, gt=0, description="last sample is before this [s]")
 
@@ -69,7 +72,10 @@ class ManifestRecord(_Part):
 
     def meta(self) -> RecordMeta:
         """Return the description of the record."""
-        return RecordMeta(self.step, self.repeat, self.locked, self.period, self.lines, self.name)
+        return RecordMeta(
+            self.step, self.repeat, self.locked, self.period, self.lines, self.name,
+            {} if self.loaded is None else {LOADED: int(self.loaded)},
+        )  # fmt: skip
 
 
 class Manifest(_Part):
@@ -87,7 +93,7 @@ def load_manifest(path: Path) -> tuple[Manifest, dict[tuple[str | int, ...], int
     data, lines = load_yaml(text, str(path))
     manifest = validate_model(Manifest, data, lines, str(path))
     _refuse_duplicates(manifest.records, lines, path)
-    return manifest, lines
+    return _with_every_load(manifest, lines, path), lines
 
 
 def _refuse_duplicates(
@@ -110,6 +116,28 @@ def _refuse_duplicates(
             )
         seen[key] = line
         names.add(name)
+
+
+def _with_every_load(
+    manifest: Manifest, lines: dict[tuple[str | int, ...], int], path: Path
+) -> Manifest:
+    """Return the manifest with a load stated of every record, where one states it: else none.
+
+    Raises InputError for a step whose repeats differ in it: they would not have the same motion.
+    """
+    if all(entry.loaded is None for entry in manifest.records):
+        return manifest
+    records = tuple(r.model_copy(update={LOADED: bool(r.loaded)}) for r in manifest.records)
+    first: dict[str, bool | None] = {}
+    for index, entry in enumerate(records):
+        if entry.loaded is not first.setdefault(entry.step, entry.loaded):
+            line = lines.get(("records", index, LOADED), lines.get(("records", index), 1))
+            raise InputError(
+                f"{path}:{line}: records.{index}.loaded: found {str(entry.loaded).lower()}, "
+                f"expected it as in the other repeats of step {entry.step!r}; give the records "
+                "with the load a step of their own"
+            )
+    return manifest.model_copy(update={"records": records})
 
 
 def check_against_rig(

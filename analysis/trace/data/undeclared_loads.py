@@ -1,0 +1,289 @@
+"""Records that carry a load which others lack, where no record states it.
+
+A load of mass m at the tip adds m p to the torque rows: p = X g, of the baseline's columns X and
+the growth g of its coefficients per kilogram. Of records that all carry it M, R and W absorb it; of
+records of which only some carry it they do not. Two fits alternate to find which do:
+ coefficients and m by least squares, with p in the rows of the records that carry the load;
+ the state of each record, by whether r or r - m p is smaller in its rows (r: residual without m).
+The first guess is of whole steps: from each single step on, one step after the other changes its
+state while the energy that m removes grows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.payload import HEAVIEST, Payload, growth
+from analysis.regression.least_squares import shortest
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.data.set_aside import in_judging_block
+from analysis.trace.search.linear_fit import orthonormal
+from analysis.trace.settings import DATA, TRACE
+from rig.model.records import LOADED, Run
+from rig.model.rig import Rig
+from rig.model.units import plain
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+MECHANICAL: Final = "mechanical"  # the family of torque rows
+Key = tuple[int, str]  # number of the run, name of the record
+
+
+@dataclass(frozen=True)
+class UndeclaredLoad:
+    """The runs with every record's load stated as its torque rows show it, and a note on that.
+
+    `resists` as in `LoadFit`.
+    """
+
+    train: tuple[Run, ...]
+    holdout: tuple[Run, ...]
+    judge: tuple[Run, ...]
+    words: str
+    resists: bool
+
+
+@dataclass(frozen=True)
+class LoadFit:
+    """A load that some of the records carry and others do not.
+
+    `mass` [kg]; `loaded` are the training records that carry it; `beta` are the coefficients of the
+    torque rows beside it. `resists` is whether its inertia shows, and is that of its weight.
+    """
+
+    mass: float
+    loaded: frozenset[Key]
+    beta: dict[str, float]
+    resists: bool
+
+
+@dataclass(frozen=True)
+class _LoadRows:
+    """Whitened torque rows (M,) of records, each by itself, and what 1 kg at the tip adds to them.
+
+    `unit` (M,) numbers each row's record among `keys`.
+    """
+
+    data: RegressionData
+    column: Array
+    residual: Array
+    unit: NDArray[np.int64]
+    keys: tuple[Key, ...]
+
+    def sums(self, values: Array) -> Array:
+        """Return the sum of values (M,) over the rows of each record (U,)."""
+        return np.bincount(self.unit, values, len(self.keys)).astype(np.float64)
+
+    def with_load(self, loaded: Mask) -> Array:
+        """Return what 1 kg adds (M,) where the records `loaded` (U,) carry it."""
+        return np.where(loaded[self.unit], self.column, 0.0)
+
+
+def undeclared_load(
+    rig: Rig, terms: Sequence[Used], train: Sequence[Run], holdout: Sequence[Run],
+    judge: Sequence[Run],
+) -> UndeclaredLoad | None:  # fmt: skip
+    """Return the runs with the load that the torque rows show in some records, None if in none.
+
+    A record that is not fitted to is asked by its rows alone; a held-out one by the rows that
+    choose, where others of it judge.
+    """
+    unseen = (*holdout, *judge)
+    if any(record.loaded is not None for run in (*train, *unseen) for record in run.records):
+        return None
+    load = fitted_load(rig, terms, train)
+    if load is None:
+        return None
+    found = [
+        (train, load.loaded),
+        (holdout, loaded_records(rig, terms, holdout, load, divided=not judge)),
+        (judge, loaded_records(rig, terms, judge, load, divided=False) if judge else frozenset()),
+    ]
+    carry = [word for runs, loaded in found for word in _in_words(runs, loaded)]
+    weighed = "" if load.resists else ", by its weight alone"
+    words = (
+        f"no record states a load: by the torque balances {' '.join(dict.fromkeys(carry))} carry "
+        f"about {plain(load.mass, 2)} kg more at the tip than the other records{weighed}; state "
+        "`loaded` of the records where it is known (import manifest)"
+    )
+    stated = [with_loads(runs, loaded) for runs, loaded in found]
+    return UndeclaredLoad(stated[0], stated[1], stated[2], words, load.resists)
+
+
+def _in_words(runs: Sequence[Run], loaded: frozenset[Key]) -> list[str]:
+    """Return the steps that carry a load, of a step that carries it in part the records."""
+    out = []
+    for number, run in enumerate(runs):
+        bare = {r.step for r in run.records if (number, r.name) not in loaded}
+        here = [r for r in run.records if (number, r.name) in loaded]
+        out += [r.name if r.step in bare else r.step for r in here]
+    return out
+
+
+def fitted_load(rig: Rig, terms: Sequence[Used], runs: Sequence[Run]) -> LoadFit | None:
+    """Return the load that separates the training records best.
+
+    None on a rig without links, and where no load removes `DATA.load_share` of the torque rows'
+    energy above noise.
+    """
+    if not Payload.all_places(rig):
+        return None
+    rows = _load_rows(rig, terms, runs)
+    basis = orthonormal(rows.data.base)
+    before = rows.residual - basis @ (basis.T @ rows.residual)
+    steps = _steps(runs, rows.keys)
+    loaded = _first_guess(rows, basis, before, steps)
+    for _ in range(DATA.load_rounds):
+        mass, change = _fit(rows, loaded)
+        states = _states(rows, rows.residual - rows.data.base @ change, mass)
+        if (states == loaded).all():
+            break
+        loaded = states
+    mass, change = _fit(rows, loaded)
+    after = rows.residual - rows.data.base @ change - mass * rows.with_load(loaded)
+    start = float(before @ before)
+    removed, excess = start - float(after @ after), start - len(before)
+    by_chance = TRACE.standard_errors * np.sqrt(2.0 * len(before))
+    if loaded.all() or not loaded.any() or not 0.0 < mass < HEAVIEST:
+        return None
+    resists = _resists(rows, basis, loaded)
+    if excess < by_chance or removed < DATA.load_share * excess or resists is False:
+        return None
+    beta = dict(rows.data.beta)
+    for name, step in zip(rows.data.names, change, strict=True):
+        beta[name] = beta.get(name, 0.0) + float(step)
+    return LoadFit(mass, _chosen(rows, loaded), beta, resists is not None)
+
+
+def loaded_records(
+    rig: Rig, terms: Sequence[Used], runs: Sequence[Run], load: LoadFit, divided: bool
+) -> frozenset[Key]:
+    """Return the records of other runs that carry the load of the training records.
+
+    With `divided` only the rows that choose are asked, not those of blocks that are set aside.
+    """
+    rows = _load_rows(rig, terms, runs, load.beta)
+    asked = np.ones(len(rows.column))
+    for s in rows.data.segments if divided else ():
+        asked[s.where] = ~in_judging_block(rows.data.source(s)[1].time)
+    rows = replace(rows, column=rows.column * asked)
+    return _chosen(rows, _states(rows, rows.residual, load.mass))
+
+
+def with_loads(runs: Sequence[Run], loaded: frozenset[Key]) -> tuple[Run, ...]:
+    """Return the runs with every record's load stated.
+
+    Loaded records of a step that has records without a load too become a step of their own, since
+    they do not have the same motion.
+    """
+    out = []
+    for number, run in enumerate(runs):
+        bare = {r.step for r in run.records if (number, r.name) not in loaded}
+        records = []
+        for record in run.records:
+            here = (number, record.name) in loaded
+            step = f"{record.step}, loaded" if here and record.step in bare else record.step
+            attributes = {**record.attributes, LOADED: int(here)}
+            records.append(replace(record, step=step, attributes=attributes))
+        out.append(replace(run, records=tuple(records)))
+    return tuple(out)
+
+
+def _load_rows(
+    rig: Rig, terms: Sequence[Used], runs: Sequence[Run], beta: dict[str, float] | None = None
+) -> _LoadRows:
+    single = [
+        replace(run, records=tuple(replace(r, step=r.name) for r in run.records)) for run in runs
+    ]
+    members = conditioned_records(rig, single, families=(MECHANICAL,))
+    data = regression_data(rig, terms, members, beta)
+    per_kilogram = growth(rig)
+    column = data.base @ np.array([per_kilogram.get(name, 0.0) for name in data.names])
+    keys = tuple(conditioned.group for conditioned in data.records)
+    unit = np.zeros(len(column), dtype=np.int64)
+    for s in data.segments:
+        unit[s.where] = keys.index(s.group)
+    return _LoadRows(data, column, data.mean_residual, unit, keys)
+
+
+def _steps(runs: Sequence[Run], keys: Sequence[Key]) -> list[Mask]:
+    """Return which records (U,) each step of each run has; of one step alone, each record."""
+    step_of = {(n, r.name): (n, r.step) for n, run in enumerate(runs) for r in run.records}
+    found = [step_of[key] for key in keys]
+    if len(set(found)) == 1:
+        return list(np.eye(len(keys), dtype=bool))
+    return [np.array([step == one for step in found]) for one in dict.fromkeys(found)]
+
+
+def _first_guess(rows: _LoadRows, basis: Array, residual: Array, steps: Sequence[Mask]) -> Mask:
+    """Return the records (U,) of the steps that a load in them explains best."""
+    columns = np.column_stack([rows.with_load(step) for step in steps])
+    columns = columns - basis @ (basis.T @ columns)
+    K, c, size = columns.T @ columns, columns.T @ residual, float(rows.column @ rows.column)
+
+    def removed(chosen: Mask) -> float:
+        own = float(chosen @ K @ chosen)
+        return float(chosen @ c) ** 2 / own if own > TRACE.rank_limit**2 * size else 0.0
+
+    best = np.zeros(len(steps), dtype=bool)
+    for first in np.eye(len(steps), dtype=bool):
+        now = first
+        while True:
+            others = [now ^ step for step in np.eye(len(steps), dtype=bool)]
+            other = max(others, key=removed)
+            if removed(other) <= removed(now):
+                break
+            now = other
+        best = max(best, now, key=removed)
+    if best @ c < 0.0:  # the mass is negative: the others carry the load
+        best = ~best
+    return np.asarray(np.array(steps)[best].any(axis=0))
+
+
+def _fit(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:
+    """Return the mass [kg] and the changes (k,) of the baseline's coefficients."""
+    matrix = np.column_stack((rows.data.base, rows.with_load(loaded)))
+    found = shortest(matrix, rows.residual, TRACE.rank_limit)
+    return float(found[-1]), found[:-1]
+
+
+def _resists(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
+    """Return whether what the records `loaded` (U,) have more resists motion as it weighs.
+
+    The mass by gravity and that by inertia alone may differ by `TRACE.invariance_tolerance`, plus
+    noise: what a tilt of the base or an offset of a sensor adds does not resist. None where M and R
+    absorb the inertia, since the joint moves in no record without the load.
+    """
+    rates = growth(rows.data.rig)
+    base = rows.data.base * np.where(loaded[rows.unit], 1.0, 0.0)[:, None]
+    weights = [rates.get(n, 0.0) if n.startswith("W") else 0.0 for n in rows.data.names]
+    inertias = [0.0 if n.startswith("W") else rates.get(n, 0.0) for n in rows.data.names]
+    columns = base @ np.array([weights, inertias]).T
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns - basis @ (basis.T @ columns)
+    if np.any(np.linalg.norm(columns, axis=0) <= TRACE.rank_limit * size):
+        return None
+    weight, inertia = np.linalg.lstsq(columns, rows.residual, rcond=None)[0]
+    error = np.linalg.inv(columns.T @ columns)
+    deviation = float(np.sqrt(np.array([1.0, -1.0]) @ error @ np.array([1.0, -1.0])))
+    if deviation > max(abs(weight), abs(inertia)) * TRACE.subset_error:
+        return None
+    allowed = TRACE.invariance_tolerance * max(abs(weight), abs(inertia))
+    return bool(abs(weight - inertia) <= allowed + TRACE.standard_errors * deviation)
+
+
+def _states(rows: _LoadRows, residual: Array, mass: float) -> Mask:
+    """Return which records (U,) a residual (M,) without load fits better with the mass."""
+    added = mass * rows.column
+    return np.asarray(rows.sums(residual * added) > 0.5 * rows.sums(added * added))
+
+
+def _chosen(rows: _LoadRows, loaded: Mask) -> frozenset[Key]:
+    return frozenset(key for key, here in zip(rows.keys, loaded, strict=True) if here)
