@@ -423,7 +423,8 @@ def _apply_gates(
     if not all_refused:
         effects, winner, left = _extended_set(hypotheses, effects, winner, left, holdout_data, rng)
     if all_refused or any(r.veto for r in left):
-        verdict, effects = UNEXPLAINED, (*effects, *refused)
+        verdict = UNEXPLAINED
+        effects = (*map(gates.tied_in_held_out, effects), *refused)
     elif not winner.effects:  # too little remains for any effect to be needed
         verdict = CLEAN
     else:

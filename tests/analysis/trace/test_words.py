@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from analysis.simulation.model import Estimate, nominal_model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.result import EXPLAINED, JudgedEffect, Trace
+from analysis.trace.judge.gates import NO_RIVAL, passes_gates, tied_in_held_out
+from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import sentence
 from rig.model.rig import Rig
@@ -84,3 +87,20 @@ def test_an_error_above_the_noise_is_said_to_be_within_the_form(rig: Rig) -> Non
     assert "left in torque_2, 3.3 times the noise floor, is 0.27 % of the energy" in text
     assert "may miss 10 %" in text
     assert "may miss" not in told(rig, (SPRING,))
+
+
+def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> None:
+    """Held out, the delay leaves as much as the gain: only what was fitted tells them apart."""
+    near, far = (
+        Rival("channel_delay", "joint 1", ratio, 1.4, False, "joint 1 piston")
+        for ratio in (1.0, 1.5)
+    )
+    gain = replace(SPRING, gates=(Gate(NO_RIVAL, True, "none"),))
+    open_one = tied_in_held_out(replace(gain, rivals=(far, near)))
+    assert [r.tied for r in open_one.rivals] == [True, False]
+    assert not open_one.named
+    assert passes_gates(open_one)  # it fits, but is not the only one that does
+    assert "cannot be separated from channel_delay" in open_one.gates[-1].detail
+    assert "1.40 times the training rms" in open_one.gates[-1].detail
+    clear = replace(gain, rivals=(far,))
+    assert tied_in_held_out(clear) is clear
