@@ -34,8 +34,9 @@ FINE: Final = 4  # frequencies looked at within one over the record's length
 class PeriodicDisturbance(Effect):
     """Torque T_sin sin(2 pi f t) + T_cos cos(2 pi f t) on the joint, t since the record began.
 
-    An eccentric, a hum, a controller's dither that begins with the record (one Fourier line). With
-    another phase in every repeat it does not repeat, and is noise to the trace.
+    An eccentric, a hum, a controller's dither that begins with the record (one Fourier line). One
+    with another phase in every repeat is found in what the repeats differ by; its amplitude is
+    then given, and no model or free run contains it.
     """
 
     mechanism: ClassVar[str] = "disturbance"

@@ -34,6 +34,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+WAVES = (np.sin, np.cos)
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,15 @@ class Filtering:
     """The filters of one record: `channels` before, `rows` (or none) after.
 
     The torque balances of joints `in_motion` (0-based) do not count samples at which these rest.
+    Those of the joints in `lines` (0-based, with a frequency [Hz]) are without their part at that
+    frequency: one sine of free amplitude and phase is fitted to every record and taken out.
     """
 
     channels: Smoother
     rows: FirSmoother | None
     step: int = 1
     in_motion: tuple[int, ...] = ()
+    lines: tuple[tuple[int, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -187,13 +191,15 @@ class TermPart:
 class RightPart:
     """An equation's filtered right side and its instants (m,) [s], before rows are dropped.
 
-    And where (n,) its sensors are right, and where a sample never arrived.
+    And where (n,) its sensors are right, where a sample never arrived, and the sines (m, 2 l) of
+    the l frequencies that are taken out.
     """
 
     side: Array
     time: Array
     sensors: Mask
     lost: Mask
+    sines: Array
 
 
 def _equations(signals: Signals, family: str) -> list[str]:
@@ -242,8 +248,26 @@ def right_parts(
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
         if family == "fluid":  # below zero the oil cavitates, and no balance of flows holds
             sensors &= (signals.p_cap if "cap" in name else signals.p_rod)[:, i] >= 0.0
-        out[name] = RightPart(side, time, sensors, _lost(signals, joints))
+        sines = filtered_sines(signals, filtering, name)
+        out[name] = RightPart(side, time, sensors, _lost(signals, joints), sines)
     return out
+
+
+def filtered_sines(signals: Signals, filtering: Filtering, name: str) -> Array:
+    """Return the sines and cosines (m, 2 l) that an equation's rows are without, filtered alike."""
+    at = [f for joint, f in filtering.lines if equation("torque", joint) == name]
+    angles = [2 * np.pi * f * signals.t for f in at]
+    waves = {f"{wave.__name__} {k}": wave(x) for k, x in enumerate(angles) for wave in WAVES}
+    if not waves:
+        return np.zeros((0, 0))
+    return np.column_stack(list(low_passed(weighted(waves, signals, name), filtering).values()))
+
+
+def without_sines(columns: Array, sines: Array) -> Array:
+    """Return columns (m, k) or (m,) without what the sines (m, l) can make of each."""
+    if not sines.size:
+        return columns
+    return np.asarray(columns - sines @ np.linalg.lstsq(sines, columns, rcond=None)[0])
 
 
 def _lost(signals: Signals, joints: slice) -> Mask:
@@ -274,7 +298,9 @@ def assembled(
             for parameter, column in part.columns.get(name, {}).items():
                 matrix[:, names.index(parameter)] += column[kept]
         masked = int((inside & dropped).sum())
-        out[name] = Rows(name, names, matrix, right.side[kept], right.time[kept], masked)
+        sines = right.sines[kept] if right.sines.size else right.sines
+        matrix, side = without_sines(matrix, sines), without_sines(right.side[kept], sines)
+        out[name] = Rows(name, names, matrix, side, right.time[kept], masked)
     return out
 
 

@@ -34,18 +34,17 @@ from analysis.trace.finding import (
     Finding,
     TraceRows,
     TraceRuns,
+    find,
     fitted_in_motion,
     joints_with_friction,
     rest_phase_notes,
-    search_and_judge,
-    searched_in_motion,
     trace_rows,
-    without_unnamed_effects,
 )
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
 from analysis.trace.judge.scatter import with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
+from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import detection_limit_notes, detection_limits
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.remaining import clues_to
@@ -157,6 +156,8 @@ def _traced(
     known, seed = options.known, options.seed
     terms = ordered((*known, *temperature_terms(known, runs, [*holdout, *judge])))
     rows = trace_rows(rig, terms, records)
+    as_recorded = rows.train
+    records, rows = _without_unlocked_lines(rig, terms, records, rows)
     moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
     candidates = _not_in_model(options.effects, known, moving)
     free = _not_in_model(free_mechanisms(rig), known) if options.free_forms else []
@@ -167,15 +168,19 @@ def _traced(
     baseline = _identified(runs, rows.train.terms)
     before = baseline.model
     notes = [*rows.unseen.notes, *_evidence_notes(rows.train, rows.unseen.choosing)]
-    notes += [*unrepeated_notes(rows.train), *_undetermined_notes(before)]
-    notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
-    finding = search_and_judge(rows, candidates, free, seed, columns)
-    finding = without_unnamed_effects(
-        searched_in_motion(rig, terms, records, candidates, free, seed, finding)
-    )
+    notes += [
+        *_undetermined_notes(before),
+        *(check.detail for check in baseline.checks if check.name == GEOMETRY),
+    ]
+    finding = find(rig, terms, records, rows, candidates, free, seed, columns)
+    records = replace(records, lines=finding.rows.lines)
     verdict, winner = finding.verdict, finding.winner
     judged_effects, refused = finding.named, finding.refused
-    notes += finding.notes
+    notes += [
+        *unrepeated_notes(finding.rows.train),
+        *finding.notes,
+        *phase_notes(finding.named, records.lines),
+    ]
     done(JUDGED)
     train_data, choosing = finding.rows.train, finding.rows.unseen.choosing
     split = spectral_lines(train_data, winner.fit.residual)
@@ -222,7 +227,7 @@ def _traced(
     result = Trace(
         verdict, judged_effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _remaining_fraction(hypotheses, winner), moves, further, rows.train.floors,
+        _remaining_fraction(hypotheses, winner, as_recorded), moves, further, as_recorded.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
@@ -231,6 +236,17 @@ def _traced(
         detection_limits=tuple(hidden), seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
+
+
+def _without_unlocked_lines(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, rows: TraceRows
+) -> tuple[TraceRuns, TraceRows]:
+    """Return runs and rows without the torques whose phase differs between repeats."""
+    lines = unlocked_lines(rows.train)
+    if not lines:
+        return records, rows
+    records = replace(records, lines=lines)
+    return records, trace_rows(rig, terms, records)
 
 
 def _no_progress(_: float) -> None:
@@ -407,9 +423,19 @@ def _tolerated_error_notes(
     return out
 
 
-def _remaining_fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:
-    """Return the share of the training energy above noise under the baseline that remains."""
-    start = hypotheses.empty.total
+def _remaining_fraction(
+    hypotheses: HypothesisSet, winner: Hypothesis, as_recorded: RegressionData
+) -> float:
+    """Return the share of the training energy above noise under the baseline that remains.
+
+    `as_recorded` are the training rows before any sine was taken out of them.
+    """
+    noise = {(f.group, f.equation): f.noise for f in as_recorded.floors}
+    taken = sum(
+        (s.where.stop - s.where.start) * max(0.0, (noise[s.group, s.equation] / s.noise) ** 2 - 1)
+        for s in hypotheses.train_data.segments
+    )
+    start = hypotheses.empty.total + taken
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
@@ -433,25 +459,28 @@ def _identified_with_effects(
     if not winner.effects:
         return before, {}
     train_data = rows.train
-    found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion)
+    found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion, rows.lines)
     return at_nominal_temperature(
         with_form_errors(train_data, winner.fit, found.model)
     ), by_geometry(found)
 
 
 def _identified(
-    runs: Sequence[Run], terms: Sequence[Used], in_motion: tuple[int, ...] = ()
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    in_motion: tuple[int, ...] = (),
+    lines: tuple[Line, ...] = (),
 ) -> Identification:
     """Return a model's identified parameters.
 
     Temperature and spool path are left out of `terms`: the estimator fits them itself. Torque rows
-    of the joints `in_motion` (0-based) are weighted by speed.
+    of the joints `in_motion` (0-based) are weighted by speed; sines at `lines` are taken out.
     """
     beside = (BulkTemperature, SpoolPath)
     own = ordered([u for u in terms if not isinstance(u.term, beside)])
 
     def filtering(record: Record) -> Filtering:
-        return replace(default_filtering(record), in_motion=in_motion)
+        return replace(default_filtering(record), in_motion=in_motion, lines=lines)
 
     return identify(runs, terms=own, filtering=filtering, estimator=ESTIMATOR)
 

@@ -19,8 +19,10 @@ from analysis.trace.data.conditioned_record import (
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import UnseenRows, set_aside
 from analysis.trace.data.spool_path import path_terms
+from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.free_forms import explained_by_free_form, mechanism_count
 from analysis.trace.judge import gates, readings
+from analysis.trace.judge.unlocked import Line, judged_line
 from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.remaining import Remainder, remainders
 from analysis.trace.result import (
@@ -45,12 +47,16 @@ ONLY_HELD_OUT_MISSED = (
 
 @dataclass(frozen=True)
 class TraceRuns:
-    """Runs by their task, and the families of equations that are traced."""
+    """Runs by their task, and the families of equations that are traced.
+
+    Sines at `lines` (joint, 0-based, and frequency [Hz]) are taken out of the torque balances.
+    """
 
     train: tuple[Run, ...]
     holdout: tuple[Run, ...]
     judge: tuple[Run, ...]
     families: tuple[str, ...]
+    lines: tuple[Line, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,11 @@ class TraceRows:
     def in_motion(self) -> tuple[int, ...]:
         """The joints (0-based) whose torque rows are weighted by speed, by 0 at rest."""
         return self.train.records[0].filtering.in_motion
+
+    @property
+    def lines(self) -> tuple[Line, ...]:
+        """The sines that are taken out of torque rows: joint (0-based) and frequency [Hz]."""
+        return self.train.records[0].filtering.lines
 
 
 @dataclass(frozen=True)
@@ -105,8 +116,11 @@ def trace_rows(
     Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation.
     """
 
+    def filters(record: Record) -> Filtering:
+        return replace(filtering(record), lines=records.lines)
+
     def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
-        return conditioned_records(rig, runs, filtering, records.families)
+        return conditioned_records(rig, runs, filters, records.families)
 
     train_data = _training_rows(rig, terms, conditioned(records.train))
     terms, beta = train_data.terms, train_data.beta
@@ -163,7 +177,22 @@ def search_and_judge(
     winner = hypotheses.run(done)
     found = _judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
     named = any(map(gates.passes_gates, found.effects))
-    return _finding(rows, found, _remainder_notes(found.verdict, found.remainders, quiet, named))
+    notes = _remainder_notes(found.verdict, found.remainders, quiet, named)
+    if quiet and found.verdict == UNEXPLAINED:
+        notes = [*_held_out_only_notes(rows.train, found.remainders), *notes]
+    return _finding(rows, found, notes)
+
+
+def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) -> list[str]:
+    """Say why only held-out records keep too much: what does not repeat, or little excitation."""
+    above = sorted({r.equation for r in left if r.veto})
+    unrepeated = [e for e in above if e in unrepeated_floors(train_data)]
+    out = [
+        f"{e}: the training repeats differ from each other too: the cause changes with time or "
+        "does not follow the excitation, and more excitation would not show it"
+        for e in unrepeated
+    ]
+    return out if unrepeated == above else [*out, ONLY_HELD_OUT_MISSED]
 
 
 def _finding(rows: TraceRows, found: Judgement, notes: Iterable[str]) -> Finding:
@@ -184,6 +213,47 @@ def without_unnamed_effects(finding: Finding) -> Finding:
     left = remainders(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
     notes = _remainder_notes(finding.verdict, left, quiet=False, named=bool(kept))
     return replace(finding, winner=winner, remainders=tuple(left), notes=tuple(notes))
+
+
+def find(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, rows: TraceRows,
+    candidates: Sequence[Effect], free: Sequence[Effect], seed: int, done: Callable[[float], None],
+) -> Finding:  # fmt: skip
+    """Return what the model lacks: `search_and_judge`, in motion only where that is needed.
+
+    Torques at `records.lines` are judged beside the effects found. Where one is refused, nothing is
+    taken out of the rows, and all is searched again.
+    """
+    found = search_and_judge(rows, candidates, free, seed, done)
+    found = without_unnamed_effects(
+        searched_in_motion(rig, terms, records, candidates, free, seed, found)
+    )
+    if not records.lines:
+        return found
+    judged = _judged_lines(rig, records, found)
+    refused = gates.refused_effects(judged)
+    if refused:
+        whole = replace(records, lines=())
+        rows = trace_rows(rig, terms, whole)
+        found = find(rig, terms, whole, rows, candidates, free, seed, done)
+        return replace(found, effects=(*found.effects, *refused))
+    verdict = EXPLAINED if found.verdict == CLEAN else found.verdict
+    return replace(found, effects=(*found.effects, *judged), verdict=verdict)
+
+
+def _judged_lines(rig: Rig, records: TraceRuns, found: Finding) -> tuple[JudgedEffect, ...]:
+    """Return the torques at `records.lines` with their gates, beside the effects found."""
+    unseen, fit = found.rows.unseen, found.winner.fit
+    train, holdout = (
+        conditioned_records(rig, runs, families=records.families)
+        for runs in (records.train, records.holdout)
+    )
+    judged = []
+    for line in records.lines:
+        own = [s for s in unseen.choosing.segments if s.equation == equation("torque", line[0])]
+        noise = float(np.sqrt(np.mean([s.noise**2 for s in own]))) if own else np.inf
+        judged.append(judged_line(rig, line, fit, train, holdout, unseen.divided, noise))
+    return tuple(judged)
 
 
 def searched_in_motion(
@@ -333,7 +403,7 @@ def _remainder_notes(
 
     `quiet`: the training records held nothing above the noise; `named`: an effect is named.
     """
-    out = [ONLY_HELD_OUT_MISSED] if quiet and verdict == UNEXPLAINED else []
+    out = []
     if verdict == UNEXPLAINED and (named or quiet):
         out += [f"{r.equation}: {r.words}" for r in left if r.veto]
     return [*out, *(f"{r.equation}: {r.words}" for r in left if not r.veto)]
@@ -353,7 +423,8 @@ def _apply_gates(
     if not all_refused:
         effects, winner, left = _extended_set(hypotheses, effects, winner, left, holdout_data, rng)
     if all_refused or any(r.veto for r in left):
-        verdict, effects = UNEXPLAINED, (*effects, *refused)
+        verdict = UNEXPLAINED
+        effects = (*map(gates.tied_in_held_out, effects), *refused)
     elif not winner.effects:  # too little remains for any effect to be needed
         verdict = CLEAN
     else:

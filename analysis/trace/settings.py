@@ -161,6 +161,11 @@ class DataSettings:
     unrepeated_share: float = 0.5
     """Share of that scatter's energy at one frequency, from which the note states the frequency
     (convention)."""
+    line_ratio: float = 2.0
+    """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
+    torque at one frequency is looked for in it (tuned: clean benches stay below)."""
+    least_turns: float = 5.0
+    """Least number of turns that a frequency makes in a record: fewer are drift (tuned)."""
     # Noise from neighbouring states.
     pair_time: float = 0.5
     """[s] Least time between the two rows of a pair: five times the row filter's memory."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from analysis.simulation.model import Estimate
 from analysis.trace.clues.formula import surest_formula
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Trace
+from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
 from rig.model.units import plain, typeset, with_interval
@@ -32,7 +31,7 @@ def sentence(result: Trace) -> str:
             "is named."
         )
     named = "; ".join(_effect(e) for e in result.effects)
-    errors = _errors(result)
+    errors = " ".join([_errors(result), *_remarks(result), *_tolerated(result)]).strip()
     if result.verdict == EXPLAINED:
         return f"{_variables_in_words(result.effects)}: {named}. {errors}"
     if result.verdict == CONFOUNDED:
@@ -70,8 +69,9 @@ def _symmetry(result: Trace) -> str:
 
 
 def _variables_in_words(effects: tuple[JudgedEffect, ...]) -> str:
-    variables = [e.variable for e in effects if e.variable and not _constant(e.variable)]
-    if len(variables) < len(effects) and variables:
+    named = [e.variable for e in effects if e.variable and not _constant(e.variable)]
+    variables = list(dict.fromkeys(named))
+    if len(named) < len(effects) and variables:
         variables.append("a constant")
     return "The residual follows " + " and ".join(variables) if variables else "Explained"
 
@@ -81,8 +81,49 @@ def _constant(variable: str) -> bool:
 
 
 def _effect(effect: JudgedEffect) -> str:
-    values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
+    values = ", ".join(
+        f"{n} not determined: {quantity(e)}" if _undetermined(effect, n) else f"{n} = {quantity(e)}"
+        for n, e in effect.parameters.items()
+    )
     return f"{effect.name.replace('_', ' ')} at {effect.location} ({values})"
+
+
+def _undetermined(effect: JudgedEffect, name: str) -> bool:
+    """Return whether a number is less certain than the effect's largest one of its unit."""
+    estimate = effect.parameters[name]
+    alike = [e.value for e in effect.parameters.values() if e.unit == estimate.unit]
+    return estimate.half > max(map(abs, alike))
+
+
+def _remarks(result: Trace) -> list[str]:
+    """Return what a note says of each number that the records do not determine."""
+    open_numbers = [
+        f"{e.name}: {name} " for e in result.effects for name in e.parameters
+        if _undetermined(e, name)
+    ]  # fmt: skip
+    remarks = [n for n in result.notes if n.startswith(tuple(open_numbers))] if open_numbers else []
+    return [f"{remark.partition(': ')[2]}." for remark in remarks]
+
+
+def _tolerated(result: Trace) -> list[str]:
+    """Say which error of an explanation is above the noise's band, and why it may be."""
+    if result.verdict not in (EXPLAINED, CONFOUNDED):
+        return []
+    floor = {e: max(v, 1e-30) for e, v in result.noise_floor.items()}
+    above = [
+        e
+        for e, after in result.after.items()
+        if after > TRACE.noted_ratio * floor[e] and after < result.before[e]
+    ]
+    if not above:
+        return []
+    e = max(above, key=lambda name: result.after[name] / floor[name])
+    energy = [error[e] ** 2 - floor[e] ** 2 for error in (result.after, result.before)]
+    return [
+        f"What is left in {e}, {result.after[e] / floor[e]:.1f} times the noise floor, is "
+        f"{plain(100 * energy[0] / energy[1], 2)} % of the energy that was above the noise: the "
+        f"form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %."
+    ]
 
 
 def quantity(estimate: Estimate) -> str:
@@ -108,9 +149,13 @@ def shot_in_words(effect: JudgedEffect) -> str:
 
 
 def equation_of_largest_reduction(result: Trace) -> str:
-    """Return the equation whose error fell most, relative to its noise."""
-    floor: Mapping[str, float] = result.noise_floor
-    return max(result.before, key=lambda e: result.before[e] / max(floor.get(e, 1e-30), 1e-30))
+    """Return the equation whose held-out energy fell most, in units of its noise."""
+
+    def fall(e: str) -> float:
+        now = result.after.get(e, float("nan"))
+        return (result.before[e] ** 2 - now**2) / max(result.noise_floor.get(e, 0.0), 1e-30) ** 2
+
+    return max(result.before, key=fall)
 
 
 def _errors(result: Trace) -> str:

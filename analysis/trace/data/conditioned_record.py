@@ -25,6 +25,7 @@ from analysis.regression.rows import (
     TermPart,
     assembled,
     default_filtering,
+    filtered_sines,
     in_common,
     instants,
     low_passed,
@@ -32,6 +33,7 @@ from analysis.regression.rows import (
     record_rows,
     right_parts,
     term_part,
+    without_sines,
 )
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Term, Used
@@ -113,10 +115,22 @@ def filtered(
     columns: Mapping[str, Array], conditioned: ConditionedRecord, rows: Rows
 ) -> dict[str, Array]:
     """Filter point-by-point columns (n,) as `rows` were, at the instants of `rows`."""
-    made = low_passed(columns, conditioned.filtering)
-    return {
-        name: column[_row_places(conditioned, len(column), rows)] for name, column in made.items()
-    }
+    return _at_rows(conditioned, low_passed(columns, conditioned.filtering), rows)
+
+
+def _at_rows(
+    conditioned: ConditionedRecord, columns: Mapping[str, Array], rows: Rows
+) -> dict[str, Array]:
+    """Return filtered columns at the instants (m,) of rows, without the sines that these lack."""
+    at = _row_places(conditioned, len(next(iter(columns.values()))), rows)
+    sines = sines_at(conditioned, rows)
+    return {name: without_sines(column[at], sines) for name, column in columns.items()}
+
+
+def sines_at(conditioned: ConditionedRecord, rows: Rows) -> Array:
+    """Return the sines and cosines (m, 2 l) that a record's rows are without, at their instants."""
+    sines = filtered_sines(conditioned.signals, conditioned.filtering, rows.equation)
+    return sines[_row_places(conditioned, len(sines), rows)] if sines.size else sines
 
 
 def _row_places(conditioned: ConditionedRecord, count: int, rows: Rows) -> Indices:
@@ -198,9 +212,7 @@ def _added_columns(
         part = _term_part(rig, used, conditioned, family, seen(), cache)
         for name, columns in part.columns.items():
             if name in rows and any(np.any(v) for v in columns.values()):
-                count = len(next(iter(columns.values())))
-                at = _row_places(conditioned, count, rows[name])
-                out[name] = {parameter: v[at] for parameter, v in columns.items()}
+                out[name] = _at_rows(conditioned, columns, rows[name])
     return {name: out[name] for name in rows if name in out}
 
 

@@ -1,13 +1,17 @@
 """Notes on scatter between repeats that is not sensor noise.
 
 A pump, a neighbouring machine or a fault that comes and goes acts with another phase in every
-repeat. It is then part of the noise floor and leaves no repeatable residual.
+repeat. It is then part of the noise floor and leaves no repeatable residual. Where it is a torque
+at one frequency, `judge.unlocked` names it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.signal import lombscargle
 
 from analysis.trace.data.noise_floor import PERIODS, REPEATS, Floor
@@ -23,6 +27,11 @@ def unrepeated_notes(data: RegressionData) -> list[str]:
 
     The limit is `DATA.unrepeated_ratio`; of several groups the one with the largest ratio is noted.
     """
+    return [_unrepeated_note(data, floor) for floor in unrepeated_floors(data).values()]
+
+
+def unrepeated_floors(data: RegressionData) -> dict[str, Floor]:
+    """Return the floor that is most above the stated noise, of each equation that is so noted."""
     loudest: dict[str, Floor] = {}
     for floor in data.floors:
         measured = floor.source in (REPEATS, PERIODS)
@@ -30,7 +39,7 @@ def unrepeated_notes(data: RegressionData) -> list[str]:
             best = loudest.get(floor.equation)
             if best is None or floor.noise / floor.stated > best.noise / best.stated:
                 loudest[floor.equation] = floor
-    return [_unrepeated_note(data, floor) for floor in loudest.values()]
+    return loudest
 
 
 def _unrepeated_note(data: RegressionData, floor: Floor) -> str:
@@ -55,16 +64,36 @@ def _dominant_frequency(data: RegressionData, segment: Segment) -> tuple[float, 
     """
     if segment.repeats < 2:
         return 0.0, 0.0
-    time = data.source(segment)[1].time
+    return dominant_frequency([scatter(data, segment)])
+
+
+def scatter(data: RegressionData, segment: Segment) -> tuple[Array, Array]:
+    """Return the instants (m,) of a segment, and its repeats' residuals (n, m) less their mean."""
     rows = data.residual[: segment.repeats, segment.where]
-    scatter = rows - rows.mean(axis=0)
-    length = float(time[-1] - time[0])
-    highest = 0.5 / float(np.median(np.diff(time)))
+    return data.source(segment)[1].time, rows - rows.mean(axis=0)
+
+
+def dominant_frequency(parts: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """Return the frequency [Hz] that most of the energy of series lies at, and its share of it.
+
+    `parts` are instants (m,) [s] with series (n, m) of any phase.
+    """
+    length = max(float(time[-1] - time[0]) for time, _ in parts)
+    highest = 0.5 / float(np.median(np.diff(parts[0][0])))
+    whole = sum(float(np.sum(series**2)) for _, series in parts)
+
+    def share(frequency: Array) -> Array:
+        return np.asarray(
+            sum(
+                lombscargle(time, r - r.mean(), 2 * np.pi * frequency, normalize=True) * (r @ r)
+                for time, series in parts
+                for r in series
+            )
+            / whole
+        )
+
     frequency = np.arange(2.0 / length, highest, 0.25 / length)
-    power = sum(
-        lombscargle(time, r - r.mean(), 2 * np.pi * frequency, normalize=True) * np.sum(r**2)
-        for r in scatter
-    )
-    share = np.asarray(power) / float(np.sum(scatter**2))
-    best = int(np.argmax(share))
-    return float(frequency[best]), float(share[best])
+    coarse = float(frequency[np.argmax(share(frequency))])
+    bounds = (coarse - 0.25 / length, coarse + 0.25 / length)
+    best = minimize_scalar(lambda f: -share(np.array([f])).item(), bounds=bounds, method="bounded")
+    return float(best.x), -float(best.fun)

@@ -117,14 +117,16 @@ def errors(
     `members` are the records, each repeat by itself; of those in `divided` groups only the judging
     rows count. The noise floor is that of the residual under the model `after`. A record without
     repeats has a floor by its periods or neighbouring states, for which all its rows are used.
+    Sines that are taken out of the rows are part of what the model `before` leaves.
     """
+    bare = [replace(c, filtering=replace(c.filtering, lines=())) for c in members]
     whole = [model_rows(rig, after.terms, conditioned) for conditioned in members]
     first, other = (
         [
             {e: judging_rows(r) for e, r in rows.items()} if c.group in divided else rows
             for c, rows in zip(members, built, strict=True)
         ]
-        for built in ([model_rows(rig, before.terms, c) for c in members], whole)
+        for built in ([model_rows(rig, before.terms, c) for c in bare], whole)
     )
     repeats = Counter(c.group for c in members)
     compared = [

@@ -156,7 +156,7 @@ RULES: Final = (
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
-         ((engine, "searched_in_motion", lambda *given: given[-1]),
+         ((finding, "searched_in_motion", lambda *given: given[-1]),
           (engine, "joints_with_friction", lambda *_: set()))),
     Rule("free forms", "no mechanism without a named form",
          ((finding, "_try_free_forms", lambda *_: None),)),

@@ -1,0 +1,244 @@
+"""Periodic torques that begin at another phase in every record.
+
+They leave nothing in the average of the repeats that one phase could meet, and are all of the
+scatter between them. The scatter shows the frequency. One sine of free phase is then taken out of
+every record of that torque balance, and its amplitude, which must be the same in all records, is
+what is named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.disturbance import FREQUENCY, PeriodicDisturbance
+from analysis.effects.mechanics import torque_limit
+from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.rows import WAVES, without_sines
+from analysis.simulation.model import Estimate
+from analysis.terms.base import equation
+from analysis.trace.data.conditioned_record import model_rows, row_residual, sines_at
+from analysis.trace.data.noise_floor import REPEATS, Group
+from analysis.trace.data.regression_data import RegressionData, Segment
+from analysis.trace.data.set_aside import in_judging_block
+from analysis.trace.data.unrepeated import dominant_frequency, scatter
+from analysis.trace.judge.gates import INVARIANT, NO_RIVAL, PHYSICAL, REMOVES, SIGNIFICANT
+from analysis.trace.result import Gate, JudgedEffect
+from analysis.trace.search.refinement import ExactFit
+from analysis.trace.settings import DATA, TRACE
+from rig.model.rig import Rig
+from rig.model.units import plain
+
+Array = NDArray[np.float64]
+Line = tuple[int, float]  # joint (0-based) and frequency [Hz]
+
+
+def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
+    """Return joint and frequency of torques whose phase differs between repeats.
+
+    The scatter between the repeats of the joint's torque balance is `DATA.line_ratio` times what
+    the stated noise makes, and more than `DATA.unrepeated_share` of its energy is at one frequency.
+    Not meant are: a drift, of fewer than `DATA.least_turns` turns; a frequency at which the joint's
+    velocity has as large a share, since a load that varies with the motion scatters there; and one
+    at which another balance scatters too, as an error of a sensor makes them.
+    """
+    repeated = {(f.group, f.equation): f for f in data.floors if f.source == REPEATS}
+    loud: dict[str, list[Segment]] = {}
+    for s in data.segments:
+        floor = repeated.get((s.group, s.equation))
+        if floor is not None and floor.noise > DATA.line_ratio * floor.stated:
+            loud.setdefault(s.equation, []).append(s)
+    found: dict[str, float] = {}
+    for e, segments in loud.items():
+        f, share = dominant_frequency([scatter(data, s) for s in segments])
+        if share > DATA.unrepeated_share:
+            found[e] = f
+    out = []
+    for e, f in found.items():
+        joint = int(e.rsplit("_", 1)[1]) - 1
+        others = [g for other, g in found.items() if other != e]
+        own = [_velocity(data, s, joint) for s in loud[e]]
+        length = max(float(time[-1] - time[0]) for time, _ in own)
+        if (
+            e == equation("torque", joint)
+            and FREQUENCY[0] <= f <= FREQUENCY[1]
+            and f * length >= DATA.least_turns
+            and not any(abs(f - g) * length < 1.0 for g in others)
+            and not _moves_at(own, f, length)
+        ):
+            out.append((joint, f))
+    return tuple(out)
+
+
+def _velocity(data: RegressionData, segment: Segment, joint: int) -> tuple[Array, Array]:
+    """Return the instants (m,) of a segment, and the joint's velocity (1, m) at them."""
+    conditioned, rows = data.source(segment)
+    velocity = conditioned.signals.qd[conditioned.samples_at(rows.time), joint]
+    return rows.time, velocity[None] - velocity.mean()
+
+
+def _moves_at(velocities: Sequence[tuple[Array, Array]], frequency: float, length: float) -> bool:
+    """Return whether most of the energy of velocities (1, m) lies at a frequency [Hz]."""
+    own, share = dominant_frequency(velocities)
+    return abs(own - frequency) * length < 1.0 and share > DATA.unrepeated_share
+
+
+@dataclass(frozen=True)
+class _LineFit:
+    """A sine fitted to one record's torque balance: amplitude and its error, SI.
+
+    `before` and `after` are the residual's energies over `count` rows; `seconds` is the record's
+    length.
+    """
+
+    group: Group
+    seconds: float
+    amplitude: float
+    error: float
+    before: float
+    after: float
+    count: int
+
+
+def _fitted(
+    rig: Rig, conditioned: ConditionedRecord, fit: ExactFit, line: Line, chosen: bool
+) -> _LineFit | None:
+    """Fit a sine to what a model leaves in one record, None where the joint is locked.
+
+    `chosen`: leave out the rows that judge.
+    """
+    rows = model_rows(rig, fit.terms, conditioned).get(equation("torque", line[0]))
+    if rows is None or len(rows.time) < TRACE.least_rows:
+        return None
+    with_line = replace(conditioned, filtering=replace(conditioned.filtering, lines=(line,)))
+    left, sines = row_residual(rows, fit.beta), sines_at(with_line, rows)
+    rest = without_sines(left, sines)
+    waves = np.linalg.lstsq(sines, left, rcond=None)[0]
+    noise = float(np.sqrt(rest @ rest / max(len(rest) - len(WAVES), 1)))
+    size = math.sqrt(float(np.sum(sines**2)) / len(WAVES))
+    used = ~in_judging_block(rows.time) if chosen else np.ones(len(rest), dtype=bool)
+    return _LineFit(
+        conditioned.group, float(rows.time[-1] - rows.time[0]), float(np.hypot(*waves)),
+        noise / size, float(left[used] @ left[used]), float(rest[used] @ rest[used]),
+        int(used.sum()),
+    )  # fmt: skip
+
+
+def judged_line(
+    rig: Rig,
+    line: Line,
+    fit: ExactFit,
+    train: Sequence[ConditionedRecord],
+    holdout: Sequence[ConditionedRecord],
+    divided: Collection[Group],
+    noise: float,
+) -> JudgedEffect:
+    """Return a periodic torque with its gates, beside the effects of a fitted model.
+
+    `train` and `holdout` are the records, each repeat by itself; of those in `divided` the rows
+    that judge are left out. `noise` is the noise floor of the joint's torque balance in the
+    held-out records, SI.
+    """
+    joint, frequency = line
+    own = [f for c in train if (f := _fitted(rig, c, fit, line, False)) is not None]
+    unseen = [
+        f for c in holdout if (f := _fitted(rig, c, fit, line, c.group in divided)) is not None
+    ]
+    amplitude = _mean_amplitude(rig, joint, own)
+    before, after = sum(f.before for f in unseen), sum(f.after for f in unseen)
+    quiet = noise**2 * sum(f.count for f in unseen)
+    removed = 1.0 - max(0.0, after - quiet) / (before - quiet) if before > quiet else 0.0
+    tolerance = TRACE.invariance_tolerance * amplitude.value
+    differing = [
+        f"{plain(f.amplitude, 2)} in {f.group[1]}"
+        for f in own
+        if abs(f.amplitude - amplitude.value) > max(tolerance, TRACE.standard_errors * f.error)
+    ]
+    p = _probability(own)
+    limit, effect = torque_limit(rig, joint), PeriodicDisturbance(f"joint {joint + 1}")
+    size = f"{plain(amplitude.value, 2)} of the {plain(limit, 2)} that may be"
+    gates = (
+        Gate(
+            REMOVES,
+            removed >= TRACE.least_removed,
+            f"{100 * removed:.0f} % of the energy above noise",
+        ),
+        Gate(PHYSICAL, amplitude.value < limit, f"amplitude {size}"),
+        Gate(
+            INVARIANT,
+            not differing,
+            "; ".join(differing[:3]) or "the same amplitude in all records",
+        ),
+        Gate(SIGNIFICANT, p <= TRACE.p_limit, f"p = {p:.3g} over all frequencies"),
+        Gate(NO_RIVAL, True, "its phase does not follow the excitation, as effects of motion do"),
+    )
+    error = _frequency_error(own, amplitude.value)
+    scale = noise * math.sqrt(max(sum(f.count for f in unseen), 1))
+    return JudgedEffect(
+        effect.name,
+        effect.where,
+        {
+            f"T_amplitude_{joint + 1}": amplitude,
+            effect.shape_names()[0]: _estimate(frequency, "Hz", error),
+        },
+        p,
+        removed,
+        (),
+        gates,
+        effect.variable,
+        mechanism=effect.mechanism,
+        left_without=math.sqrt(before) / scale,
+        left_with=math.sqrt(after) / scale,
+        at=effect.where,
+    )
+
+
+def _mean_amplitude(rig: Rig, joint: int, own: Sequence[_LineFit]) -> Estimate:
+    """Return the mean amplitude, with what the records differ by beyond noise in its error."""
+    weight = np.array([1.0 / f.error**2 for f in own])
+    values = np.array([f.amplitude for f in own])
+    spread = float(values.std(ddof=1)) / math.sqrt(len(own))
+    unit = PeriodicDisturbance(f"joint {joint + 1}").coefficients(rig)[0].unit
+    mean = float(weight @ values / weight.sum())
+    return _estimate(mean, unit, max(spread, 1.0 / math.sqrt(float(weight.sum()))))
+
+
+def _probability(own: Sequence[_LineFit]) -> float:
+    """Return Fisher's probability that noise has as large a line at any frequency."""
+    share = 1.0 - sum(f.after for f in own) / max(sum(f.before for f in own), 1e-300)
+    count = sum(f.count for f in own) / 2
+    return float(min(1.0, count * (1.0 - share) ** (count - 1.0)))
+
+
+def _frequency_error(own: Sequence[_LineFit], amplitude: float) -> float:
+    """Return the standard error of the frequency [Hz] of sines of free phase in several records.
+
+    A record of T seconds gives sqrt(12) / (2 pi T) of its phase's error (Rife and Boorstyn, 1974).
+    """
+    known = sum((2 * math.pi * f.seconds * amplitude / f.error) ** 2 / 12.0 for f in own)
+    return 1.0 / math.sqrt(known)
+
+
+def _estimate(value: float, unit: str, std: float) -> Estimate:
+    half = TRACE.normal_quantile * std
+    return Estimate(value, unit, std, (value - half, value + half))
+
+
+def phase_notes(named: Sequence[JudgedEffect], lines: Sequence[Line]) -> list[str]:
+    """Say which named torques have a phase of their own in each record."""
+    of_joint = {f"joint {joint + 1}": (joint, f) for joint, f in lines}
+    found = [
+        of_joint[e.where]
+        for e in named
+        if e.name == PeriodicDisturbance.name and e.where in of_joint
+    ]
+    return [
+        f"{equation('torque', joint)}: the torque at {plain(f, 3)} Hz begins at another phase in "
+        "each record; it is fitted to each record by itself, and left out of the models and their "
+        "free runs"
+        for joint, f in found
+    ]

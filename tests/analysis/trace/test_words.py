@@ -1,0 +1,106 @@
+"""A trace's paragraph quotes what its named effects act on, each thing once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from analysis.simulation.model import Estimate, nominal_model
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.judge.gates import NO_RIVAL, passes_gates, tied_in_held_out
+from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
+from analysis.trace.search.refinement import ExactFit
+from analysis.trace.words import sentence
+from rig.model.rig import Rig
+
+FLOOR = {"flow_cap_1": 3.5e-8, "torque_2": 0.14}
+BEFORE = {"flow_cap_1": 3.8e-8, "torque_2": 0.15}
+AFTER = {"flow_cap_1": 3.8e-8, "torque_2": 0.13}
+
+
+def effect(name: str, variable: str, numbers: dict[str, tuple[float, float, str]]) -> JudgedEffect:
+    parameters = {
+        n: Estimate(v, unit, half / 1.96, (v - half, v + half))
+        for n, (v, half, unit) in numbers.items()
+    }
+    return JudgedEffect(name, "joint 2", parameters, 0.005, 1.0, (), (), variable)
+
+
+def told(
+    rig: Rig,
+    effects: tuple[JudgedEffect, ...],
+    before: dict[str, float] = BEFORE,
+    after: dict[str, float] = AFTER,
+    notes: tuple[str, ...] = (),
+) -> str:
+    model = nominal_model(rig, tuple(map(Used, baseline_of(rig))))
+    fit = ExactFit((), {}, np.zeros(0), np.zeros((0, 0)))
+    return sentence(
+        Trace(
+            EXPLAINED, effects, FLOOR, before, after, {}, {}, model, model, 0.0, (), None, (), fit,
+            fit, notes,
+        )
+    )  # fmt: skip
+
+
+SPRING = effect("joint_spring", "the joint's angle", {"k_spring_2": (2.2, 0.04, "N*m/rad")})
+
+
+def test_the_quoted_error_is_of_an_equation_that_the_effect_lowers(rig: Rig) -> None:
+    """Another equation stood farther above its noise, before and after alike."""
+    text = told(rig, (SPRING,))
+    assert "Held-out error of torque_2" in text
+    assert "flow_cap_1" not in text
+
+
+def test_a_variable_that_two_effects_share_is_said_once(rig: Rig) -> None:
+    sign = "the sign of the piston's velocity"
+    pair = tuple(effect("coulomb_friction", sign, {f"Fc{i}": (9.0, 1.0, "N")}) for i in (1, 2))
+    text = told(rig, (*pair, SPRING))
+    assert text.startswith(f"The residual follows {sign} and the joint's angle: ")
+    assert told(rig, pair).startswith(f"The residual follows {sign}: ")
+
+
+def test_a_number_less_certain_than_its_size_is_not_determined(rig: Rig) -> None:
+    line = effect(
+        "return_line", "the flow given back to the tank",
+        {"dp_return": (0.7e7, 2.3e7, "Pa"), "return_laminar": (0.4, 0.1, "")},
+    )  # fmt: skip
+    note = "return_line: dp_return is the drop at the pump's whole flow; in these records 0.56 MPa"
+    text = told(rig, (line,), notes=(note, "torque_1: another note"))
+    assert "dp_return not determined: 0.7e7 ± 2.3e7 Pa, return_laminar = 0.40 ± 0.10" in text
+    assert "dp_return is the drop at the pump's whole flow; in these records 0.56 MPa." in text
+    assert "another note" not in text
+
+
+def test_a_small_part_of_a_large_number_is_determined(rig: Rig) -> None:
+    wave = {"T_sin_2": (1.5, 0.1, "N*m"), "T_cos_2": (0.01, 0.1, "N*m")}
+    text = told(rig, (effect("periodic_disturbance", "time", wave),))
+    assert "not determined" not in text
+
+
+def test_an_error_above_the_noise_is_said_to_be_within_the_form(rig: Rig) -> None:
+    after = AFTER | {"torque_2": 3.3 * FLOOR["torque_2"]}
+    text = told(rig, (SPRING,), BEFORE | {"torque_2": 60 * FLOOR["torque_2"]}, after)
+    assert "left in torque_2, 3.3 times the noise floor, is 0.27 % of the energy" in text
+    assert "may miss 10 %" in text
+    assert "may miss" not in told(rig, (SPRING,))
+
+
+def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> None:
+    """Held out, the delay leaves as much as the gain: only what was fitted tells them apart."""
+    near, far = (
+        Rival("channel_delay", "joint 1", ratio, 1.4, False, "joint 1 piston")
+        for ratio in (1.0, 1.5)
+    )
+    gain = replace(SPRING, gates=(Gate(NO_RIVAL, True, "none"),))
+    open_one = tied_in_held_out(replace(gain, rivals=(far, near)))
+    assert [r.tied for r in open_one.rivals] == [True, False]
+    assert not open_one.named
+    assert passes_gates(open_one)  # it fits, but is not the only one that does
+    assert "cannot be separated from channel_delay" in open_one.gates[-1].detail
+    assert "1.40 times the training rms" in open_one.gates[-1].detail
+    clear = replace(gain, rivals=(far,))
+    assert tied_in_held_out(clear) is clear
