@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
-    """State, for each family with parameters lost, what is determined and what would help."""
+    """State, for each family with undetermined parameters, what is determined, what would help."""
     out = []
     for family, solution in solutions.items():
         if not solution.unidentifiable or not len(solution.triangle):

@@ -71,7 +71,7 @@ def spans_of(record: Record) -> dict[str, tuple[float, float]]:
     }
 
 
-def refuse_dead_channels(
+def refuse_constant_channels(
     rig: Rig, record: Record | RecordHead, spans: Mapping[str, tuple[float, float]] | None = None
 ) -> None:
     """Raise InputError for an excited joint that never moved or a channel that stood still.
@@ -110,11 +110,11 @@ def refuse_dead_channels(
             )
 
 
-def refuse_dead_records(rig: Rig, runs: Iterable[Run]) -> None:
-    """Raise InputError for a record of the runs with a dead channel (`refuse_dead_channels`)."""
+def refuse_constant_records(rig: Rig, runs: Iterable[Run]) -> None:
+    """Raise InputError for a constant channel in a record (`refuse_constant_channels`)."""
     for run in runs:
         for record in run.records:
-            refuse_dead_channels(rig, record)
+            refuse_constant_channels(rig, record)
 
 
 def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
@@ -175,7 +175,7 @@ def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
         return Check(
             "repeats",
             False,
-            f"only one repeat of {' '.join(single)}: scatter between repeats cannot be had; the "
+            f"only one repeat of {' '.join(single)}: the scatter between repeats is unknown; the "
             "intervals come from segments within the record and may be too narrow",
         )
     return Check("repeats", True, f"{min(strata.values())} or more repeats of every step")

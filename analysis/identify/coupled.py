@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 _UNREFINED = Check(
     "estimator",
     True,
-    "plain: least squares with intervals from the scatter between repeats alone; what the other "
-    "estimators refine (every row in memory, parameters linear in them) was not applied",
+    "plain: least squares with intervals from the scatter between repeats alone; the other "
+    "estimators, which need every row in memory and linear parameters, were not applied",
 )
 
 

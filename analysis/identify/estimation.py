@@ -27,7 +27,7 @@ from analysis.identify.estimators.instruments import (
     steps_without_instruments,
 )
 from analysis.identify.estimators.robust import robust
-from analysis.identify.estimators.shifts import certain_shift, including, shifts_of
+from analysis.identify.estimators.shifts import including, shifts_of, significant_shift
 from analysis.identify.estimators.statements import (
     noise_statement,
     nuisance_statement,
@@ -141,7 +141,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         beta, total, fit = fits[p.family]
         shift = np.zeros(p.parameters)
         if estimator == "ls" and tests:
-            shift = certain_shift(tests[p.family], p)
+            shift = significant_shift(tests[p.family], p)
         total = including(total, shift)
         new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
@@ -168,7 +168,7 @@ def _bootstrap_ends(
 def _prepare(
     job: EstimationJob, solutions: Mapping[str, Solution]
 ) -> tuple[list[FamilyBlocks], list[Check]]:
-    """Build rows with the nuisances; one that the data contradict is left out, and said."""
+    """Build rows with the nuisance columns, without one that the data contradict (reported)."""
     values: dict[str, float] = {}
     for s in solutions.values():
         for name, v in zip(s.names, s.value, strict=True):

@@ -1,4 +1,4 @@
-"""Rows of the regression: what every term says about every equation of one record.
+"""Rows of the regression: every term's columns in every equation of one record.
 
 Used are the torque rows and the chamber-flow rows of the excited joints only: a locked joint's
 contact torque is unknown, and its valve is shut. Rows are built point by point from the filtered
@@ -38,9 +38,9 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Filtering:
-    """The filters of one record: `channels` before, `rows` (or none) after.
+    """The filters of one record: `channels` before, `rows` (or none) after the rows are built.
 
-    The torque balances of joints `in_motion` (0-based) do not count samples at which these rest.
+    Torque balances of joints `in_motion` (0-based) give no weight to samples at rest.
     """
 
     channels: Smoother
@@ -53,8 +53,8 @@ class Filtering:
 class Rows:
     """Rows of one equation of one record: matrix (m, k), rhs (m,), time [s] of each row (m,).
 
-    `names` are the parameters of the columns; `masked` rows were dropped because a sample under
-    the filter lay outside the model, was clipped or was lost.
+    `names` are the parameters of the columns; `masked` rows were dropped because a sample within
+    reach of the filter lay outside the model, was clipped or was lost.
     """
 
     equation: str
@@ -66,7 +66,7 @@ class Rows:
 
 
 def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
-    """Return the places in either of the instants that two sets of rows have in common."""
+    """Return the indices, in either set of rows, of the instants that both have."""
     if np.array_equal(one.time, other.time):  # nearly always
         at = np.arange(len(one.time))
         return at, at
@@ -75,7 +75,7 @@ def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
 
 
 def default_filtering(record: Record) -> Filtering:
-    """Return the filters that the bias study chose, fitted to the record's excitation."""
+    """Return the default filters, adapted to the record's excitation."""
     rate = record.sample_rate
     cutoff = (
         REGRESSION.row_cutoff_electric
@@ -94,12 +94,12 @@ def lines_cutoff(record: Record) -> float:
 
 
 def paper_filtering(record: Record) -> Filtering:
-    """Return the paper's: a 20-sample average (zero-phase here), differences, every row used."""
+    """Return the paper's filters: 20-sample average (zero-phase here), differences, every row."""
     return Filtering(moving_average(record.sample_rate), None)
 
 
 def butterworth_filtering(record: Record) -> Filtering:
-    """Return a zero-phase Butterworth on the channels in place of the windowed sinc."""
+    """Return filters with a zero-phase Butterworth on the channels."""
     chosen = default_filtering(record)
     cutoff = min(80.0, 0.2 * record.sample_rate)
     return replace(chosen, channels=butterworth(record.sample_rate, cutoff))
@@ -144,7 +144,7 @@ def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ..
 
 
 def prepared(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
-    """Return the signals as the terms' columns see them, each term having prepared them in turn."""
+    """Return the signals as the terms' columns see them, after every term's preparation in turn."""
     for used in terms:
         signals = used.term.prepare(rig, signals, used.shape)
     return signals
@@ -174,9 +174,9 @@ def record_rows(
 
 @dataclass(frozen=True)
 class TermPart:
-    """What a term puts into one family's rows of the excited joints, by equation.
+    """A term's filtered columns (m,) by equation and parameter, before rows are dropped.
 
-    Filtered columns (m,) by parameter, before rows are dropped, and where (n,) the equation holds.
+    `valid` (n,) states, by equation, where the term's equation holds.
     """
 
     columns: dict[str, dict[str, Array]]
@@ -187,7 +187,7 @@ class TermPart:
 class RightPart:
     """An equation's filtered right side and its instants (m,) [s], before rows are dropped.
 
-    And where (n,) its sensors are right, and where a sample never arrived.
+    `sensors` (n,) states where its sensors are valid, `lost` (n,) where a sample never arrived.
     """
 
     side: Array
@@ -218,7 +218,7 @@ def term_part(
 
 
 def weighted(columns: Mapping[str, Array], signals: Signals, name: str) -> Mapping[str, Array]:
-    """Return an equation's columns (n,) times what each sample counts in it."""
+    """Return an equation's columns (n,) multiplied by the weight of each sample."""
     kind, number = name.rsplit("_", 1)
     if signals.weight is None or kind != "torque":
         return columns
@@ -240,7 +240,7 @@ def right_parts(
         side = low_passed(weighted({"": sides[name]}, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
-        if family == "fluid":  # below zero the oil cavitates, and no balance of flows holds
+        if family == "fluid":  # below zero the oil cavitates, and the flow balance does not hold
             sensors &= (signals.p_cap if "cap" in name else signals.p_rod)[:, i] >= 0.0
         out[name] = RightPart(side, time, sensors, _lost(signals, joints))
     return out
@@ -297,19 +297,19 @@ def instants(time: Array, filtering: Filtering, count: int) -> Array:
 
 
 def _inside(x: NDArray[Any], filtering: Filtering) -> NDArray[Any]:
-    """Return samples (n, ...) without those that the channel filter's edges have spoiled."""
+    """Return samples (n, ...) without those affected by the channel filter's edges."""
     edges = filtering.channels.reach
     return x[edges : len(x) - edges]
 
 
 def _dropped(bad: Mask, lost: Mask, filtering: Filtering, count: int) -> Mask:
-    """Return which filtered rows (m,) a masked sample is under."""
+    """Return which filtered rows (m,) have a masked sample within the filter's reach."""
     bad, lost = _inside(bad, filtering), _inside(lost, filtering)
     if filtering.rows is None:
         return np.asarray((bad | lost)[:: filtering.step])
     dropped = np.zeros(count, dtype=bool)
     weights = np.abs(filtering.rows.taps[0]) / np.abs(filtering.rows.taps[0]).sum()
-    # What stands for a lost sample is made up: not even the filter's tails may touch it.
+    # A lost sample is interpolated: not even the filter's tails may include it.
     for mask, taps, limit in (
         (bad, weights, REGRESSION.masked_share),
         (lost, np.ones(len(weights)), 0.5),

@@ -68,7 +68,7 @@ def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
-    """Return V_groups - V_noise (k, k), positive, zero for parameters where it is not visible."""
+    """Return V_groups - V_noise (k, k), positive; zero for parameters without significance."""
     _, score, _ = pieces.grouped(pieces.part)
     u = score @ inverse.T
     noise = stratified(np.column_stack((pieces.stratum, pieces.part)), pieces.score @ inverse.T)
