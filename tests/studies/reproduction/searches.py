@@ -65,13 +65,10 @@ def _lost_table(found: Mapping[str, Identification]) -> Table:
     def row(title: str, *cells: str) -> list[str]:
         return [title, *cells]
 
-    causes = list(next(iter(data.values()))["lost"])
+    fates = list(next(iter(data.values()))["lost"])
     rows = [
         row("candidates simulated", *(str(d["evaluations"]) for d in data.values())),
-        *(
-            row(f"lost: {cause}", *(str(d["lost"][cause]) for d in data.values()))
-            for cause in causes
-        ),
+        *(row(f"lost: {fate}", *(str(d["lost"][fate]) for d in data.values())) for fate in fates),
         row("lost, share", *(f"{share(d):.1f} %" for d in data.values())),
         row(
             "lost in the first generation",
