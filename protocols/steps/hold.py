@@ -1,4 +1,4 @@
-"""Standing still: what leaks and creeps shows."""
+"""Keeping still, to record leakage and creep."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from rig.model.quantity import Time
 
 
 class HoldStep(StepKind):
-    """Bring joints to their places, close the valves, and let time pass.
+    """Bring joints to their places, close the valves, and wait.
 
-    With a name a record of the whole time is taken. Without locks of its own or of an earlier
-    `lock` step nothing is moved before: every valve just stays closed.
+    With a name a record of the whole time is taken. Without locks, of this or of an earlier `lock`
+    step, nothing moves: every valve stays closed.
     """
 
     key: ClassVar[str] = "hold"
@@ -45,5 +45,5 @@ class HoldStep(StepKind):
         return PlannedStep(self, title, seconds, locks=locks, records=records)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Stand still."""
+        """Keep still."""
         actions.hold(planned, planned.locks, self.hold)

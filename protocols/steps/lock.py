@@ -12,7 +12,7 @@ from protocols.steps.parts import Lock, require_one_job
 
 
 class LockStep(StepKind):
-    """Prove that joints lock, and lock them in all steps that follow and do not name them."""
+    """Prove that joints lock, and lock them in all later steps that do not name them."""
 
     key: ClassVar[str] = "lock"
     rank: ClassVar[int] = 2  # other kinds may have locks too
@@ -32,5 +32,5 @@ class LockStep(StepKind):
         return PlannedStep(self, f"lock {title}", (MOVE_SECONDS + 2.0) * len(locks), locks=locks)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Lock them once, now."""
+        """Lock them once."""
         actions.lock(planned, planned.locks)
