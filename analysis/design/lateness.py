@@ -84,7 +84,7 @@ def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Recor
         for made in resampler.add(float(at), row, unmarked):
             if made.tick < n:
                 out[made.tick] = made.values
-    # The driver's stream goes on before and after a record; only the twin's ends here.
+    # The driver's stream continues before and after a record; the twin's ends here.
     out[:1], out[-1:] = values[:1], values[-1:]
     return replace(record, channels={name: out[:, k] for k, name in enumerate(names)})
 

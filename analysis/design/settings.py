@@ -11,7 +11,7 @@ class DesignSettings:
     """Margins of a design on the twin, moves of the search, start of the twin."""
 
     # Limits: share of the supply kept from tank and supply pressure, share of a closed lock's
-    # tolerance used (beyond half of it the engine closes it anew).
+    # tolerance used (beyond half of it the engine closes it again).
     pressure_margin: float = 0.03
     lock_share: float = 0.6
     # Peaks are clipped at this share of the worst signal's in the search for phases.

@@ -1,6 +1,6 @@
 """One record reduced to the quantities that an identification needs: triangles, counts, noise.
 
-A reduction is a few kilobytes whatever the record's length. It is made where the samples are (in
+A reduction has a few kilobytes for any length of the record. It is made where the samples are (in
 this process, in another, on a worker of a cluster) and only it is sent on;
 `analysis.identify.coupled` joins the reductions of all records. Every record is kept in SEGMENTS
 parts of its duration: a step of one record has no repeats to compare, and compares its parts.

@@ -1,8 +1,8 @@
 """Identifiability of a planned experiment: the regressor of its motions on the twin.
 
-A step's motion gives the same rows that its record would (`analysis.regression.rows`), without
-sensor noise: rank and condition number of all steps' rows stacked state what can be identified. The
-row filter is omitted: there is no noise to remove, and it does not change the rank.
+A step's motion results in the same rows as its record (`analysis.regression.rows`), without sensor
+noise: rank and condition number of all steps' rows stacked state what can be identified. The row
+filter is omitted: there is no noise to remove, and it does not change the rank.
 """
 
 from __future__ import annotations

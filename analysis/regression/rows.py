@@ -235,7 +235,7 @@ def right_parts(
         if name not in sides:
             continue
         i = int(name.rsplit("_", 1)[1]) - 1
-        # Inertia couples: a clipped piston of any joint spoils every torque row.
+        # Inertia couples the joints: a clipped piston of any joint affects every torque row.
         joints = slice(None) if family == "mechanical" else slice(i, i + 1)
         side = low_passed(weighted({"": sides[name]}, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))

@@ -328,7 +328,7 @@ def state_at(signals: Signals, sample: int) -> State:
     )
 
 
-def corrected_for_sensors(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
+def sensor_corrected(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
     """Return signals corrected for the terms' sensor effects; other terms prepare in simulation."""
     for used in terms:
         if not used.term.prepares:

@@ -25,9 +25,9 @@ from analysis.simulation.simulate import (
     Simulation,
     State,
     compiled,
-    corrected_for_sensors,
     drive_of,
     hidden_paths,
+    sensor_corrected,
     simulate,
     state_at,
 )
@@ -97,7 +97,7 @@ def validate_record(
     """
     smoother = default_filtering(record).channels
     here = arrived(rig, record)
-    signals = corrected_for_sensors(rig, model.terms, condition(rig, record, smoother, moving))
+    signals = sensor_corrected(rig, model.terms, condition(rig, record, smoother, moving))
     # Sensors are corrected by the model's sensor effects before anything is compared.
     channels = aligned_channels(rig, record)
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)

@@ -2,7 +2,7 @@
 
 A pool maps a plain function (importable by name, picklable, no state of its own) over items and
 yields the results in the items' order; exceptions of the function are raised by `map`. Use it as a
-context manager: processes and connections end with it, whatever happens inside.
+context manager: processes and connections end with it in any case.
 
     with Processes(workers) as pool:
         for result in pool.map(one_study, seeds): ...
@@ -41,7 +41,7 @@ class Pool(Protocol):
 
     @property
     def workers(self) -> int:
-        """How many items are worked on at once."""
+        """Number of items worked on at once."""
 
     def map(
         self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None

@@ -64,7 +64,7 @@ def shifts_of(
         half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)
         for i, name in enumerate(p.names[: p.parameters]):
             size = abs(float(test.difference[i]))
-            # The rows hold 1/b: what makes 1/b larger makes b smaller.
+            # The rows contain 1/b: a larger 1/b is a smaller b.
             sign = -1.0 if name == "b" else 1.0
             shifts.append(
                 Shift(

@@ -28,13 +28,7 @@ from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
 from analysis.simulation.model import Model, model_of
-from analysis.simulation.simulate import (
-    Effort,
-    compiled,
-    corrected_for_sensors,
-    drive_of,
-    hidden_paths,
-)
+from analysis.simulation.simulate import Effort, compiled, drive_of, hidden_paths, sensor_corrected
 from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -45,7 +39,7 @@ Array = NDArray[np.float64]
 
 
 class Windows:
-    """The data of one fit by windows, and the their simulations.
+    """The data of one fit by windows, and their simulations.
 
     `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms. With
     `free` only those named there are free. At most `seconds` of data are used.
@@ -80,7 +74,7 @@ class Windows:
         strata = {s: k for k, s in enumerate(sorted({one.group for one in records}))}
         most = max(1, round(self.seconds / IDENTIFY.window) // len(records))
         for one in records:
-            record, signals = one.record, corrected_for_sensors(self.rig, self.terms, one.signals)
+            record, signals = one.record, sensor_corrected(self.rig, self.terms, one.signals)
             drive = drive_of(signals)
             kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
             self.sources.append(WindowSource(signals, drive.inputs, drive.locked, kelvin))
@@ -200,8 +194,8 @@ class Windows:
             window = self.placed[k]
             return self._window(window, starts[k], sigma[window.stratum], ready[window.record])
 
-        # A record's first window shows which parameters have no influence in it; the others then
-        # run in parallel.
+        # A record's first window shows which parameters have no influence in it; its other windows
+        # then run in parallel.
         reductions = {}
         for k, window in enumerate(self.placed):
             if window.record not in self._without_influence:
