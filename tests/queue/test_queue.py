@@ -210,7 +210,7 @@ def test_a_retried_item_keeps_its_place_and_its_first_run(night: Night) -> None:
     night.add("done")
     night.run()
     with QueueStore(night.path) as store:
-        with pytest.raises(InputError, match="is the run folder of item 1 already"):
+        with pytest.raises(InputError, match="is already the run folder of item 1"):
             store.add(store.item(1).job, 0, {})
         store.retry(1, "me")
         assert [item.id for item in store.items()] == [1, 2]
@@ -232,7 +232,7 @@ def test_one_runner_at_a_time_and_a_dead_one_holds_nothing(night: Night) -> None
     child.wait(LONG)
     (night.folder / "queue.sqlite.d" / "runner.lock").write_text("4194000\n")
     night.run()
-    assert "the runner before this, process 4194000, ended without saying so" in night.said
+    assert "the previous runner, process 4194000, was killed" in night.said
 
 
 @pytest.mark.parametrize(

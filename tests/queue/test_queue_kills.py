@@ -99,5 +99,5 @@ def test_killed_at_each_of_its_steps_the_next_runner_carries_on(
         assert night.starts(1) == 0
     else:
         assert states[0] == "done", night.item(1).reason
-        assert "no runner saw its end" in night.item(1).reason
+        assert "ended while no runner was watching" in night.item(1).reason
     assert night.events(1).count("running") <= 1
