@@ -15,7 +15,7 @@ class DeviceFault(Fault):
 
     @property
     def place(self) -> str:
-        """Where it is."""
+        """Its place, as text."""
         return "device"
 
 

@@ -35,7 +35,7 @@ class Release(Enum):
 
 
 class End(Enum):
-    """Which part of the link a piece ends."""
+    """The part of the link that a piece ends."""
 
     NONE = auto()
     WAY = auto()

@@ -50,7 +50,7 @@ class LineLink(FaultyLink):
 
     @property
     def endpoint(self) -> str:
-        """Where the host reaches the device through this link."""
+        """The host's endpoint of this link."""
         return self._endpoint
 
     def use(self, faults: Sequence[WireFault]) -> None:

@@ -69,7 +69,7 @@ class TcpLink(FaultyLink):
 
     @property
     def endpoint(self) -> str:
-        """Where the host reaches the device through this link."""
+        """The host's endpoint of this link."""
         return self._endpoint
 
     def _step(self) -> None:

@@ -61,7 +61,7 @@ class RunControl:
         """Accept a command; return None, or in one line why it is refused."""
         state = self._machine.state
         if state in (EngineState.SAFE, EngineState.TRIPPED):
-            return f"the run is over ({state}); nothing can be asked of it"
+            return f"the run is over ({state}); it accepts no command"
         handler = {
             "pause": self._pause,
             "resume": self._resume,

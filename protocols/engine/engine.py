@@ -38,8 +38,8 @@ def run(
 
     `on_phase` is called with every phase: "place", "lock", "warm-up", "centre", "record", "stop",
     "done" and those of the other steps; `desk` connects people and estimates. Raises
-    ProtocolAborted (or its LockFailed) if the bench does not do what a step needs, and whatever the
-    bench raises; in every case the outputs were put to zero first.
+    ProtocolAborted (or its LockFailed) if the bench fails a requirement of a step, and the bench's
+    own exceptions; in every case the outputs were put to zero first.
     """
     runner = PlanRunner(plan, rig, bench, on_phase or _nobody, desk or Desk())
     machine = runner.machine

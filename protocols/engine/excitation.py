@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from protocols.engine.excited_joint import ExcitedJoint
-from protocols.engine.locking import Hold, JointLock, lock, lock_movement, look, move
+from protocols.engine.locking import Hold, JointLock, lock, lock_movement, move, placement
 from protocols.engine.playback import Playback
 from protocols.engine.session import Session
 from protocols.engine.settings import ENGINE
@@ -221,7 +221,7 @@ class ExcitationRun:
             if held.at != CLOSED:
                 continue
             first = self.session.now - self.step.period
-            off = look(self.session, held.joint, first, self.session.now).piston - held.piston
+            off = placement(self.session, held.joint, first, self.session.now).piston - held.piston
             if abs(off) <= ENGINE.relock_share * held.tolerance:
                 continue
             self.report_phase(

@@ -35,7 +35,7 @@ class PlacementReading:
     command: float
 
 
-def look(session: Session, joint: int, first: int, last: int) -> PlacementReading:
+def placement(session: Session, joint: int, first: int, last: int) -> PlacementReading:
     """Return the mean motion of joint `joint` (0-based) over ticks [first, last).
 
     Speed is the difference of the means of the two halves over half the time: unlike the difference
@@ -74,12 +74,12 @@ def move(
     began, still_since = session.now, session.now
     while True:
         first = session.wait(ENGINE.look_seconds)
-        seen = {j: look(session, j, first, session.now) for j in targets}
+        seen = {j: placement(session, j, first, session.now) for j in targets}
         late = {j for j in targets if not _in_place(seen[j], targets[j], tolerance)}
         if late:
             still_since = session.now
         elif session.now - still_since >= settle * session.rate:
-            return {j: look(session, j, still_since, session.now).command for j in targets}
+            return {j: placement(session, j, still_since, session.now).command for j in targets}
         # Only the error of a piston at rest is due to a missing command; others are still moving.
         stuck = {j for j in late if abs(seen[j].speed) < ENGINE.rocking_speed}
         for j in stuck:
@@ -140,7 +140,7 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     session.apply({plan.joint: OutputLaw(0.0, push, place.position_gain, plan.piston, place.limit)})
     began, still_since = session.now, session.now
     while session.now - still_since < hold.settle * session.rate:
-        seen = look(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
+        seen = placement(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
         if abs(seen.piston - plan.piston) > plan.tolerance or abs(seen.speed) > ENGINE.still_speed:
             still_since = session.now
         if session.now - began > place.timeout * session.rate:
@@ -154,7 +154,7 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     law = OutputLaw(bias=push, limit=abs(push))
     session.apply({plan.joint: law})
     first = session.wait(hold.settle)
-    stands = look(session, plan.joint, first, session.now).piston
+    stands = placement(session, plan.joint, first, session.now).piston
     held = JointLock(plan.joint, plan.at, stands, law, plan.tolerance)
     verify(session, held, hold.step, first, session.now)
     log.info("%s: joint %d held at %s, %.2f mm", hold.step, plan.joint + 1, plan.at, 1e3 * stands)
@@ -195,7 +195,7 @@ def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> Placemen
     session.apply({joint: law})
     session.wait(hold.settle)
     first = session.wait(hold.settle)
-    return look(session, joint, first, session.now)
+    return placement(session, joint, first, session.now)
 
 
 def _near(seen: PlacementReading, plan: LockPlan) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from protocols.engine.desk import Desk
 from protocols.engine.excitation import ExcitationRun
-from protocols.engine.locking import Hold, lock, look, move
+from protocols.engine.locking import Hold, lock, move, placement
 from protocols.engine.session import BenchSession, Session
 from protocols.engine.settings import ENGINE
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded, StateMachine
@@ -182,8 +182,8 @@ class PlanRunner:
             self.session.until(first + ticks)
             span = min(round(ENGINE.look_seconds * self.session.rate), ticks // 2)
             for j in range(self.session.joints):
-                began = look(self.session, j, first, first + span).piston
-                ended = look(self.session, j, first + ticks - span, first + ticks).piston
+                began = placement(self.session, j, first, first + span).piston
+                ended = placement(self.session, j, first + ticks - span, first + ticks).piston
                 record.note(**{f"creep_m_{j + 1}": ended - began})
         self._complete[name] = repeat
         self.records += 1

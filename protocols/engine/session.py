@@ -156,7 +156,7 @@ class Session:
         column = self._columns[name]
         begin, end = max(first, self.now - len(self._ring)), min(last, self.now)
         if (begin, end) == (first, last):
-            return self._ring[self._places(first, last), column].copy()  # for the ring goes on
+            return self._ring[self._places(first, last), column].copy()  # the ring is overwritten
         values = np.full(last - first, np.nan)
         if begin < end:
             values[begin - first : end - first] = self._ring[self._places(begin, end), column]

@@ -33,7 +33,7 @@ class OnTrip(ProtocolPart):
 
     mark: str = Field(default="", description="written into the run's log")
     record: Time = Field(
-        default=2.0, ge=2.0, le=60.0, description="goes on being recorded, outputs at zero"
+        default=2.0, ge=2.0, le=60.0, description="time of further recording, outputs at zero"
     )
 
 
@@ -97,7 +97,7 @@ class Protocol(ProtocolPart):
         return steps
 
     @model_validator(mode="after")
-    def _every_joint_has_a_job(self, info: ValidationInfo) -> Self:
+    def _every_joint_has_a_role(self, info: ValidationInfo) -> Self:
         if info.context and info.context.get(INCOMPLETE):
             return self  # a lock may be in a step that could not be read
         wanted = set(range(1, self.joints + 1))

@@ -9,7 +9,7 @@ import yaml
 
 from protocols.files.schema import Protocol
 
-# Unit written beside each quantity, and how many of it make an SI unit.
+# Unit written after each quantity, and its number per SI unit.
 _UNITS: Mapping[str, tuple[str, float]] = {
     "position_gain": ("V/m", 1.0),
     "limit": ("V", 1.0),

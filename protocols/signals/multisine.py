@@ -91,7 +91,7 @@ class Multisine(AmplitudeSignal):
 
         A_k follows f^-tilt and is scaled to the asked rms or peak. Of `draws` sets of phases the
         one is kept whose crest factors of command and of piston motion have the lowest product:
-        stroke and voltage both limit the amplitude. The same seed gives the same samples. Raises
+        stroke and voltage both limit the amplitude. Equal seeds result in equal samples. Raises
         ValueError where the period is not a whole number of samples or a line is beyond Nyquist.
         """
         n = base_period(self.base_frequency, sample_rate)

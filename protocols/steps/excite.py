@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 from pydantic import Field, model_validator
 
 from protocols.steps.base import NAME, Actions, PlannedStep, Planner, StepKind
-from protocols.steps.parts import Excite, Lock, require_one_job
+from protocols.steps.parts import Excite, Lock, require_one_role
 from rig.model.quantity import Time
 
 MAX_REPEATS = 1000
@@ -40,8 +40,8 @@ class Step(StepKind):
         return (*(part.joint for part in self.lock), *(part.joint for part in self.excite))
 
     @model_validator(mode="after")
-    def _one_job_per_joint(self) -> Self:
-        require_one_job(self.name, self.joints)
+    def _one_role_per_joint(self) -> Self:
+        require_one_role(self.name, self.joints)
         return self
 
     def plan(self, planner: Planner) -> PlannedStep:

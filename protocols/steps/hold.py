@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 from protocols.steps.excite import MOVE_SECONDS
-from protocols.steps.parts import CLOSED, Lock, require_one_job
+from protocols.steps.parts import CLOSED, Lock, require_one_role
 from rig.model.quantity import Time
 
 
@@ -26,7 +26,7 @@ class HoldStep(StepKind):
 
     @model_validator(mode="after")
     def _valves_are_closed(self) -> Self:
-        require_one_job(self.name or self.key, tuple(part.joint for part in self.lock))
+        require_one_role(self.name or self.key, tuple(part.joint for part in self.lock))
         pushed = [part.joint for part in self.lock if part.at != CLOSED]
         if pushed:
             raise ValueError(

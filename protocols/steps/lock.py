@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 from protocols.steps.excite import MOVE_SECONDS
-from protocols.steps.parts import Lock, require_one_job
+from protocols.steps.parts import Lock, require_one_role
 
 
 class LockStep(StepKind):
@@ -20,8 +20,8 @@ class LockStep(StepKind):
     lock: tuple[Lock, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _one_job_per_joint(self) -> Self:
-        require_one_job(self.name or self.key, tuple(part.joint for part in self.lock))
+    def _one_role_per_joint(self) -> Self:
+        require_one_role(self.name or self.key, tuple(part.joint for part in self.lock))
         return self
 
     def plan(self, planner: Planner) -> PlannedStep:

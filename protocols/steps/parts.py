@@ -77,7 +77,7 @@ class Excite(ProtocolPart):
     centring: Centring = Centring()
 
 
-def require_one_job(name: str, joints: tuple[int, ...]) -> None:
+def require_one_role(name: str, joints: tuple[int, ...]) -> None:
     """Raise ValueError where a joint is named twice by one step."""
     for joint in joints:
         if joints.count(joint) > 1:

@@ -31,7 +31,7 @@ class PromptStep(StepKind):
     prompt: str = Field(min_length=1, max_length=500)
     answers: tuple[Word, ...] = Field(default=("yes", "no"), min_length=1)
     default: Word | None = Field(default=None, description="counts after the time-out, unattended")
-    timeout: Time = Field(gt=0, description="for an answer where nobody attends")
+    timeout: Time = Field(gt=0, description="for an answer when unattended")
     abort_on: tuple[Word, ...] = Field(default=("no",), description="answers that end the run")
 
     @model_validator(mode="after")

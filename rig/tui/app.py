@@ -224,8 +224,8 @@ class Monitor(ByHand, App[int]):
     def early_key(self, event: events.Key) -> None:
         """Stop a live run from the thread that reads the terminal, before any drawing."""
         frame, dialog = self.link.frame, self.dialog
-        lives = frame.endpoint is not None and not frame.over
-        if lives and (event.key == "space" or (event.key == "s" and dialog is None)):
+        run_is_live = frame.endpoint is not None and not frame.over
+        if run_is_live and (event.key == "space" or (event.key == "s" and dialog is None)):
             self._stopped_by = event
             self.act_stop()
 
@@ -235,11 +235,11 @@ class Monitor(ByHand, App[int]):
         event.prevent_default()
         key = event.key
         typing = self.dialog is not None and self.dialog.text is not None
-        lives = self.link.frame.endpoint is not None and not self.link.frame.over
+        run_is_live = self.link.frame.endpoint is not None and not self.link.frame.over
         choosing = self.link.frame.stage is LinkStage.CHOOSING
         if event is self._stopped_by:
             self._stopped_by = None
-        elif key == "space" and (lives or choosing or not typing):
+        elif key == "space" and (run_is_live or choosing or not typing):
             self.act_stop()
         elif key == "escape":
             self._escape()

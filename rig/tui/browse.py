@@ -54,7 +54,7 @@ class BrowserState:
 
     @property
     def lines(self) -> int:
-        """How many lines the open tab has."""
+        """Number of lines of the open tab."""
         return len((self.protocols, self.runs, self.queue)[self.tab])
 
 

@@ -30,7 +30,7 @@ OF_A_RECORDED_RUN: Final = ("run log", "run trace")  # opened from the page of r
 
 @dataclass(frozen=True)
 class ScreenStyle:
-    """What is chosen: page, joint, channel, the marked line, span of the plots, filters."""
+    """The operator's choices: page, joint, channel, marked line, span of the plots, filters."""
 
     page: str = "overview"
     joint: int = 1

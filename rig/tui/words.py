@@ -76,7 +76,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class Margin:
-    """How far a channel is from a limit, as a share of the width of its band, and in SI."""
+    """Distance of a channel from a limit, as a share of the width of its band, and in SI."""
 
     channel: str
     share: float
@@ -178,10 +178,10 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
             Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}")
         )
     if snapshot is not None and snapshot.device == LOST:
-        became = (
+        result = (
             snapshot.message if frame.over else "looking for it; outputs zeroed by its watchdog"
         )
-        standing.append(Notice("alarm", f"DEVICE LOST: {became}"))
+        standing.append(Notice("alarm", f"DEVICE LOST: {result}"))
     if snapshot is not None and snapshot.trip is not None:
         standing.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
     if frame.trouble:
@@ -227,12 +227,12 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
         return Notice("alarm", f"STOP: NO ANSWER from the run. {EMERGENCY}")
     if stop.endpoint is not None and stop.endpoint != frame.endpoint:
         whom = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
-        became = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
-        return Notice("warn", f"STOP to {whom}, which is not the run shown: {became}")
-    return _stop_of_the_shown(frame, stop, now)
+        result = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
+        return Notice("warn", f"STOP to {whom}, which is not the run shown: {result}")
+    return _stop_of_shown_run(frame, stop, now)
 
 
-def _stop_of_the_shown(frame: Frame, stop: Stop, now: float) -> Notice:
+def _stop_of_shown_run(frame: Frame, stop: Stop, now: float) -> Notice:
     if frame.snapshot is not None and _zeroed(frame.snapshot):
         return Notice("normal", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
     if stop.answer is KeyAnswer.SENDING:

@@ -23,13 +23,13 @@ class EventLine:
     kind: str = "protocol"
 
 
-Said = tuple[str, str, str]  # text, style, kind
+EventText = tuple[str, str, str]  # text, style, kind
 _OWN: Final = ("event", "time", "tick", "t", "parameters")  # fields of an event that are not shown
 
 
 def new_lines(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
     """Return what is new in a snapshot compared with the previous one (None: a run's first)."""
-    said: list[Said] = []
+    said: list[EventText] = []
     if last is not None and (last.run, last.pid) != (snapshot.run, snapshot.pid):
         last = None
     if last is None:
@@ -53,10 +53,10 @@ def new_lines(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
     return [EventLine(snapshot.done_s, *parts) for parts in said if parts[0]]
 
 
-def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
+def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[EventText]:
     before = {alarm.key: alarm for alarm in last.alarms} if last is not None else {}
     now = {alarm.key: alarm for alarm in snapshot.alarms}
-    said: list[Said] = []
+    said: list[EventText] = []
     for key, alarm in now.items():
         old = before.get(key)
         if old is None and not alarm.trips:
@@ -67,8 +67,8 @@ def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
     return said
 
 
-def _people(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
-    said: list[Said] = []
+def _people(last: Snapshot | None, snapshot: Snapshot) -> list[EventText]:
+    said: list[EventText] = []
     if snapshot.prompt and (last is None or last.prompt != snapshot.prompt):
         said.append((f"asked: {snapshot.prompt}", STRONG, "people"))
     if last is not None and snapshot.holder != last.holder:
@@ -105,13 +105,13 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
     return lines
 
 
-def event_text(event: Mapping[str, Any]) -> Said:
+def event_text(event: Mapping[str, Any]) -> EventText:
     """Return the line of an event; an event of an unknown kind is shown by its fields."""
 
     def get(key: str) -> str:
         return str(event.get(key, ""))
 
-    texts: dict[str, Said] = {
+    texts: dict[str, EventText] = {
         "phase": (f"{get('step')} {get('phase')}  {get('message')}", PLAIN, "protocol"),
         "state": (f"{get('before')} → {get('state')}: {get('why')}", DIM, "protocol"),
         "mark": (f"mark: {get('text')}", PLAIN, "protocol"),

@@ -103,8 +103,8 @@ def _about_residual(name: str, left: Sequence[tuple[float, float]]) -> list[str]
     least = min(range(len(medians)), key=lambda k: medians[k])
     if now > ONLINE.large:
         return [
-            f"{name}: {now:.0%} remains as residual: the model explains less than half. Check signs, "
-            "units and sensors before continuing."
+            f"{name}: {now:.0%} remains as residual: the model explains less than half. "
+            "Check signs, units and sensors before continuing."
         ]
     if now > max(ONLINE.small, ONLINE.grown * medians[least]):
         when = clock_text(left[least + few - 1][0])

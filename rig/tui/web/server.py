@@ -124,7 +124,7 @@ class PageServer(Server):
             title=self.title,
             query=f"token={self._token}",
             # Where the browser reached it: the port may be a forwarded one. The terminal's script
-            # appends "?width=…", which ends in a key that nobody reads; the size follows anyway.
+            # appends "?width=…", which ends in an unused key; the size follows in a message.
             websocket=f"ws://{request.host}/ws?token={self._token}&terminal=",
         )
         return web.Response(text=text, content_type="text/html")
