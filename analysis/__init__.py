@@ -1,1 +1,1 @@
-"""What the records mean: differentiation, regressor rows, coupled identification, validation."""
+"""Analysis of records: differentiation, regressor rows, identification, validation, trace."""

@@ -1,12 +1,12 @@
-"""The one interface between a bench and any device: outputs to valves, blocks of samples back.
+"""The interface between a bench and any device: outputs to valves, blocks of samples back.
 
 The device owns the sample clock. It evaluates one output law per joint at every tick,
 
     v = clip(gain wave[(tick - start) mod period] + bias + position_gain (setpoint - s), +-limit)
 
-so that waveforms are device-timed, and streams what it measured as numbered blocks. For a device
-that only reads and writes, the driver does the same at the host's rate (`drivers.polled`); the
-class attribute `host_timed` says which of the two it is.
+so that waveforms are device-timed, and streams samples as numbered blocks. For a device that only
+reads and writes, the driver does the same at the host's rate (`drivers.polled`); the class
+attribute `host_timed` states which of the two applies.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Array = NDArray[np.float64]
 
 
 class DeviceError(Exception):
-    """The device answered garbage, refused a command, or is not the one described."""
+    """The device sent an invalid answer, refused a command, or is not the one described."""
 
 
 class DeviceLost(DeviceError):
-    """The device does not answer any more (or never did)."""
+    """The device does not answer (any more)."""
 
 
 class DeviceBusy(DeviceError):
@@ -41,7 +41,7 @@ class DeviceBusy(DeviceError):
 
 @runtime_checkable
 class ReportsDoubts(Protocol):
-    """A driver that can say which of its settings makes a channel's values implausible."""
+    """A driver that can name settings that make a channel's values implausible."""
 
     def doubts(self) -> Mapping[str, str]:
         """Return a question for each channel in doubt; reads, moves nothing. Raises DeviceError."""
@@ -49,7 +49,7 @@ class ReportsDoubts(Protocol):
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """Who answered: identity, size and clock of the device."""
+    """The connected device: identity, size and clock."""
 
     identity: str
     joints: int
@@ -61,9 +61,9 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class OutputLaw:
-    """What one joint's valve output follows; all zeros is a closed valve.
+    """The law of one joint's valve output; all zeros is a closed valve.
 
-    `gain` scales the uploaded waveform, `bias` [V] is added, `position_gain` [V/m] pulls the
+    `gain` scales the uploaded waveform, `bias` [V] is added, `position_gain` [V/m] drives the
     piston to `setpoint` [m], `limit` [V] bounds the sum either way.
     """
 
@@ -84,11 +84,11 @@ class SampleBlock:
     `tick` is the device's sample counter at the first row (an unbroken stream continues by
     `len(data)`); `data` has shape (n, channels + joints): measured channels, then the commands
     put out [V]; `saturated` marks samples at an end of their converter's range, same shape as the
-    measured part; `backlog` counts the blocks still waiting in the device; `tripped` says that
+    measured part; `backlog` counts the blocks still waiting in the device; `tripped` states that
     the device itself has zeroed its outputs (watchdog or fault). A host-timed driver adds
-    `read_at`, shape (n,): when each row's own sample was taken [s since tick 0], NaN for a row
-    that has none of its own. `armed` is False where the device says that no law may put out a
-    voltage: after laws that may, another client has zeroed the outputs.
+    `read_at`, shape (n,): when each row's own sample was taken [s since tick 0], NaN for an
+    interpolated row. `armed` is False where the device reports that no law may put out a voltage:
+    after laws that may, another client has zeroed the outputs.
     """
 
     sequence: int
@@ -124,7 +124,7 @@ class WireSettings(Part):
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Return the settings that an endpoint such as ``modbus-tcp://127.0.0.1:5020`` stands for.
+        """Return the settings of an endpoint such as ``modbus-tcp://127.0.0.1:5020``.
 
         Raises ValueError where it does not have the form of `example`.
         """
@@ -139,7 +139,7 @@ class Driver(Protocol):
     A driver is a class of `(wire, rig)`, found by the entry point group ``bramah.drivers`` under
     the name of its kind of wire; its class attribute `settings` is the `WireSettings` it reads.
     `host_timed` is False where the device has the sample clock, waveforms and output laws, True
-    where this process has them and samples and outputs are as late as it is.
+    where this process has them, with its delays.
     """
 
     settings: ClassVar[type[WireSettings]]
@@ -154,7 +154,7 @@ class Driver(Protocol):
         """Zero the outputs if the device still answers, then close; never raises."""
 
     def zero_outputs(self) -> None:
-        """Put every output to zero now, whatever else is going on."""
+        """Put every output to zero now, in any state."""
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of joint `joint`'s (0-based) waveform [V], shape (period,)."""
@@ -163,30 +163,30 @@ class Driver(Protocol):
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
 
     def start(self) -> None:
-        """Start streaming blocks, sequence and waveform phase anew."""
+        """Start streaming blocks, with new sequence numbers and waveform phase."""
 
     def read_block(self) -> SampleBlock:
         """Return the next block, waiting for it; also feeds the device's watchdog."""
 
     def stop(self) -> None:
-        """Stop streaming; a host-timed driver, which follows no law then, zeroes the outputs."""
+        """Stop streaming; a host-timed driver then also zeroes the outputs."""
 
     def trip_cause(self) -> str | None:
-        """Say why the device has zeroed its outputs and keeps them so, or None if it has not."""
+        """Return why the device has zeroed its outputs and keeps them so, None if it has not."""
 
     def reset(self) -> None:
-        """Clear a latched trip of the device; only on a person's word."""
+        """Clear a latched trip of the device; only on a person's request."""
 
 
 @runtime_checkable
 class AsksAhead(Protocol):
-    """A driver that can ask for a block before the one before it has been worked on."""
+    """A driver that can request a block before the previous one is processed."""
 
     def ask_ahead(self) -> None:
-        """Ask for the block that the next `read_block` returns, without waiting; never raises.
+        """Request the block that the next `read_block` returns, without waiting; never raises.
 
-        Does nothing in real time, where a block is there when it has been measured. To be called
-        where a `read_block` follows: in virtual time the laws in force hold for that block.
+        Does nothing in real time, where blocks are measured anyway. To be called only if a
+        `read_block` follows: in virtual time the laws in force hold for that block.
         """
 
 

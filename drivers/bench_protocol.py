@@ -1,6 +1,6 @@
-"""What every wire of this project's own protocol shares: identity, waveforms, reasons.
+"""Common parts of all wires of this project's protocol: identity, waveforms, reasons.
 
-Modbus TCP and the serial line carry the same values in other envelopes
+Modbus TCP and the serial line transfer the same values in different frames
 (`rig.model.wire.registers`).
 """
 
@@ -26,21 +26,21 @@ _IDENTITY = struct.Struct(">IHHHfHHII")
 
 
 class DeviceRefused(DeviceError):
-    """The device understood a request and did not carry it out."""
+    """The device understood a request and refused it."""
 
 
 class DeviceSilent(DeviceLost):
-    """No answer came in time; the same request may be worth another try."""
+    """No answer came in time; the request may be repeated."""
 
 
 class AnswerDamaged(DeviceSilent):
-    """What came in time was damaged on its way; the same request may be worth another try."""
+    """A damaged answer came in time; the request may be repeated."""
 
 
 def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
-    """Return who answered with the bytes of the identity group (`reg.IDENTITY_SPAN`).
+    """Return the device's identity from the bytes of the identity group (`reg.IDENTITY_SPAN`).
 
-    Raises DeviceError with the first thing in which the device at `where` is not the rig's.
+    Raises DeviceError with the first property in which the device at `where` is not the rig's.
     """
     magic, version, joints, channels, rate, samples, virtual, _, converters = _IDENTITY.unpack_from(
         data
@@ -86,7 +86,7 @@ def wave_codes(
 ) -> NDArray[np.int16]:
     """Return the 16-bit codes of a waveform [V] of joint `joint` (0-based).
 
-    Raises DeviceError for a joint that is none, more samples than `capacity`, or a voltage
+    Raises DeviceError for a joint that does not exist, more samples than `capacity`, or a voltage
     outside the converter's range.
     """
     if not 0 <= joint < len(rig.joints):
@@ -108,7 +108,7 @@ def wave_codes(
 
 
 def trip_text(cause: int, tick: int) -> str | None:
-    """Say why a device has zeroed its outputs by itself and when, or None if it has not."""
+    """Return why and when a device has zeroed its outputs, None if it has not."""
     if cause == TripCause.NONE:
         return None
     known = cause in TripCause.__members__.values()
@@ -117,7 +117,7 @@ def trip_text(cause: int, tick: int) -> str | None:
 
 
 def refusal_text(reason: Refusal, trip: str | None) -> str:
-    """Say why a device refused; `trip` is why it has tripped, if it has."""
+    """Return why a device refused; `trip` is the cause of its trip, if it has tripped."""
     if reason == Refusal.TRIPPED:
         return f"tripped: {trip}; find the cause, then reset it"
     return reg.REFUSAL_TEXT[reason]

@@ -1,4 +1,4 @@
-"""Messages over the frames of a CAN bus, and what a wrong bus looks like."""
+"""Messages over the frames of a CAN bus, and diagnosis of a wrong bus."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 
 class CanLine:
-    """`drivers.message_link.MessageLine` over a `CanPort`; see there for what each call does."""
+    """`drivers.message_link.MessageLine` over a `CanPort`; see there for each call."""
 
     def __init__(self, port: CanPort, layout: CanLayout, block: BlockLayout, bitrate: int) -> None:
         self._port, self._layout, self._bitrate = port, layout, bitrate
@@ -42,11 +42,11 @@ class CanLine:
 
     @property
     def damaged(self) -> int:
-        """Answers and blocks that were not whole, and blocks of other streams, in all."""
+        """Total of incomplete answers and blocks, and of blocks of other streams."""
         return self._answers.damaged + self._blocks.damaged
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the bus, which others may have open too; raises what `CanPort.open` does."""
+        """Open the bus, also if others use it; raises as `CanPort.open`."""
         del shared
         self._port.open()
         self._answers.reset()
@@ -54,13 +54,13 @@ class CanLine:
         self._damaged = self.damaged
 
     def send(self, message: WireFrame) -> None:
-        """Send a message; raises DeviceLost when the bus has gone."""
+        """Send a message; raises DeviceLost when the bus is lost."""
         if message.type == Message.ALIVE_NOTE:
             self._port.send(alive_frame(self._layout, message))
             return
         if message.type == Message.ZERO:
-            # One frame that wins the bus and that nobody's request can be mixed into; the request
-            # behind it brings the answer.
+            # One frame of highest priority, which cannot mix with requests of others; the request
+            # after it is answered.
             self._port.send(zero_frame(self._layout))
         if message.type == Message.START:
             self._stream = (message.number, message.session)
@@ -68,7 +68,7 @@ class CanLine:
             self._port.send(frame)
 
     def receive(self, patience: float) -> list[WireFrame]:
-        """Return the messages that are whole; raises DeviceLost when the bus has gone."""
+        """Return the complete messages; raises DeviceLost when the bus is lost."""
         messages = []
         for key, data in self._port.receive(patience):
             if self._blocks.takes(key):
@@ -80,7 +80,7 @@ class CanLine:
         return messages
 
     def complaint(self, heard: int) -> str:
-        """Say what came that may explain a silence, or nothing."""
+        """Return what may explain missing answers, or ''."""
         seen = self._port.seen
         if seen.errors:
             return (

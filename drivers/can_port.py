@@ -1,7 +1,7 @@
 """Frames of a CAN bus by python-can: a thread of this module receives, the caller's thread sends.
 
-Nothing is sent by python-can's periodic sender: its thread ends silently with the first error of
-the bus, and the device's watchdog would be all that is left.
+python-can's periodic sender is not used: its thread ends silently with the first error of the bus,
+and only the device's watchdog would remain.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _ERRORS: Final = (can.CanError, OSError, ValueError, ImportError, NotImplemented
 
 @dataclass(frozen=True)
 class BusPlace:
-    """Where a bus is: python-can's interface and what it needs to open it."""
+    """A bus: python-can's interface and what it needs to open it."""
 
     text: str
     interface: str
@@ -104,18 +104,18 @@ class CanPort:
 
     @property
     def fault(self) -> BaseException | None:
-        """Why the bus has gone, None while it has not."""
+        """Why the bus was lost, None while it is not."""
         return None if self._reader is None else self._reader.fault
 
     @property
     def seen(self) -> FrameCounts:
-        """What came since the bus was opened last."""
+        """Counts of frames since the bus was last opened."""
         return FrameCounts() if self._reader is None else self._reader.seen
 
     def open(self) -> None:
         """Open the bus; raises DeviceLost where there is none, DeviceError where it may not be."""
         self.close()
-        # python-can warns of what is ordinary, such as half a line; we report what is not.
+        # python-can warns of normal conditions, such as half a line; faults are reported here.
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if self._place.interface == SOCKETCAND:
             self._greeted()
@@ -128,7 +128,7 @@ class CanPort:
         self._reader = reader
 
     def send(self, frame: CanFrame) -> None:
-        """Send a frame; raises DeviceLost when the bus has gone or takes none."""
+        """Send a frame; raises DeviceLost when the bus is lost or accepts none."""
         reader = self._usable()
         message = can.Message(
             arbitration_id=frame.identifier,
@@ -187,7 +187,7 @@ class CanPort:
         return DeviceLost(f"the bus {self.where} has gone: {_line(error)}")
 
     def _greeted(self) -> None:
-        """Refuse what is no socketcand: python-can would wait for its answer for ever."""
+        """Reject anything but a socketcand: python-can would wait for its answer for ever."""
         place = self._place
         try:
             with socket.create_connection((place.host, place.port), DRIVER.can_greeting) as asked:
@@ -204,7 +204,7 @@ class CanPort:
                 f"what listens at {place.host}:{place.port} has not greeted as socketcand does "
                 f"within {DRIVER.can_greeting:g} s; check the port, which another program may have"
             ) from error
-        except OSError as error:  # a name that is none
+        except OSError as error:  # an invalid name
             raise DeviceLost(
                 f"no socketcand at {place.host}:{place.port}: {error.strerror or error}"
             ) from error
@@ -271,10 +271,10 @@ class CanPort:
 
 
 class _SocketcandBus(SocketCanDaemonBus):
-    """python-can's client, which a busy bus keeps from opening and an ended one keeps spinning."""
+    """python-can's client, corrected: a busy bus never opened, an ended one never stopped."""
 
     def _expect_msg(self, msg: str) -> None:
-        # The last answer of the greeting may come together with the first frames.
+        # The last answer of the greeting may arrive together with the first frames.
         answer = b""
         while not answer.endswith(b">") and (byte := self._end.recv(1)):
             answer += byte
@@ -296,7 +296,7 @@ class _SocketcandBus(SocketCanDaemonBus):
 
 
 class _SlcanBus(slcanBus):
-    """python-can's client, which asks for every byte by itself and ends with a damaged text."""
+    """python-can's client, corrected: it reads byte by byte and ends at a damaged text."""
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
@@ -319,7 +319,7 @@ class _SlcanBus(slcanBus):
 
 
 def _first_text(begun: bytearray) -> str | None:
-    """Take the first whole text, up to its end or error mark, from what has come."""
+    """Take the first complete text, up to its end or error mark."""
     ends = [at for mark in (b"\r", b"\a") if (at := begun.find(mark)) >= 0]
     if not ends:
         return None
@@ -330,7 +330,7 @@ def _first_text(begun: bytearray) -> str | None:
 
 @dataclass
 class FrameCounts:
-    """Frames since a bus was opened, by what they were."""
+    """Frames since a bus was opened, by kind."""
 
     accepted: int = 0
     foreign: int = 0
@@ -359,7 +359,7 @@ class _Reader:
         self._thread.start()
 
     def end(self) -> None:
-        """End the thread and close the bus; one that hangs in a library is left behind."""
+        """End the thread and close the bus; a thread that hangs in a library is left."""
         self._ending = True
         if threading.current_thread() is not self._thread:
             self._thread.join(DRIVER.can_open)
@@ -367,7 +367,7 @@ class _Reader:
     def _run(self) -> None:
         try:
             self.bus = self._make()
-        except Exception as error:  # whatever a vendor's library raises
+        except Exception as error:  # any exception of a vendor's library
             self.fault = error
             self.opened.set()
             return
@@ -379,7 +379,7 @@ class _Reader:
                     self._take(message)
         except Exception as error:
             self.fault = error
-            self.frames.put((-1, b""))  # ends the wait of the reader
+            self.frames.put((-1, b""))  # ends the reader's wait
         finally:
             with suppress(Exception):
                 self.bus.shutdown()
@@ -405,7 +405,7 @@ def _is_full(error: BaseException) -> bool:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """Return the system's number of an error, wherever in its causes it stands."""
+    """Return the system's error number of an error, from its chain of causes."""
     while error is not None:
         number = getattr(error, "errno", None) or getattr(error, "error_code", None)
         if isinstance(number, int):

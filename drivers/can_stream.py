@@ -27,7 +27,7 @@ _SLCAN_DATA_RATES: Final = (2_000_000, 5_000_000)
 
 
 class CanSettings(WireSettings):
-    """The bus: python-can's interface and channel, its rates, and what is on it."""
+    """The bus: python-can's interface and channel, its rates, and its messages."""
 
     example: ClassVar = "can://socketcan/can0?bitrate=1000000"
 
@@ -67,7 +67,7 @@ class CanSettings(WireSettings):
 
 
 class CanStreamDriver(MessageStreamDriver):
-    """`drivers.base.Driver` over a CAN bus; see there for what each call promises."""
+    """`drivers.base.Driver` over a CAN bus; see there for each call."""
 
     settings: ClassVar[type[WireSettings]] = CanSettings
 
@@ -95,9 +95,9 @@ class CanStreamDriver(MessageStreamDriver):
 
 
 def can_layout(settings: CanSettings, rig: Rig) -> CanLayout:
-    """Return the messages of the bus: of its DBC file, or of the one made for the rig.
+    """Return the messages of the bus: of its DBC file, or of the rig's default one.
 
-    Raises InputError for a file that cannot be read or lacks what the bench needs.
+    Raises InputError for a file that cannot be read or lacks required signals.
     """
     if settings.dbc is None:
         return read_layout(

@@ -1,8 +1,8 @@
 """The driver of valves of CiA 408 on a CANopen bus (docs/wire-canopen-408.md).
 
-One node for each joint. The host is the sample clock: each tick it sends SYNC, takes the nodes'
+One node for each joint. The host is the sample clock: each tick it sends SYNC, receives the nodes'
 synchronous TPDOs, and sends control word, set point and its heartbeat (`drivers.polled`). The
-package `canopen` is an extra of this project, imported when a rig names this kind of wire.
+package `canopen` is an optional dependency, imported when a rig names this kind of wire.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _COMMON: Final = frozenset({ch.SUPPLY, ch.TEMPERATURE})
 
 
 class ValveBusSettings(WireSettings):
-    """The bus, the valves' node numbers by joint, and what they are."""
+    """The bus, the valves' node numbers by joint, and their EDS file."""
 
     example: ClassVar = "canopen-408://socketcan/can0?bitrate=500000"
 
@@ -135,7 +135,7 @@ class CanOpenValves:
                 self._received.wait(min(remaining, 0.05))
             missing = sorted({1 + (cob - 1) % 0x80 for cob in self._awaited_ids})
         if missing:
-            # A late answer would pass for the next one.
+            # A late answer would be taken as the next one.
             self._port.close()
             nodes = " ".join(str(number) for number in missing)
             raise DeviceLost(
@@ -153,7 +153,7 @@ class CanOpenValves:
         self._send(volts, hold | Control.ACTIVE if volts.any() else hold)
 
     def close(self) -> None:
-        """Disable the valves if the bus is still there, and let them expect no heartbeat."""
+        """Disable the valves if the bus works, and stop their supervision of the heartbeat."""
         errors = (
             DeviceError,
             self._canopen.SdoCommunicationError,
@@ -167,7 +167,7 @@ class CanOpenValves:
         self._port.close()
 
     def fault(self) -> str | None:
-        """Say which valves are in a fault, None where none is."""
+        """Return which valves are in a fault, None if there are none."""
         for number, state in zip(self._numbers, self._states, strict=True):
             if not state & 0b1000:
                 name = ValveState(state).name if state in set(ValveState) else f"{state:04b}"
@@ -194,7 +194,7 @@ class CanOpenValves:
     # -- inside -----------------------------------------------------------------------------
 
     def _find_sensors(self) -> dict[str, tuple[int, int, int]]:
-        """Return (node's place, TPDO, place in it) of every channel but the spools."""
+        """Return (node index, TPDO, index in it) of every channel but the spools."""
         nodes = self._remote_nodes(self._canopen.Network())
         self._tpdo_ids = set()
         places: dict[str, tuple[int, int, int]] = {}
@@ -227,7 +227,7 @@ class CanOpenValves:
                 network.add_node(node)
                 node.tpdo.read(from_od=True)
                 node.rpdo.read(from_od=True)
-            except Exception as error:  # whatever a damaged file makes of the reader
+            except Exception as error:  # any exception of the reader for a damaged file
                 reason = " ".join(str(error).split())
                 raise InputError(f"{self._source}: not an EDS file of a valve: {reason}") from error
             nodes.append(node)
@@ -237,7 +237,7 @@ class CanOpenValves:
         port = self._port
 
         class Network(self._canopen.Network):  # type: ignore[misc,name-defined]
-            """The library's network over our port: no thread and no periodic sender of its own."""
+            """The library's network over this port, without a thread or periodic sender."""
 
             def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
                 port.send(CanFrame(can_id, bytes(data)))
@@ -250,7 +250,7 @@ class CanOpenValves:
             node.tpdo.subscribe()
 
     def _settle(self, node: Any, milliseconds: int) -> None:
-        """Check who a node is and set what it must do without its host."""
+        """Check a node's identity and configure its reaction to a lost host."""
         try:
             kind = node.sdo[0x1000].raw & 0xFFFF
             if kind != cia408.DEVICE_TYPE:
@@ -280,7 +280,7 @@ class CanOpenValves:
                 self._received.notify_all()
 
     def _heartbeat(self, *, force: bool = False) -> None:
-        # Sent by the thread that serves the outputs, so that a host that stops sends none.
+        # Sent by the thread that serves the outputs, so that a stopped host sends none.
         now = self._clock()
         if force or now - self._beat > self._wire.watchdog / DRIVER.heartbeats:
             state = bytes([cia408.OPERATIONAL])
@@ -343,14 +343,14 @@ class CanOpen408Driver(PolledDriver):
         return super().apply(laws, restart=restart)
 
     def trip_cause(self) -> str | None:
-        """Say why outputs were zeroed without the host's word, or None if they were not."""
+        """Return why outputs were zeroed without a command, None if they were not."""
         cause = super().trip_cause()
         self._note()
         return self._cause or cause
 
     def reset(self) -> None:
-        """Clear a latched trip, in the valves as well; only on a person's word."""
-        self._safely(self._valves.read)  # for the valves' states, which may be old
+        """Clear a latched trip, in the valves as well; only on a person's request."""
+        self._safely(self._valves.read)  # to update the valves' states
         if self.trip_cause() is None:
             return
         self._zero_laws()

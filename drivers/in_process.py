@@ -1,9 +1,9 @@
 """A driver over any Python object that advances in this process: for tests, twins and notebooks.
 
-The object has one method, `advance(ticks, laws)`: it measures, evaluates one `ActiveLaw` per joint
-and holds the output, `ticks` times, and returns what it measured, shape (ticks, channels), and what
-it put out, shape (ticks, joints). Whole numbers are converter codes (`rig.model.wire.codes`),
-floats are SI. Time is virtual: nothing runs while no block is read.
+The object has one method, `advance(ticks, laws)`: `ticks` times it measures, evaluates one
+`ActiveLaw` per joint and holds the output; it returns samples, shape (ticks, channels), and
+outputs, shape (ticks, joints). Integers are converter codes (`rig.model.wire.codes`), floats are
+SI. Time is virtual: it advances only while a block is read.
 
 In a rig file `object: package.module:name` names a callable that takes the rig and returns it;
 naming it runs that module's code.
@@ -64,14 +64,14 @@ class ActiveLaw:
 
 
 class Advancing(Protocol):
-    """What the object must offer."""
+    """The interface of the object."""
 
     def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Run `ticks` samples under laws like `ActiveLaw`; return (measured, outputs)."""
 
 
 class InProcessSettings(WireSettings):
-    """The object behind the wire, as the import path of a callable of the rig."""
+    """The object, as the import path of a callable of the rig."""
 
     example: ClassVar = "in-process://package.module:name"
 
@@ -88,7 +88,7 @@ class InProcessSettings(WireSettings):
 class InProcessDriver:
     """`drivers.base.Driver` over an object of this process; see there for the calls.
 
-    `make` returns the object for each session; without it the wire's `object` is imported.
+    `make` returns the object for each session; by default the wire's `object` is imported.
     """
 
     settings: ClassVar[type[WireSettings]] = InProcessSettings
@@ -141,7 +141,7 @@ class InProcessDriver:
             raise DeviceError("wire: object: expected package.module:name, a callable of the rig")
         try:
             factory: Callable[[Rig], Advancing] = getattr(importlib.import_module(module), name)
-        except Exception as error:  # whatever the module does when it is imported
+        except Exception as error:  # any exception of the imported module
             raise DeviceError(f"wire: object: cannot import {self._path}: {error!r}") from error
         return factory
 
@@ -152,7 +152,7 @@ class InProcessDriver:
         self._object = None
 
     def zero_outputs(self) -> None:
-        """Put every output to zero from the next sample on; nothing runs before it."""
+        """Put every output to zero from the next sample on; time stands still until then."""
         self._laws = (OFF,) * len(self._rig.joints)
 
     def reset(self) -> None:
@@ -201,7 +201,7 @@ class InProcessDriver:
         try:
             measured, outputs = device.advance(BLOCK_SAMPLES, laws)
             block = self._block(np.asarray(measured), np.asarray(outputs))
-        except Exception as error:  # anything that the user's object raises
+        except Exception as error:  # any exception of the user's object
             self.close()
             raise DeviceLost(f"the object of the wire in-process failed: {error!r}") from error
         self._tick += BLOCK_SAMPLES

@@ -1,4 +1,4 @@
-"""What a law or a waveform must be before a driver without a checking device takes it."""
+"""Checks of laws and waveforms for drivers whose device does not check them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rig.model.rig import Rig
 
 
 def possible_laws(laws: Sequence[OutputLaw], rig: Rig) -> tuple[OutputLaw, ...]:
-    """Return one law per joint; raises DeviceError naming the joint whose law cannot be kept."""
+    """Return one law per joint; raises DeviceError naming the joint of an impossible law."""
     if len(laws) != len(rig.joints):
         raise DeviceError(f"{len(laws)} laws for a rig of {len(rig.joints)} joints")
     for number, (law, joint) in enumerate(zip(laws, rig.joints, strict=True), start=1):

@@ -1,8 +1,8 @@
-"""One host's session on a wire of messages: requests that return their answer, blocks beside them.
+"""One host's session on a wire of messages: requests with answers, and pushed blocks.
 
-A request is sent again, with the same number, until its answer comes: the device carries it out
-once. An answer counts only with the number and the session of the request under way, so that a
-late one to an earlier request is dropped.
+A request is repeated with the same number until its answer comes; the device executes it once. An
+answer counts only with the number and the session of the pending request, so that a late answer to
+an earlier request is dropped.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NO_SUCH = "it knows no such request, or not of this size"
 
 
 class RequestRefused(DeviceRefused):
-    """A refusal with the reason that the device gave; `what` was refused by whom."""
+    """A refusal with the device's reason; `what` names the request and the device."""
 
     def __init__(self, what: str, reason: Refusal) -> None:
         text = _NO_SUCH if reason == Refusal.NO_SUCH_REGISTER else reg.REFUSAL_TEXT[reason]
@@ -39,44 +39,44 @@ class RequestRefused(DeviceRefused):
 
 
 class MessageLine(Protocol):
-    """What carries whole messages: a serial port, a CAN bus. It can be opened again and again."""
+    """A carrier of complete messages: a serial port, a CAN bus. It can be reopened."""
 
     @property
     def where(self) -> str:
-        """The line's name, for people."""
+        """The line's name."""
 
     @property
     def is_open(self) -> bool:
         """Whether messages can be sent and received."""
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the line and drop what it had received.
+        """Open the line and drop earlier received data.
 
-        Raises DeviceLost when there is none, DeviceError when it may not be opened, DeviceBusy
-        when another program has it, unless `shared`.
+        Raises DeviceLost if there is none, DeviceError if it may not be opened, DeviceBusy if
+        another program has it, unless `shared`.
         """
 
     def send(self, message: WireFrame) -> None:
-        """Send a message; raises DeviceLost when the line has gone."""
+        """Send a message; raises DeviceLost when the line is lost."""
 
     def receive(self, patience: float) -> Sequence[WireFrame]:
-        """Return the messages waiting, at once if anything is; nothing after `patience` [s] or so.
+        """Return waiting messages, at once if there are any; nothing after about `patience` [s].
 
-        What is damaged is left out. Raises DeviceLost when the line has gone.
+        Damaged ones are left out. Raises DeviceLost when the line is lost.
         """
 
     def complaint(self, heard: int) -> str:
-        """Say what came since opening that may explain a silence after `heard` messages, or ''."""
+        """Return what may explain missing answers after `heard` messages, or ''."""
 
     def close(self) -> None:
         """Close the line; never raises."""
 
 
 class MessageLink:
-    """A line that is opened once and, broken once, stays closed until opened again.
+    """A line that is opened once and, once broken, stays closed until reopened.
 
-    `blocks` holds the messages of pushed blocks of this session as they came, at most four
-    windows of them; the oldest goes when a device sends more than it may.
+    `blocks` holds the messages of pushed blocks of this session, at most four windows of them; the
+    oldest is dropped when a device sends more than it may.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class MessageLink:
 
     @property
     def patience(self) -> float:
-        """How long an answer is waited for [s]."""
+        """Time limit for an answer [s]."""
         return self._patience
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the line for a new session; raises what `MessageLine.open` does."""
+        """Open the line for a new session; raises as `MessageLine.open`."""
         self._line.open(shared=shared)
         self._received = 0
         self._session = secrets.randbits(32)
@@ -117,7 +117,7 @@ class MessageLink:
         self.blocks.clear()
 
     def be_patient(self, factor: float) -> None:
-        """Wait `factor` times as long for every answer until the line is opened anew."""
+        """Multiply the time limit of answers by `factor` until the line is reopened."""
         self._patience = factor * self._timeout
 
     def close(self) -> None:
@@ -146,16 +146,16 @@ class MessageLink:
         raise DeviceSilent(self._silence())
 
     def send_unanswered(self, kind: Message) -> None:
-        """Send a request once and wait for no answer; raises DeviceLost when the line has gone."""
+        """Send a request once without waiting; raises DeviceLost when the line is lost."""
         self._number = self.next_number()
         self.note(kind, self._number, b"")
 
     def note(self, kind: Message, number: int, payload: bytes) -> None:
-        """Send a message that is not answered; raises DeviceLost when the line has gone."""
+        """Send a message without answer; raises DeviceLost when the line is lost."""
         self._line.send(WireFrame(kind, number, self._session, payload))
 
     def listen(self, patience: float) -> None:
-        """Take in what is waiting, or what comes within `patience` [s]; raises DeviceLost."""
+        """Receive what is waiting, or arrives within `patience` [s]; raises DeviceLost."""
         for frame in self._line.receive(patience):
             self._sort(frame)
 
@@ -211,7 +211,7 @@ class MessageLink:
         return RequestRefused(what, Refusal(refusal.reason))
 
     def complaint(self) -> str:
-        """Say what came since opening that may explain what is missing, or ''."""
+        """Return what may explain missing messages, or ''."""
         return self._line.complaint(self._received)
 
     def _silence(self) -> str:

@@ -1,4 +1,4 @@
-"""The driver of a bench that sends and takes messages, whatever line carries them."""
+"""The driver of a bench with messages, on any line."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ _IDENTITY_BYTES = 2 * (reg.IDENTITY_SPAN[1] - reg.IDENTITY_SPAN[0])
 
 
 class MessageStreamDriver:
-    """`drivers.base.Driver` over a `MessageLine`; see there for what each call promises.
+    """`drivers.base.Driver` over a `MessageLine`; see there for each call.
 
-    A class of a kind of wire makes its line and names its settings.
+    The class of a kind of wire makes its line and names its settings.
     """
 
     settings: ClassVar[type[WireSettings]] = WireSettings
@@ -73,9 +73,9 @@ class MessageStreamDriver:
         self._heartbeat = secrets.randbits(16)
         self._capacity = reg.WAVE_CAPACITY
         self._stream: int | None = None  # number of the request that started it
-        self._expected = 0  # number of the block to come, modulo 2^16
+        self._expected = 0  # number of the next block, modulo 2^16
         self._ready: deque[msg.PushedBlock] = deque()
-        self._asked_for: int | None = None  # the block that a gap was reported before
+        self._asked_for: int | None = None  # the block before which a gap was reported
         self.info: DeviceInfo | None = None
 
     # -- session ----------------------------------------------------------------------------
@@ -88,7 +88,7 @@ class MessageStreamDriver:
             self.info = self._identify()
             if self.info.virtual_time:
                 self._link.be_patient(VIRTUAL_PATIENCE)
-            # Zeroes the outputs and stops a stream as well.
+            # This also zeroes the outputs and stops a stream.
             self._command(Message.OPEN, struct.pack(">H", round(self._wire.watchdog * 1e3)))
             self._decoder.restart(_u32(self._status(), reg.STATUS_TICK))
         except BaseException:
@@ -100,12 +100,12 @@ class MessageStreamDriver:
         """Zero the outputs if the device still answers, then close; never raises."""
         try:
             if self._link.is_open:
-                # With or without control: zero first, then give it up.
+                # With or without control: zero first, then release it.
                 self._command(Message.ZERO)
                 self._command(Message.CLOSE)
         except DeviceError as error:
             logger.debug("while closing: %s", error)
-            # Perhaps only the answers are lost: then the next host need not wait for the watchdog.
+            # If only answers are lost, the next host need not wait for the watchdog.
             with suppress(DeviceError):
                 self._link.send_unanswered(Message.CLOSE)
         finally:
@@ -113,9 +113,9 @@ class MessageStreamDriver:
             self._link.close()
 
     def close_tripped(self) -> None:
-        """Zero the outputs, then close while it streams: the device latches a lost host.
+        """Zero the outputs, then close while streaming, so that the device latches a lost host.
 
-        A device that does not see its line closed latches it when the watchdog time is over.
+        A device that cannot detect the closing latches it after its watchdog time.
         """
         try:
             if self._link.is_open:
@@ -127,7 +127,7 @@ class MessageStreamDriver:
             self._link.close()
 
     def zero_outputs(self) -> None:
-        """Put every output to zero now; opens the line anew if need be, zero needs no control."""
+        """Put every output to zero now; reopens the line if need be, zero needs no control."""
         if self._link.is_open:
             try:
                 self._link.request(Message.ZERO)
@@ -139,17 +139,17 @@ class MessageStreamDriver:
             self._link.open()
             self._zero_once()
             return
-        # Another program has the line; what both write arrives whole, and zero is for anybody.
+        # Another program has the line; messages of both arrive complete, and any host may zero.
         self._link.open(shared=True)
         self._zero_once()
         self._link.close()
 
     def reset(self) -> None:
-        """Clear a latched trip of the device; only on a person's word."""
+        """Clear a latched trip of the device; only on a person's request."""
         self._command(Message.RESET, struct.pack(">H", reg.RESET_KEY))
 
     def trip_cause(self) -> str | None:
-        """Say why the device has zeroed its outputs, or None if it has not."""
+        """Return why the device has zeroed its outputs, None if it has not."""
         return _trip_text(self._status())
 
     # -- outputs ----------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class MessageStreamDriver:
     # -- samples ----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start streaming blocks, sequence and waveform phase anew."""
+        """Start streaming blocks, with new sequence numbers and waveform phase."""
         self._decoder.restart()
         self._ready.clear()
         self._expected, self._asked_for = 0, None
@@ -202,7 +202,7 @@ class MessageStreamDriver:
         period = self._layout.samples / self._rig.sample_rate
         pause = period + min(DRIVER.resend, self._wire.watchdog / 5)
         deadline = self._clock() + period + self._link.patience
-        known = ""  # what was wrong with the line before it was waited for in vain
+        known = ""  # the line's errors before the wait
         for asked in count(1):
             due = min(self._clock() + pause, deadline)
             while not self._ready and (remaining := due - self._clock()) > 0.0:
@@ -212,7 +212,7 @@ class MessageStreamDriver:
                 break
             if asked == 1:
                 known = self._link.complaint()
-            # The note or the block was lost; the watchdog wants another note in any case.
+            # The note or the block was lost; the watchdog needs another note in any case.
             self._alive(resend=True)
             if asked % DRIVER.notes_before_status == 0:
                 self._why_no_block(overdue=self._clock() >= deadline, known=known)
@@ -222,7 +222,7 @@ class MessageStreamDriver:
     # -- inside -----------------------------------------------------------------------------
 
     def _place(self) -> str:
-        """Return where the device is, for the messages of a first contact."""
+        """Return the device's place for messages of a first contact."""
         return self._link.where
 
     def _identify(self) -> DeviceInfo:
@@ -262,14 +262,14 @@ class MessageStreamDriver:
             raise DeviceRefused(f"{refused.what}: {text}") from refused
 
     def _alive(self, *, resend: bool = False) -> None:
-        if self._stream is None:  # between two streams no block is expected
+        if self._stream is None:  # no block is expected between two streams
             return
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF
         alive = msg.Alive((self._expected - 1) & 0xFFFF, self._heartbeat, resend)
         self._link.note(Message.ALIVE_NOTE, self._stream, msg.pack_alive(alive))
 
     def _accept(self) -> None:
-        """Move the blocks that came, as far as they are in order, to those that are ready."""
+        """Move received blocks that are in order to the ready ones."""
         while self._link.blocks:
             frame = self._link.blocks.popleft()
             if frame.number != self._stream:
@@ -283,7 +283,7 @@ class MessageStreamDriver:
             ahead = (block.header.sequence - self._expected) & 0xFFFF
             gone = (block.oldest - self._expected) & 0xFFFF
             if 0 < ahead == gone <= 0x7FFF:
-                ahead = 0  # what lies between is lost in the device; the decoder says so
+                ahead = 0  # blocks between are lost in the device; the decoder counts them
             if ahead == 0:
                 self._ready.append(block)
                 self._expected = (block.header.sequence + 1) & 0xFFFF
@@ -296,7 +296,7 @@ class MessageStreamDriver:
                 self._alive(resend=True)
 
     def _why_no_block(self, *, overdue: bool, known: str = "") -> None:
-        """Raise the reason why no blocks come, if it is one that lasts; `known` is none for it."""
+        """Raise the reason of missing blocks, if it is permanent; `known` was there before."""
         where = self._link.where
         try:
             status = self._status()

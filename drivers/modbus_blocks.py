@@ -1,4 +1,4 @@
-"""From the bytes of a block to SI samples, and whether it can follow the block before."""
+"""Decoding of a block's bytes to SI samples, with checks against the previous block."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def unwrap(raw: int, near: int, bits: int) -> int:
 
 
 class BlockDecoder:
-    """Decodes the blocks of one stream in order; knows what the next one must look like."""
+    """Decodes the blocks of one stream in order; knows the expected next numbers."""
 
     def __init__(self, rig: Rig) -> None:
         self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
@@ -54,33 +54,33 @@ class BlockDecoder:
         self._scale = self._rows([step, volt], np.float64)
         self._offset = self._rows([low, -(most * volt)], np.float64)
         self._sequence: int | None = None
-        self.tick = 0  # of the sample expected next
+        self.tick = 0  # of the next expected sample
 
     def _rows(self, parts: Sequence[Array], kind: type[np.generic]) -> NDArray[Any]:
         """Return one value per column, repeated for every sample.
 
-        Arrays of a block's own shape are worked through at once, a row that fits is not.
+        Operations on arrays of a block's own shape are faster than broadcasting a row.
         """
         return np.tile(np.concatenate(parts).astype(kind), (self.layout.samples, 1))
 
     @property
     def acknowledge(self) -> int:
-        """The number of the last block decoded; before the first one a number never offered."""
+        """The number of the last decoded block; before the first one, an unused number."""
         return 0xFFFF if self._sequence is None else self._sequence & 0xFFFF
 
     def restart(self, tick: int | None = None) -> None:
-        """Expect a stream numbered anew; `tick` is where another device's clock stands."""
+        """Expect a stream with new numbers; `tick` is the clock of another device."""
         self._sequence = None
         if tick is not None:
             self.tick = tick
 
     def seen(self, header: BlockHeader) -> bool:
-        """Return whether a block is one of the last few decoded: a late copy of an answer."""
+        """Return whether a block was decoded recently: a late copy of an answer."""
         behind = (self.acknowledge - header.sequence) & 0xFFFF
         return self._sequence is not None and behind <= min(self._sequence, DRIVER.late_blocks)
 
     def refuse_restarted(self, tick: int) -> None:
-        """Raise DeviceLost where a device counts `tick` (modulo 2^32) after samples beyond it."""
+        """Raise DeviceLost if a device counts `tick` (modulo 2^32) after higher ones."""
         now = unwrap(tick, self.tick, 32)
         if now < self.tick:
             raise DeviceLost(
@@ -93,12 +93,12 @@ class BlockDecoder:
         return self.decode_samples(header, answer[2 * reg.HEADER_WORDS :])
 
     def decode_samples(self, header: BlockHeader, samples: bytes) -> SampleBlock:
-        """Return the block in SI; raises DeviceError if it is impossible after the last one."""
+        """Return the block in SI; raises DeviceError if it cannot follow the last one."""
         sequence, tick = self._follow(header)
         codes = np.frombuffer(samples, ">u2").reshape(self._shape).astype(np.uint16)
         codes += self._shift
         ends = codes - _ONE >= self._almost_top  # 0 wraps to the top
-        if np.count_nonzero(ends):  # what is beyond an end is at one as well
+        if np.count_nonzero(ends):  # values beyond an end count as at the end
             impossible = codes > self._span
             if np.count_nonzero(impossible):
                 raise self._impossible(impossible, codes)
@@ -117,12 +117,12 @@ class BlockDecoder:
         )
 
     def _follow(self, header: BlockHeader) -> tuple[int, int]:
-        """Return unwrapped (sequence, tick), if the numbers can be those of the next block."""
+        """Return unwrapped (sequence, tick) if the numbers can be those of the next block."""
         tick = unwrap(header.tick, self.tick, 32)
         last = -1 if self._sequence is None else self._sequence
         lost = (header.sequence - last - 1) & 0xFFFF
         expected = self.tick + lost * self.layout.samples
-        # Before a stream's first block any time may pass, but none backwards.
+        # Before a stream's first block any time may pass, but never backwards.
         if lost > 0x7FFF or tick < expected or (tick > expected and self._sequence is not None):
             raise DeviceError(
                 f"impossible block: number {header.sequence} at sample {tick}, expected number "

@@ -1,7 +1,8 @@
-"""Modbus as bytes: requests, and the frames that TCP and serial lines put around them.
+"""Modbus as bytes: requests, and frames of TCP and serial lines.
 
-Glossary: a *PDU* is a function code and its data, a *frame* a PDU with what its wire adds. Sources:
-MODBUS Application Protocol V1.1b3, Messaging on TCP/IP V1.0b, MODBUS over Serial Line V1.02.
+Glossary: a *PDU* is a function code and its data, a *frame* a PDU with its wire's header and
+checksum. Sources: MODBUS Application Protocol V1.1b3, Messaging on TCP/IP V1.0b, MODBUS over Serial
+Line V1.02.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ READ_INPUT: Final = 4
 WRITE_ONE: Final = 6
 WRITE_MANY: Final = 16
 WRITE_AND_READ: Final = 23
-REFUSED: Final = 0x80  # added to the function of a request that is not carried out
+REFUSED: Final = 0x80  # added to the function of a refused request
 
-_MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows it, unit
+_MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), length of the rest, unit
 _LONGEST: Final = 254  # [bytes] of unit and PDU
 _COUNTED: Final = (READ_HOLDING, READ_INPUT, WRITE_AND_READ)  # answers with a byte count
 
 
 class TcpFrame(NamedTuple):
-    """What a frame of TCP carries; `used` is its length [bytes]."""
+    """The content of a frame of TCP; `used` is its length [bytes]."""
 
     transaction: int
     unit: int
@@ -39,7 +40,7 @@ def read_request(function: int, address: int, count: int) -> bytes:
 def write_request(address: int, words: Sequence[int]) -> bytes:
     """Return the PDU that writes registers by function 6 (one) or 16.
 
-    Its first five bytes are the answer to it. Raises struct.error for what is no register.
+    Its first five bytes are its answer. Raises struct.error for an invalid register.
     """
     if len(words) == 1:
         return struct.pack(">BHH", WRITE_ONE, address, words[0])
@@ -73,9 +74,9 @@ def tcp_frame(transaction: int, unit: int, pdu: bytes) -> bytes:
 
 
 def read_tcp_frame(data: bytes) -> TcpFrame | None:
-    """Return the frame that begins `data`, None while it is not whole.
+    """Return the frame that begins `data`, None while it is incomplete.
 
-    Raises ValueError for bytes that no frame begins with.
+    Raises ValueError for bytes that begin no frame.
     """
     if len(data) < _MBAP.size:
         return None
@@ -112,16 +113,16 @@ def rtu_frame(unit: int, pdu: bytes) -> bytes:
 
 
 def read_rtu_answer(data: bytes, unit: int) -> bytes | None:
-    """Return the PDU of the first whole answer of `unit` in `data`, None while there is none.
+    """Return the PDU of the first complete answer of `unit` in `data`, None if there is none.
 
-    What stands before it (noise, a damaged frame) is passed over.
+    Earlier bytes (noise, a damaged frame) are skipped.
     """
     for start in range(len(data)):
         if data[start] != unit:
             continue
         length = _answer_length(data[start : start + 3])
         if length is None:
-            return None  # the rest may still come
+            return None  # the rest may still arrive
         frame = data[start : start + length]
         if length and len(frame) < length:
             return None

@@ -1,8 +1,8 @@
-"""The driver of any I/O module or PLC over Modbus TCP: its register map stands in the rig file.
+"""The driver of any I/O module or PLC on Modbus TCP, by a register map in the rig file.
 
-Documented for people in docs/wire-modbus-map.md. The device has no sample clock: `drivers.polled`
-reads and writes it at the host's rate. Answers carry the transaction number of their request, and
-one with another number is dropped; after any timeout the connection ends.
+Format: docs/wire-modbus-map.md. The device has no sample clock: `drivers.polled` reads and writes
+it at the host's rate. Answers have the transaction number of their request, and one with another
+number is dropped; after any timeout the connection ends.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class MapSettings(WireSettings):
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Raise ValueError: no endpoint says what the registers mean."""
+        """Raise ValueError: an endpoint has no register map."""
         raise ValueError(f"no register map in {url.geturl()}")
 
 
@@ -92,7 +92,7 @@ class OutputEntry(_Number):
 
 
 class ZeroByEntry(Part):
-    """The module's own watchdog: its register takes the time in milliseconds."""
+    """The module's own watchdog: its register holds the time in milliseconds."""
 
     watchdog_register: int = Field(ge=0, le=_LAST_REGISTER)
     milliseconds: int = Field(ge=1, le=0xFFFF)
@@ -100,7 +100,7 @@ class ZeroByEntry(Part):
 
 @dataclass(frozen=True)
 class Point:
-    """One number of the map: where it stands, its form, and value = offset + scale * number."""
+    """One number of the map: its registers, its form, and value = offset + scale * number."""
 
     name: str
     function: int
@@ -112,7 +112,7 @@ class Point:
 
     @property
     def words(self) -> int:
-        """How many registers it takes."""
+        """Its number of registers."""
         return word_count(self.form)
 
     @property
@@ -121,7 +121,7 @@ class Point:
         return self.address + self.words
 
     def value(self, data: bytes) -> float:
-        """Return the value [SI] that the bytes of its registers mean."""
+        """Return the value [SI] in the bytes of its registers."""
         return self.offset + self.scale * decode_registers(data, self.form, self.order)
 
     def registers(self, value: float) -> list[int]:
@@ -145,7 +145,7 @@ class Span:
 
 @dataclass(frozen=True)
 class RegisterMap:
-    """Where every channel and every output stands; `watchdog` is None where the module has none."""
+    """The registers of every channel and output; `watchdog` is None if the module has none."""
 
     inputs: tuple[Point, ...]
     outputs: tuple[Point, ...]
@@ -153,7 +153,7 @@ class RegisterMap:
 
 
 def register_map(settings: MapSettings, rig: Rig) -> RegisterMap:
-    """Return the map that a rig file describes; raises InputError naming the key at fault."""
+    """Return the map of a rig file; raises InputError naming the key at fault."""
     inputs = tuple(
         _point(f"inputs.{name}", name, entry, entry.function, rig.unit_of(name))
         for name, entry in zip(
@@ -220,7 +220,7 @@ def _refuse_narrow(point: Point, reach: float) -> None:
 
 
 def spans(points: Iterable[Point], most: int = MAX_READ) -> tuple[Span, ...]:
-    """Return the fewest requests for all points that ask for no register beside theirs."""
+    """Return the fewest requests for all points without any other register."""
     ordered = sorted(enumerate(points), key=lambda item: (item[1].function, item[1].address))
     groups: list[list[tuple[int, Point]]] = []
     for index, point in ordered:
@@ -246,13 +246,13 @@ def spans(points: Iterable[Point], most: int = MAX_READ) -> tuple[Span, ...]:
 
 
 class UnitConnection(TcpConnection):
-    """A connection to one unit behind an address, that ends with the first unanswered request."""
+    """A connection to one unit of an address, closed at the first unanswered request."""
 
     def _end(self, number: int, within: float | None) -> bytes:
         try:
             return super()._end(number, within)
         except DeviceLost:
-            self.close()  # what comes late then comes to nobody
+            self.close()  # late answers are then ignored
             raise
 
 
@@ -266,7 +266,7 @@ class MappedModule:
         ranges: Sequence[tuple[float, float]],
         timeout: float,
     ) -> None:
-        """Know a map and the range [SI] of every channel's sensor; nothing is opened."""
+        """Store a map and the range [SI] of every channel's sensor; open nothing."""
         self._link = UnitConnection(settings.host, settings.port, timeout, settings.unit)
         self._unit = settings.unit
         self._ranges = ranges
@@ -299,7 +299,7 @@ class MappedModule:
         return values
 
     def doubts(self) -> dict[str, str]:
-        """Read once; return the channels that another word order alone makes plausible."""
+        """Read once; return the channels that would be plausible with another word order."""
         reasons = {}
         for index, point, data in self._registers():
             other = replace(point, order=_OTHER[point.order])
@@ -311,7 +311,7 @@ class MappedModule:
         return reasons
 
     def _registers(self) -> Iterator[tuple[int, Point, bytes]]:
-        """Yield (place among the inputs, point, its registers' bytes)."""
+        """Yield (index among the inputs, point, its registers' bytes)."""
         for span in self._reads:
             with self._explained(str(span)):
                 data = self._link.read(span.address, span.words, span.function)
@@ -359,9 +359,9 @@ class MappedModule:
 
 
 def _plausible(point: Point, data: bytes, low: float, high: float) -> bool:
-    """Say whether registers hold a value that a sensor of this range can have shown.
+    """Return whether registers hold a value that a sensor of this range can have.
 
-    A float read in the wrong order is of any magnitude: far below what the sensor resolves, too.
+    A float read in the wrong order has any magnitude, also far below the sensor's resolution.
     """
     number = point.scale * decode_registers(data, point.form, point.order)
     tiny = 0.0 < abs(number) < DRIVER.resolved * (high - low)
@@ -369,7 +369,7 @@ def _plausible(point: Point, data: bytes, low: float, high: float) -> bool:
 
 
 class ModbusMapDriver(PolledDriver):
-    """`drivers.base.Driver` over a register map; raises InputError for one that cannot be."""
+    """`drivers.base.Driver` over a register map; raises InputError for an invalid one."""
 
     settings: ClassVar[type[WireSettings]] = MapSettings
 
@@ -395,6 +395,6 @@ class ModbusMapDriver(PolledDriver):
         )
 
     def doubts(self) -> Mapping[str, str]:
-        """Return the channels whose registers may be read in the wrong order, and why."""
+        """Return the channels whose registers may be read in the wrong order, with reasons."""
         self._require_open()
         return self._safely(self._module.doubts)

@@ -1,8 +1,8 @@
-"""The driver of a bench behind Modbus RTU on a serial line (docs/wire-modbus-rtu.md).
+"""The driver of a bench on Modbus RTU on a serial line (docs/wire-modbus-rtu.md).
 
 The register map is that of Modbus TCP. RTU frames carry no transaction number, so that a late
-answer to an earlier request may pass for the next one: after a request without an answer the line
-is listened to until it is quiet, and blocks carry a sequence number that only the right one has.
+answer may be mistaken for the next one: after a request without an answer the driver reads until
+the line is quiet, and blocks are identified by sequence numbers.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class RtuSettings(WireSettings):
 
 
 class RtuConnection(ModbusConnection):
-    """A serial line that is opened once and, broken once, stays closed until opened again."""
+    """A serial line that is opened once and, once broken, stays closed until reopened."""
 
-    pipelines = False  # an answer without a number could be that of any request
+    pipelines = False  # an answer without a number could be to any request
 
     def __init__(self, at: RtuSettings, timeout: float) -> None:
         super().__init__(at.device, UNIT, timeout)
@@ -66,7 +66,7 @@ class RtuConnection(ModbusConnection):
         self._port.close()
 
     def _send(self, request: bytes) -> int:
-        self._port.read(0.0)  # a late answer that came since
+        self._port.read(0.0)  # a late answer that arrived since
         self._port.write(rtu_frame(self._unit, request))
         return 0
 
@@ -96,9 +96,9 @@ class RtuConnection(ModbusConnection):
         )
 
     def settle(self) -> None:
-        """Read and drop what still arrives, until the line is quiet.
+        """Read and drop bytes until the line is quiet.
 
-        Raises DeviceLost where the line is gone or does not fall silent.
+        Raises DeviceLost where the line is lost or does not become quiet.
         """
         began = time.monotonic()
         while self._port.read(DRIVER.quiet):
@@ -108,7 +108,7 @@ class RtuConnection(ModbusConnection):
 
 
 class ModbusRtuDriver(ModbusTcpDriver):
-    """`drivers.base.Driver` over Modbus RTU; see there for what each call promises."""
+    """`drivers.base.Driver` over Modbus RTU; see there for each call."""
 
     settings: ClassVar[type[WireSettings]] = RtuSettings
 

@@ -1,4 +1,4 @@
-"""The driver of a bench behind Modbus TCP (docs/wire-modbus-tcp.md)."""
+"""The driver of a bench on Modbus TCP (docs/wire-modbus-tcp.md)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _STREAMING: Final = int(Status.STREAMING)
 
 
 class TcpSettings(WireSettings):
-    """Where a device listens."""
+    """The device's address."""
 
     example: ClassVar = "modbus-tcp://127.0.0.1:5020"
 
@@ -66,7 +66,7 @@ class TcpSettings(WireSettings):
 
 
 class ModbusTcpDriver:
-    """`drivers.base.Driver` over Modbus TCP; see there for what each call promises."""
+    """`drivers.base.Driver` over Modbus TCP; see there for each call."""
 
     settings: ClassVar[type[WireSettings]] = TcpSettings
     host_timed: ClassVar[bool] = False
@@ -79,13 +79,13 @@ class ModbusTcpDriver:
         self._sleep = sleep
         # Two tries within the time after which a silent device counts as lost.
         self._link = self.connection(wire, wire.timeout / 2)
-        # A block is asked for again early enough for a lost answer to trip neither watchdog.
+        # A block is requested again early enough that a lost answer trips neither watchdog.
         self._wait = min(wire.timeout / 2, wire.watchdog / 4)
         self._tries = math.ceil(wire.timeout / self._wait - 1e-9)
         self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
         self._decoder = BlockDecoder(rig)
         self._heartbeat = 0
-        self._due: float | None = None  # when the next block can be there [s], by time.monotonic
+        self._due: float | None = None  # when the next block can be ready [s], by time.monotonic
         self.info: DeviceInfo | None = None
 
     @staticmethod
@@ -121,13 +121,13 @@ class ModbusTcpDriver:
             self._link.close()
 
     def close_tripped(self) -> None:
-        """Zero the outputs, then close while it streams: the device latches a lost host."""
+        """Zero the outputs, then close while streaming, so that the device latches a lost host."""
         self._command_before_closing(reg.CONTROL_ZERO, reg.ZERO_NOW)
         with suppress(OSError):
             self._link.close()
 
     def _command_before_closing(self, register: reg.Register, value: int) -> bool:
-        """Write one command, again where a late or damaged answer met it; says whether it held."""
+        """Write one command, again after a late or damaged answer; return whether it succeeded."""
         for _ in range(2):
             if not self._link.is_open:
                 return False
@@ -140,7 +140,7 @@ class ModbusTcpDriver:
         return False
 
     def zero_outputs(self) -> None:
-        """Put every output to zero now; connects anew if need be, zero needs no control."""
+        """Put every output to zero now; reconnects if need be, zero needs no control."""
         if self._link.is_open:
             try:
                 self._link.write(reg.CONTROL_ZERO.address, [reg.ZERO_NOW])
@@ -156,11 +156,11 @@ class ModbusTcpDriver:
             raise
 
     def reset(self) -> None:
-        """Clear a latched trip of the device; only on a person's word."""
+        """Clear a latched trip of the device; only on a person's request."""
         self._command(reg.CONTROL_RESET, reg.RESET_KEY)
 
     def trip_cause(self) -> str | None:
-        """Say why the device has zeroed its outputs, or None if it has not."""
+        """Return why the device has zeroed its outputs, None if it has not."""
         status = self._status()
         cause = unpack(">H", status, _offset(reg.STATUS_CAUSE))
         return trip_text(cause, unpack(">I", status, _offset(reg.STATUS_TRIP_TICK)))
@@ -183,7 +183,7 @@ class ModbusTcpDriver:
         if len(laws) != len(self._rig.joints):
             raise DeviceError(f"{len(laws)} laws for a rig of {len(self._rig.joints)} joints")
         values = np.array([astuple(law) for law in laws])
-        with np.errstate(over="ignore"):  # what single precision cannot hold the device refuses
+        with np.errstate(over="ignore"):  # the device refuses values beyond single precision
             words = reg.float_words(values)
         self._control(reg.LAWS.address, words, f"laws {list(laws)}")
         flag = reg.APPLY_AND_RESTART if restart else reg.APPLY
@@ -200,7 +200,7 @@ class ModbusTcpDriver:
     # -- samples ----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start streaming blocks, sequence and waveform phase anew."""
+        """Start streaming blocks, with new sequence numbers and waveform phase."""
         self._command(reg.CONTROL_STREAM, reg.STREAM_START)
         self._decoder.restart()
         self._due = None
@@ -210,7 +210,7 @@ class ModbusTcpDriver:
         self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
 
     def ask_ahead(self) -> None:
-        """Ask for the next block of a device in virtual time, which computes it meanwhile."""
+        """Request the next block of a device in virtual time, which computes it meanwhile."""
         if self.info is not None and self.info.virtual_time and self._link.pipelines:
             words = self._acknowledgement()
             self._link.ask_ahead(
@@ -229,7 +229,7 @@ class ModbusTcpDriver:
             answer = self._exchange()
             header = reg.unpack_header(answer)
             if header.status & _BLOCK and self._decoder.seen(header):
-                # The device offers no block again that it knows to have arrived: a late answer.
+                # The device does not repeat an acknowledged block: a late answer.
                 logger.warning("block %d came a second time; asking again", header.sequence)
                 self._link.settle()
             elif header.status & _BLOCK:
@@ -253,11 +253,11 @@ class ModbusTcpDriver:
     # -- inside -----------------------------------------------------------------------------
 
     def _next_due(self, backlog: int, period: float, *, at_once: bool) -> float | None:
-        """Return when the next block can be there [s, monotonic], None where it is by now.
+        """Return when the next block can be ready [s, monotonic], None if it may be now.
 
-        Asking is work for both ends. A block that was there when first asked for may have waited:
-        the next is asked for a little earlier, so that the host finds the device's clock and
-        follows it.
+        Requests cost time at both ends. A block that was ready at the first request may have
+        waited: the next is requested slightly earlier, so that the host finds the device's clock
+        and follows it.
         """
         if backlog or (self.info is not None and self.info.virtual_time):
             return None
@@ -275,13 +275,13 @@ class ModbusTcpDriver:
                     self._link.settle()
                 answer = self._exchange_once()
             except DeviceSilent as silent:
-                # The block stays in the device until acknowledged, so the same one comes again.
+                # The block stays in the device until acknowledged, so that it is sent again.
                 last = silent
                 if number < self._tries - 1:
                     logger.warning("%s; asking again", silent)
                 continue
             if number:
-                # It may have been the late answer to the first try; then another is on its way.
+                # This may have been the late answer to the first try; another may follow.
                 self._link.settle()
             return answer
         self._link.close()
@@ -303,7 +303,7 @@ class ModbusTcpDriver:
             raise self._explained(refused, "block") from refused
 
     def _acknowledgement(self) -> list[int]:
-        """Return what a request for a block writes: the last one's number, a new heartbeat."""
+        """Return the words written with a block's request: last number, new heartbeat."""
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF
         return [self._decoder.acknowledge, self._heartbeat]
 
@@ -321,7 +321,7 @@ class ModbusTcpDriver:
             raise self._explained(refused, about) from refused
 
     def _explained(self, refused: DeviceRefused, about: str) -> DeviceError:
-        """Return the refusal with the reason that the device's registers give."""
+        """Return the refusal with the reason from the device's registers."""
         status = self._status()
         reason = unpack(">H", status, _offset(reg.STATUS_REFUSAL))
         joint = unpack(">H", status, _offset(reg.STATUS_REFUSAL_JOINT))

@@ -29,22 +29,22 @@ _CHUNK = 4096
 
 
 class ModbusConnection(ABC):
-    """A connection that is opened once and, broken once, stays closed until opened again.
+    """A connection that is opened once and, once broken, stays closed until reopened.
 
-    One request may be under way whose answer nobody waits for yet (`ask_ahead`). Whatever is asked
-    before its answer was taken leaves that answer to be dropped, as a late one.
+    One request may be pending without a waiting caller (`ask_ahead`). A request made before its
+    answer was taken makes that answer a late one, which is dropped.
     """
 
     pipelines: ClassVar[bool]  # requests are numbered, so that two may be under way
 
     def __init__(self, where: str, unit: int, timeout: float) -> None:
-        """Know the device `where` as `unit` of its wire; an answer may take `timeout` [s]."""
+        """Store the device's address `where`, its unit, and the time limit of an answer [s]."""
         self.where = where
         self._unit, self._timeout = unit, timeout
         self._factor = 1.0
-        self._answered = False  # ever since it was opened
+        self._answered = False  # since it was opened
         self._ahead: tuple[int, bytes, int] | None = None  # number, request, registers
-        self._given_up = -1  # number of a request ahead whose answer nobody wants
+        self._given_up = -1  # number of a request ahead whose answer is dropped
 
     @property
     @abstractmethod
@@ -52,7 +52,7 @@ class ModbusConnection(ABC):
         """Whether a request may be sent."""
 
     def open(self) -> None:
-        """Connect; raises DeviceLost where nothing listens, DeviceError where it may not be."""
+        """Connect; raises DeviceLost where nothing listens, DeviceError where it is not allowed."""
         self.close()
         self._answered = False
         self._factor = 1.0
@@ -63,20 +63,20 @@ class ModbusConnection(ABC):
         """Open what is closed; raises as `open`."""
 
     def close(self) -> None:
-        """Close the connection if there is one."""
+        """Close the connection if it is open."""
         self._ahead = None
         self._disconnect()
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Close what may be open."""
+        """Close everything that is open."""
 
     @abstractmethod
     def settle(self) -> None:
         """Let a late answer pass before the next request."""
 
     def be_patient(self, factor: float) -> None:
-        """Wait `factor` times as long for every answer of the open connection."""
+        """Multiply the time limit of answers on the open connection by `factor`."""
         self._factor = factor
 
     def read(self, address: int, count: int, function: int = READ_HOLDING) -> bytes:
@@ -106,16 +106,16 @@ class ModbusConnection(ABC):
         return self._ahead is not None
 
     def ask_ahead(self, write_at: int, words: list[int], read_at: int, count: int) -> None:
-        """Send what `write_and_read` sends, and leave the answer to `answer_ahead`; never raises.
+        """Send the request of `write_and_read` for `answer_ahead`; never raises.
 
-        A connection that cannot send says so at the next request.
+        A failed connection is reported at the next request.
         """
         request = write_and_read_request(write_at, words, read_at, count)
         with suppress(DeviceError):
             self._ahead = self._begin(request), request, count
 
     def answer_ahead(self, within: float | None = None) -> bytes:
-        """Return the registers that `ask_ahead` asked for; raises as `write_and_read`."""
+        """Return the registers requested by `ask_ahead`; raises as `write_and_read`."""
         ahead, self._ahead = self._ahead, None
         if ahead is None:
             raise ValueError("nothing was asked ahead")
@@ -123,7 +123,7 @@ class ModbusConnection(ABC):
         return self._payload(request, self._end(number, within), count)
 
     def _ask(self, request: bytes, within: float | None = None) -> bytes:
-        """Return the answer to a request; DeviceRefused where it was not carried out."""
+        """Return the answer to a request; raises DeviceRefused for a refused one."""
         return self._end(self._begin(request), within)
 
     def _begin(self, request: bytes) -> int:
@@ -169,12 +169,12 @@ class ModbusConnection(ABC):
         return payload
 
     def _mismatch(self, text: str) -> DeviceError:
-        """Return what a whole answer to another request means; leaves nothing behind it."""
-        self.close()  # what else is under way would be taken for the next answer
+        """Return the error of a complete answer to another request; clears the input."""
+        self.close()  # other pending bytes would be taken as the next answer
         return DeviceError(text)
 
     def _no_answer(self, received: int) -> DeviceError:
-        """Return what `received` bytes mean that are no Modbus answer; leaves nothing of them."""
+        """Return the error of `received` bytes that are no Modbus answer; clears the input."""
         self.close()
         return DeviceError(
             f"the device at {self.where} answered {received} bytes that are no Modbus answer "
@@ -188,11 +188,11 @@ class ModbusConnection(ABC):
 
     @abstractmethod
     def _never_answered(self) -> str:
-        """Return what may be wrong where nothing has ever answered."""
+        """Return possible causes if the device has never answered."""
 
 
 class TcpConnection(ModbusConnection):
-    """A connection over TCP, whose answers carry the number of their request."""
+    """A connection over TCP, whose answers have the number of their request."""
 
     pipelines = True
 
@@ -200,7 +200,7 @@ class TcpConnection(ModbusConnection):
         super().__init__(f"{host}:{port}", unit, timeout)
         self._address = host, port
         self._socket: socket.socket | None = None
-        self._waiting = b""  # received and not taken
+        self._waiting = b""  # received and not yet read
         self._transaction = 0
 
     @property
@@ -209,7 +209,7 @@ class TcpConnection(ModbusConnection):
         return self._socket is not None
 
     def settle(self) -> None:
-        """Do nothing: an answer with another number is dropped when it comes."""
+        """Do nothing: answers with another number are dropped on arrival."""
 
     def _connect(self) -> None:
         try:
@@ -219,7 +219,7 @@ class TcpConnection(ModbusConnection):
                 f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setblocking(False)  # with a timeout every call asks the system twice
+        self._socket.setblocking(False)  # with a timeout every call needs two system calls
         self._waiting = b""
 
     def _disconnect(self) -> None:
@@ -235,7 +235,7 @@ class TcpConnection(ModbusConnection):
             sent = self._socket.send(frame)
         except OSError as error:
             self._lost(error)
-        if sent < len(frame):  # no device is asked for so much at once: it has stopped to listen
+        if sent < len(frame):  # no request is that long: the device has stopped reading
             self._lost(None)
         return self._transaction
 
@@ -256,7 +256,7 @@ class TcpConnection(ModbusConnection):
                 logger.warning("a late answer from %s is dropped", self.where)
 
     def _more(self, until: float) -> bytes:
-        """Return what arrives next, before a time [s, monotonic]."""
+        """Return the bytes that arrive before a time [s, monotonic]."""
         assert self._socket is not None
         try:
             ready, _, _ = select.select([self._socket], [], [], max(until - time.monotonic(), 0.0))

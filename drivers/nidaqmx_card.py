@@ -1,8 +1,7 @@
-"""A worked example of a small driver: a DAQ card of National Instruments, by the package `nidaqmx`.
+"""An example of a small driver: a DAQ card of National Instruments, by the package `nidaqmx`.
 
 The package is no dependency of this project; it is imported when a rig file names this kind.
-No card was at hand when this was written: it was tested against a stand-in for the package's
-calls, never on hardware (docs/own-device.md).
+It was tested with a substitute for the package's calls, never on hardware (docs/own-device.md).
 
 Inputs and outputs are software-timed, one sample at a time; the sample clock, the waveform and the
 position loop are those of `drivers.polled`.
@@ -55,7 +54,7 @@ class CardSettings(WireSettings):
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Raise ValueError: no endpoint says what the channels mean."""
+        """Raise ValueError: an endpoint does not describe channels."""
         raise ValueError(f"no channels in {url.geturl()}")
 
 
@@ -69,7 +68,7 @@ class CardInput(Part):
 
 
 class CardOutput(Part):
-    """One analogue output to a joint's valve, in volts as they are."""
+    """One analogue output to a joint's valve, in volts."""
 
     channel: str = Field(pattern=_CHANNEL)
 
@@ -83,7 +82,7 @@ class CardWatchdog(Part):
 
 @dataclass(frozen=True)
 class Wiring:
-    """What is connected where: inputs and outputs as physical channels, volts to SI."""
+    """The connections: inputs and outputs as physical channels, volts to SI."""
 
     inputs: tuple[str, ...]
     ranges: tuple[float, ...]
@@ -95,7 +94,7 @@ class Wiring:
 
 
 def wiring(settings: CardSettings, rig: Rig) -> Wiring:
-    """Return what a rig file says is connected; raises InputError naming the key at fault."""
+    """Return the connections of a rig file; raises InputError naming the key at fault."""
     entries = inputs_by_channel(CardInput, settings.inputs, rig)
     outputs = outputs_by_joint(CardOutput, settings.outputs, rig)
     keys = [f"inputs.{name}" for name in rig.channels]
@@ -232,7 +231,7 @@ class NidaqmxCard:
 
 
 class NidaqmxDriver(PolledDriver):
-    """`drivers.base.Driver` over a DAQ card; raises InputError for wiring that cannot be."""
+    """`drivers.base.Driver` over a DAQ card; raises InputError for impossible wiring."""
 
     settings: ClassVar[type[WireSettings]] = CardSettings
 

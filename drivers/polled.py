@@ -1,13 +1,13 @@
-"""A bench without a sample clock: waveform, position loop and limits run here, at the host's rate.
+"""A bench without a sample clock: waveforms, position loop and limits run here, at the host's rate.
 
 Glossary: a *tick* is a time k / sample_rate since the first connect; to *serve* a tick is to read
 the inputs, evaluate the output laws and write the outputs; the device's *silence* is the time
 since its outputs were last written.
 
-The law of tick k is that of `drivers.base`, with the position s read in that tick. A host that is
-late serves the newest tick that is due, so that waveforms keep their phase; the ticks it left out
-are interpolated or missing (`rig.model.wire.resample`). The command of a row is the voltage put out
-in its tick or, where the tick was left out, the one still held then.
+The law of tick k is that of `drivers.base`, with the position s read in that tick. A late host
+serves the newest due tick, so that waveforms keep their phase; skipped ticks are interpolated or
+missing (`rig.model.wire.resample`). The command of a row is the voltage put out in its tick or, for
+a skipped tick, the one held then.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ Result = TypeVar("Result")
 
 
 class InputsOutputs(Protocol):
-    """A device that only reads and writes: all that a class for a new one has to do.
+    """A device that only reads and writes: the interface to implement for a new one.
 
-    Every method may raise DeviceLost (it does not answer) or DeviceError (it answers nonsense, or
-    refuses); an OSError counts as lost, any other exception as an error of the device.
+    Every method may raise DeviceLost (it does not answer) or DeviceError (invalid answer, or
+    refusal); an OSError counts as lost, any other exception as an error of the device.
     """
 
     @property
@@ -57,7 +57,7 @@ class InputsOutputs(Protocol):
         """Seconds without a write after which the device zeroes its outputs; None: never."""
 
     def open(self) -> str:
-        """Open the device and set its watchdog; return who it is. May be called again."""
+        """Open the device and set its watchdog; return its identity. May be called again."""
 
     def read(self) -> Array:
         """Return one sample of every channel [SI], shape (channels,), ordered as Rig.channels."""
@@ -71,10 +71,10 @@ class InputsOutputs(Protocol):
 
 @dataclass(frozen=True)
 class Timing:
-    """How well a host kept its sample clock since connecting.
+    """How well a host has kept its sample clock since connecting.
 
-    `served` ticks were read and written, `late` of them more than half a period after their
-    time, the worst by `worst` [s]; `missing` ticks are in no block.
+    `served` ticks were read and written, `late` of them more than half a period after their time,
+    the worst by `worst` [s]; `missing` ticks are in no block.
     """
 
     served: int = 0
@@ -86,8 +86,8 @@ class Timing:
 class PolledDriver:
     """`drivers.base.Driver` over an `InputsOutputs`; see there for what each call promises.
 
-    Only `read_block` serves ticks: between two calls the outputs hold their voltage. If more than
-    `wire.watchdog` (or the device's own watchdog) passes so, the next tick zeroes the outputs and
+    Only `read_block` serves ticks: between two calls the outputs hold their voltage. After a pause
+    longer than `wire.watchdog` (or the device's own watchdog), the next tick zeroes the outputs and
     latches a trip. `clock` [s] and `sleep` [s] may be replaced in tests. Raises InputError for a
     rig it cannot run, or a device that does not zero its outputs by itself, unless
     `accept_no_watchdog`.
@@ -131,16 +131,16 @@ class PolledDriver:
         self._open = self._streaming = False
         self._sequence = 0
         self._block_end: int | None = None  # tick after the last block of the stream
-        self._last = -1  # newest tick that is served or in a row
+        self._last = -1  # newest tick that was served or is in a row
         self._volts = np.zeros(len(rig.joints))
         self._written = 0.0
         self._cause: str | None = None
-        self._loss: str | None = None  # why the device was lost, until it is opened again
+        self._loss: str | None = None  # why the device was lost, until it is reopened
         self._timing = Timing()
 
     @property
     def timing(self) -> Timing:
-        """How well the sample clock was kept so far."""
+        """Counts of ticks served, late and missing so far."""
         return replace(self._timing, missing=self._resampler.missing)
 
     # -- session ----------------------------------------------------------------------------
@@ -197,7 +197,7 @@ class PolledDriver:
             )
 
     def zero_outputs(self) -> None:
-        """Put every output to zero now, and keep them so; opens the device anew if need be."""
+        """Put every output to zero now, and keep them so; reopens the device if need be."""
         self._zero_laws()
         if self._open:
             try:
@@ -217,17 +217,17 @@ class PolledDriver:
             raise
 
     def trip_cause(self) -> str | None:
-        """Say why the driver has zeroed the outputs by itself, or None if it has not."""
+        """Return why the driver has zeroed the outputs, None if it has not."""
         self._require_open()
         if self._streaming:
             self._heed_silence()
         return self._cause
 
     def reset(self) -> None:
-        """Clear a latched trip; only on a person's word."""
+        """Clear a latched trip; only on a person's request."""
         if self._cause is not None:
             self._cause = None
-            self._written = self._clock()  # the silence that made the trip is over
+            self._written = self._clock()  # the pause that caused the trip is over
 
     # -- outputs ----------------------------------------------------------------------------
 
@@ -271,7 +271,7 @@ class PolledDriver:
     # -- samples ----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start serving ticks, blocks numbered and waveforms played from their beginning."""
+        """Start serving ticks, with new block numbers and waveforms from their beginning."""
         self._require_open()
         self._rows.clear()
         self._resampler.restart()
@@ -279,12 +279,12 @@ class PolledDriver:
         self._written = self._clock()
         self._last = max(self._last, math.floor(self._periods(self._written) + DRIVER.early))
         self._laws.restart(self._last + 1)
-        values, at = self._take()  # what the first tick is interpolated from
+        values, at = self._take()  # sample from which the first tick is interpolated
         self._resampler.add(at, values, self._saturated(values))
         self._streaming = True
 
     def stop(self) -> None:
-        """Stop serving ticks; nothing follows a law then, so the outputs go to zero."""
+        """Stop serving ticks and zero the outputs, because no law is evaluated then."""
         self._require_open()
         self._streaming = False
         self._rows.clear()
@@ -294,7 +294,8 @@ class PolledDriver:
     def read_block(self) -> SampleBlock:
         """Serve ticks until a block is full or a gap ends it, and return it.
 
-        Raises DeviceLost or DeviceError with the outputs zeroed if the device still obeys.
+        Raises DeviceLost or DeviceError, with the outputs zeroed if the device still accepts
+        writes.
         """
         if not self._streaming:
             if self._loss is not None:
@@ -341,7 +342,7 @@ class PolledDriver:
         )
 
     def _block(self, *, full: bool) -> SampleBlock | None:
-        """Return the oldest rows as a block; with `full` None, unless it is or a gap follows."""
+        """Return the oldest rows as a block; with `full` None if incomplete without a gap."""
         rows = self._rows
         count = 0
         for row, _, _ in rows:
@@ -353,7 +354,7 @@ class PolledDriver:
         taken = [rows.popleft() for _ in range(count)]
         first = taken[0][0].tick
         if self._block_end is not None and first > self._block_end:
-            self._sequence += 1  # what is missing counts as one block
+            self._sequence += 1  # a gap counts as one block
         self._block_end = first + count
         block = SampleBlock(
             sequence=self._sequence,
@@ -373,7 +374,7 @@ class PolledDriver:
         return (now - origin) * self._rig.sample_rate
 
     def _next_tick(self) -> int:
-        """Return the tick to serve next: the newest that is due, never one already in a row."""
+        """Return the tick to serve next: the newest due one, never one already in a row."""
         due = math.floor(self._periods(self._clock()) + DRIVER.early)
         return max(self._last + 1, due)
 
@@ -386,7 +387,7 @@ class PolledDriver:
             self._sleep(ahead / self._rig.sample_rate)
 
     def _take(self) -> tuple[Array, float]:
-        """Read one sample; return it with its time [periods], midway through the reading."""
+        """Read one sample; return it with its time [periods], the middle of the reading."""
         before = self._clock()
         values = np.asarray(self._safely(self._device.read), dtype=np.float64)
         after = self._clock()
@@ -440,7 +441,7 @@ class PolledDriver:
         self._volts = np.zeros(len(self._ranges))
 
     def _make_safe(self) -> None:
-        """After a failed tick: no law acts any more, and zero is tried once."""
+        """After a failed tick: drop all laws and try once to zero the outputs."""
         self._zero_laws()
         self._streaming = False
         if self._open:
@@ -457,7 +458,7 @@ class PolledDriver:
         self._open = False
         try:
             self._device.close()
-        except Exception as error:  # a device that fails in closing is closed
+        except Exception as error:  # a device that fails while closing counts as closed
             logger.debug("while closing: %s", error)
 
     def _safely(self, call: Callable[[], Result]) -> Result:
@@ -488,7 +489,7 @@ class _Laws:
         self._numbers = np.zeros((5, joints))
 
     def set(self, laws: Sequence[OutputLaw], waves: Sequence[Array], start: int | None) -> None:
-        """Take over laws and waveforms; `start` is the tick of the waveforms' first sample."""
+        """Store laws and waveforms; `start` is the tick of the waveforms' first sample."""
         self._numbers = np.array([astuple(law) for law in laws], dtype=np.float64).T
         self._waves = list(waves)
         if start is not None:
@@ -503,7 +504,7 @@ class _Laws:
         self._numbers = np.array([astuple(OFF)] * self._joints, dtype=np.float64).T
 
     def volts(self, tick: int, positions: NDArray[np.float64]) -> Array:
-        """Return the outputs [V] at a tick; zero for a joint whose position is no number."""
+        """Return the outputs [V] at a tick; zero for a joint whose position is NaN."""
         gain, bias, position_gain, setpoint, limit = self._numbers
         waves = zip(self._waves, self._starts, strict=True)
         wave = np.array([samples[(tick - start) % len(samples)] for samples, start in waves])
@@ -517,7 +518,7 @@ def _block_samples(rate: float) -> int:
 
 
 def _silence_allowed(wire: Wire, rig: Rig, watchdog: float | None, accepted: bool) -> float:
-    """Return the silence [s] from which on outputs are zeroed; raises InputError if unfit."""
+    """Return the longest pause [s] before outputs are zeroed; raises InputError if unsuitable."""
     if watchdog is None and not accepted:
         raise InputError(
             f"wire: zero_by: the device of wire {wire.kind} does not zero its outputs when the "

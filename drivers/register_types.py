@@ -1,7 +1,7 @@
 """Numbers in 16-bit registers: type and word order to values and back.
 
-A register's two bytes come high byte first, as Modbus has them. A wider number takes consecutive
-registers; `big` has its high word first, `little` its low word.
+A register has its high byte first, as in Modbus. A wider number has consecutive registers; `big`
+has its high word first, `little` its low word.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class RegisterType(StrEnum):
 
 
 class WordOrder(StrEnum):
-    """Which word of a wide number stands at the lowest address."""
+    """Which word of a wide number is at the lowest address."""
 
     BIG = "big"
     LITTLE = "little"
@@ -43,7 +43,7 @@ _FORMS: Final = {
 
 
 def word_count(form: RegisterType) -> int:
-    """Return how many registers a number takes."""
+    """Return the number of registers of a number."""
     return struct.calcsize(_FORMS[form]) // 2
 
 

@@ -15,12 +15,12 @@ GROUP: Final = "bramah.drivers"
 
 
 def wire_kinds() -> tuple[str, ...]:
-    """Name the kinds of wire that an installed driver serves."""
+    """Return the kinds of wire for which a driver is installed."""
     return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
 
 
 def driver_class(kind: str) -> type[Driver]:
-    """Return the driver of a kind of wire; raises InputError for one that nothing serves."""
+    """Return the driver of a kind of wire; raises InputError for an unknown kind."""
     entries: list[EntryPoint] = list(entry_points(group=GROUP, name=kind))
     if not entries:
         raise InputError(f"wire: kind: {kind!r} has no driver; installed: {' '.join(wire_kinds())}")
@@ -39,7 +39,7 @@ def make_driver(wire: Wire, rig: Rig) -> Driver:
 def wire_at(endpoint: str, wire: Wire) -> Wire:
     """Return the wire to an endpoint such as ``modbus-tcp://127.0.0.1:5020``; times as in `wire`.
 
-    Raises InputError for another form, naming the one expected.
+    Raises InputError for another form, naming the expected one.
     """
     kinds = wire_kinds()
     url = urlsplit(endpoint)

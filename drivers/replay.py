@@ -1,11 +1,10 @@
 """A driver that plays a recorded run as if it were a device (docs/runs.md, "records.h5").
 
-All records and what lies between them are played in the order they were taken. The commands in
-the samples are those recorded: nothing that a host asks for changes them. Laws that would put
-something out are therefore refused, unless `ignore_outputs` is true; laws of zero are taken.
-Samples lost when recording are missing here as well, and counted so.
-
-Played as fast as it is read (`pace: 0`, virtual time) or `pace` times as fast as recorded.
+All records and the samples between them are played in the order of recording. The commands in the
+samples are the recorded ones, whatever the host requests. Laws with an output are therefore
+refused, unless `ignore_outputs` is true; laws of zero are accepted. Samples lost when recording
+count as missing here. The run is played as fast as it is read (`pace: 0`, virtual time) or `pace`
+times as fast as recorded.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class ReplaySettings(WireSettings):
 
 
 class ReplayDriver:
-    """`drivers.base.Driver` over a recording; see there for what each call promises."""
+    """`drivers.base.Driver` over a recording; see there for each call."""
 
     settings: ClassVar[type[WireSettings]] = ReplaySettings
     host_timed: ClassVar[bool] = False
@@ -123,12 +122,12 @@ class ReplayDriver:
         return None
 
     def upload(self, joint: int, wave: Array) -> None:
-        """Check a waveform [V] and drop it."""
+        """Check a waveform [V] and discard it."""
         self._open()
         possible_wave(joint, wave, self._rig)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
-        """Take laws that put nothing out, others only with `ignore_outputs`; returns the tick."""
+        """Accept laws without output, others only with `ignore_outputs`; return the tick."""
         self._open()
         for number, law in enumerate(possible_laws(laws, self._rig), start=1):
             drives = law.limit > 0.0 and (law.gain, law.bias, law.position_gain) != (0.0, 0.0, 0.0)
@@ -142,7 +141,7 @@ class ReplayDriver:
     # -- samples ----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start a stream where the one before ended; pacing begins here."""
+        """Start a stream at the end of the previous one; pacing begins here."""
         self._open()
         self._streaming, self._sequence = True, 0
         self._began, self._first = self._clock(), self._tick
@@ -176,7 +175,7 @@ class ReplayDriver:
         return block
 
     def _wait(self, tick: int) -> int:
-        """Wait until the sample before `tick` is due; return the blocks that are due as well."""
+        """Wait until the sample before `tick` is due; return the number of further blocks due."""
         rate = self._settings.pace * self._rig.sample_rate
         if not rate:
             return 0

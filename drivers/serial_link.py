@@ -1,4 +1,4 @@
-"""Messages over the bytes of a serial port: frames, and what a wrong baud rate looks like."""
+"""Messages over the bytes of a serial port: frames, and diagnosis of a wrong baud rate."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
 
 
 class SerialLine:
-    """`drivers.message_link.MessageLine` over a `Transport`; see there for what each call does."""
+    """`drivers.message_link.MessageLine` over a `Transport`; see there for each call."""
 
     def __init__(self, transport: Transport) -> None:
         self.transport = transport
@@ -25,21 +25,21 @@ class SerialLine:
         return self.transport.is_open
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the port; raises what `Transport.open` does."""
+        """Open the port; raises as `Transport.open`."""
         self.transport.open(shared=shared)
         self._decoder.reset()
         self._damaged, self._received = self._decoder.damaged, self._decoder.received
 
     def send(self, message: WireFrame) -> None:
-        """Send a message; raises DeviceLost when the port has gone."""
+        """Send a message; raises DeviceLost when the port is lost."""
         self.transport.write(encode_frame(message))
 
     def receive(self, patience: float) -> list[WireFrame]:
-        """Return the messages that are whole; raises DeviceLost when the port has gone."""
+        """Return the complete messages; raises DeviceLost when the port is lost."""
         return self._decoder.feed(self.transport.read(patience))
 
     def complaint(self, heard: int) -> str:
-        """Say what came that may explain a silence, or nothing."""
+        """Return what may explain missing answers, or ''."""
         came = self._decoder.received - self._received
         if came and not heard:
             return (

@@ -38,7 +38,7 @@ class SerialSettings(WireSettings):
 
 
 class SerialStreamDriver(MessageStreamDriver):
-    """`drivers.base.Driver` over a serial line; see there for what each call promises."""
+    """`drivers.base.Driver` over a serial line; see there for each call."""
 
     settings: ClassVar[type[WireSettings]] = SerialSettings
 

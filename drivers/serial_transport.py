@@ -1,6 +1,6 @@
-"""Bytes of a serial port: the one thing the serial driver needs of an operating system.
+"""Bytes of a serial port, the serial driver's interface to the operating system.
 
-Another library takes pyserial's place by another class with the four methods of `Transport`.
+To use another library than pyserial, write another class with the methods of `Transport`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Transport(Protocol):
 
     @property
     def where(self) -> str:
-        """The port's name, for people."""
+        """The port's name."""
 
     @property
     def is_open(self) -> bool:
@@ -45,12 +45,12 @@ class Transport(Protocol):
         """
 
     def write(self, data: bytes) -> None:
-        """Send bytes; raises DeviceLost when the port has gone."""
+        """Send bytes; raises DeviceLost when the port is lost."""
 
     def read(self, patience: float) -> bytes:
-        """Return what is waiting, at once if there is any; nothing after `patience` [s] or so.
+        """Return waiting bytes, at once if there are any; nothing after about `patience` [s].
 
-        Raises DeviceLost when the port has gone.
+        Raises DeviceLost when the port is lost.
         """
 
     def close(self) -> None:
@@ -58,7 +58,7 @@ class Transport(Protocol):
 
 
 def why_not_opened(device: str, baud: int, error: Exception) -> DeviceError:
-    """Return the error of a serial port that the system would not open, and what to do about it."""
+    """Return the error of a serial port that cannot be opened, with a remedy."""
     text = str(error)
     if "exclusively lock" in text:
         return PortInUse(
@@ -142,7 +142,7 @@ class PySerialTransport:
         port = self._usable()
         end = time.monotonic() + patience
         try:
-            # One wait and one read where the port is a file: pyserial takes twice as many calls.
+            # One wait and one read where the port is a file: pyserial needs twice as many calls.
             while self._file is not None:
                 left = end - time.monotonic()
                 if select.select([self._file], [], [], min(max(left, 0.0), DRIVER.serial_wait))[0]:

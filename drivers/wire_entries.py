@@ -1,8 +1,7 @@
 """The tables of a rig file's section `wire`: one entry for every channel and for every output.
 
-Whoever describes a device's channels in a rig file has the same mistakes to find: a channel that
-the rig does not measure, one that is not described, a wrong key, a unit of another dimension.
-Each is refused with the key's name.
+Errors of all such tables are reported with the key's name: a channel that the rig does not measure,
+a missing one, a wrong key, a unit of another dimension.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from rig.model.rig import Rig
 
 Entry = TypeVar("Entry", bound=Part)
 
-# What a step of a scale is measured in, where a point on it has an offset.
+# Unit of a difference, where the unit of a value has an offset.
 _DIFFERENCE = {"degC": "delta_degC"}
 
 
@@ -65,7 +64,7 @@ def _complete(table: str, given: Sequence[str], wanted: Sequence[str], about: st
 
 
 def scale_of(text: Any, unit: str, key: str, per: str = "") -> float:
-    """Read a step in a channel's SI unit, `per` something, such as '/V'; not zero; InputError."""
+    """Read a scale in a channel's SI unit per `per`, such as '/V'; not zero; raises InputError."""
     scale = read_quantity(text, f"{_DIFFERENCE.get(unit, unit)}{per}", f"wire: {key}")
     if scale == 0.0:
         raise InputError(f"wire: {key}: is zero; every reading would be the same")

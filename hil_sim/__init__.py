@@ -1,1 +1,1 @@
-"""The simulated bench: a plant with finer physics than the analysis, at the far end of a wire."""
+"""The simulated bench: a plant with more detailed physics than the analysis, behind a wire."""

@@ -1,1 +1,1 @@
-"""What to do on the bench, in what order: lock, excite, repeat."""
+"""Protocols: the steps of an experiment and their order (lock, excite, repeat)."""

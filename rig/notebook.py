@@ -1,8 +1,7 @@
-"""What a notebook or a script works with, under one name: `from rig import notebook as bench`.
+"""Functions for notebooks and scripts: `from rig import notebook as bench`.
 
-Reading, identifying, judging and tracing are the functions that the command line calls, named here
-so that nobody has to look for them. Own to this module is what a file and a terminal do elsewhere:
-tables, plots, a protocol with a step changed, and taking its records. Nothing here prints.
+Reading, identification, validation and trace are the functions of the command line, collected here.
+This module adds tables, plots, changes of a protocol's step, and runs. Nothing here prints.
 
 Glossary: a *run* is a folder's content, a *record* one repeat of one step (`rig.model.records`).
 """
@@ -53,7 +52,7 @@ _PANEL = 1.1  # [in] of height for one channel
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure that a notebook shows as it stands; `figure` is Matplotlib's, to change further."""
+    """A figure that a notebook displays; `figure` is Matplotlib's, to change further."""
 
     figure: Figure
 
@@ -63,7 +62,7 @@ class Plot:
         return text.getvalue()
 
     def save(self, path: str | Path) -> Path:
-        """Write it as the format that the path's ending names; returns the path.
+        """Write it in the format of the path's ending; return the path.
 
         An old file is replaced when the new one is complete. Raises OSError.
         """
@@ -74,7 +73,7 @@ class Plot:
 
 
 def record(run: Run, name: str) -> Record:
-    """Return the record of a run by its name, as `step1_r2`; raises InputError naming those."""
+    """Return the record of a run by its name, such as `step1_r2`; raises InputError naming all."""
     for candidate in run.records:
         if candidate.name == name:
             return candidate
@@ -89,13 +88,13 @@ def units(run: Run) -> dict[str, str]:
 
 
 def frame(run: Run, name: str) -> DataFrame:
-    """Return a record as a table: a row a sample, indexed by the time [s] since the run began.
+    """Return a record as a table: a row per sample, indexed by the time [s] since the run began.
 
     Columns are channels in SI; `attrs` holds `units` and the record's attributes. Raises InputError
     for an unknown record, or where pandas (`pip install 'bramah[export]'`) is missing.
     """
     try:
-        import pandas  # noqa: PLC0415 - wanted on request alone
+        import pandas  # noqa: PLC0415 - needed here only
     except ImportError as error:
         raise InputError("a table needs pandas: pip install 'bramah[export]'") from error
     taken = record(run, name)
@@ -106,7 +105,7 @@ def frame(run: Run, name: str) -> DataFrame:
 
 
 def plot(run: Run, name: str, channels: Sequence[str] | None = None) -> Plot:
-    """Draw channels of a record over its time, a panel each; all of them by default."""
+    """Draw channels of a record over its time, one panel each; all of them by default."""
     taken = record(run, name)
     chosen = list(channels or taken.channels)
     unknown = [channel for channel in chosen if channel not in taken.channels]
@@ -120,7 +119,7 @@ def plot(run: Run, name: str, channels: Sequence[str] | None = None) -> Plot:
 
 
 def plot_validation(result: RecordValidation) -> Plot:
-    """Draw what was measured in a record, and over it the model's free run."""
+    """Draw the measured channels of a record with the model's free run."""
     simulated = result.simulation.channels()
     series = {
         f"{channel} [{result.units.get(channel, 'SI')}], FIT {fit:.1f} %": [
@@ -146,10 +145,10 @@ def _panels(time: Any, series: Mapping[str, Sequence[Any]], title: str) -> Plot:
 
 
 def changed(protocol: Protocol, step: str, changes: Mapping[str, Any]) -> Protocol:
-    """Return a protocol with one step changed and checked again as its file would be.
+    """Return a protocol with one step changed, checked as a file is.
 
-    `changes` maps keys of the step, as error messages write them, to values with units:
-    ``{"repeats": 2, "excite.0.signal.amplitude": "0.6 V"}``. Raises InputError naming step and key.
+    `changes` maps keys of the step, as in error messages, to values with units: ``{"repeats": 2,
+    "excite.0.signal.amplitude": "0.6 V"}``. Raises InputError naming step and key.
     """
     names = [part.name for part in every_step(protocol.steps) if part.name]
     if step not in names:
@@ -172,7 +171,7 @@ def changed(protocol: Protocol, step: str, changes: Mapping[str, Any]) -> Protoc
 
 
 def _put(data: Any, path: str, value: Any, step: str) -> None:
-    """Set one key of nested plain data; raises InputError for one that is not there."""
+    """Set one key of nested plain data; raises InputError for a missing one."""
     *way, last = path.split(".")
     for key in way:
         data = _at(data, key, path, step)
@@ -193,8 +192,8 @@ def _at(data: Any, key: str, path: str, step: str) -> Any:
 def check(protocol: str | Protocol, rig: str, overrides: Overrides | None = None) -> PlanProof:
     """Prove a protocol on the twin and predict its standard errors; nothing moves.
 
-    `report.ok` says whether every limit is kept, `report.refused` which are not, `text` what the
-    records would tell. Raises InputError for what does not fit together.
+    `report.ok` states whether every limit is kept, `report.refused` which are not, `text` the
+    predicted errors. Raises InputError for a protocol that does not fit the rig.
     """
     how = overrides or Overrides()
     made = load_protocol(protocol, how.parameters) if isinstance(protocol, str) else protocol
@@ -211,10 +210,10 @@ def take(
 ) -> Run:
     """Run a protocol on a bench into the folder `out`, unattended, and return what was recorded.
 
-    As `bramah run`: proved first, every sample guarded, the outputs at zero at its end, however it
-    ends. A protocol that was changed is written beside the run, as OUT.yaml, so that it can be run
-    again. Progress goes to this module's logger. Raises what `bramah run` ends with: InputError,
-    SafetyTrip, DeviceError, OperatorStop.
+    As `bramah run`: proved first, every sample guarded, the outputs zeroed at any end. A changed
+    protocol is written next to the run, as OUT.yaml, so that it can be run again. Progress goes to
+    this module's logger. Raises what `bramah run` ends with: InputError, SafetyTrip, DeviceError,
+    OperatorStop.
     """
     folder = Path(out)
     if isinstance(protocol, Protocol):

@@ -1,1 +1,1 @@
-"""Experiments before they run: predicted standard errors, limits, better excitations."""
+"""Design of experiments: predicted standard errors, limits, better excitations."""

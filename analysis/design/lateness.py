@@ -1,4 +1,4 @@
-"""What samples taken late by a host cost the bulk modulus, before the experiment.
+"""Predicted error of the bulk modulus from samples that a host takes late.
 
 A host-timed device has no sample clock: sample k is taken at k + e_k periods, e_k >= 0 random, and
 put onto the even grid by `rig.model.wire.resample`. The twin's noise-free records (a cubic spline
@@ -38,10 +38,10 @@ BULK = "b"
 
 @dataclass(frozen=True)
 class LatenessCost:
-    """What late samples cost b: `jitter` [s] as assumed, shift and scatter relative to b.
+    """Error of b by late samples: `jitter` [s] as assumed, shift and scatter relative to b.
 
-    `scatter` is that of one experiment, both are NaN where no draw left a b at all; `missing` is
-    the share of samples left out because two that were taken lay too far apart.
+    `scatter` is that of one experiment; both are NaN where no draw determined b; `missing` is the
+    share of samples left out because two neighbouring samples were too far apart.
     """
 
     jitter: float
@@ -50,15 +50,14 @@ class LatenessCost:
     missing: float
 
     def widened(self, half: float) -> float:
-        """Return the relative half width of b's interval with this cost, from that without."""
+        """Return the relative half width of b's interval with this error added to `half`."""
         return abs(self.shift) + math.hypot(half, 2.0 * self.scatter)
 
 
 def late_times(samples: int, jitter: float, rng: np.random.Generator) -> Array:
     """Return when a host serves ticks 0 to `samples` - 1 [periods], `jitter` [periods] its spread.
 
-    One that is late by more than a period serves the newest tick that is due, as
-    `drivers.polled` does.
+    A host that is late by more than a period serves the newest due tick, as `drivers.polled` does.
     """
     times: list[float] = []
     tick = 0
@@ -71,7 +70,7 @@ def late_times(samples: int, jitter: float, rng: np.random.Generator) -> Array:
 
 
 def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Record:
-    """Return a record as a host with `jitter` [s] would have made it; missing samples are NaN."""
+    """Return a record as sampled by a host with `jitter` [s]; missing samples are NaN."""
     from scipy.interpolate import CubicSpline  # noqa: PLC0415 - loads slowly
 
     names, n = list(record.channels), record.samples
@@ -85,7 +84,7 @@ def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Recor
         for made in resampler.add(float(at), row, unmarked):
             if made.tick < n:
                 out[made.tick] = made.values
-    # The driver's stream goes on before and after a record; only the twin's ends here.
+    # The driver's stream continues before and after a record; the twin's ends here.
     out[:1], out[-1:] = values[:1], values[-1:]
     return replace(record, channels={name: out[:, k] for k, name in enumerate(names)})
 
@@ -97,7 +96,7 @@ def lateness_cost(
     filtering: Filters,
     jitter: float,
 ) -> LatenessCost | None:
-    """Return what `jitter` [s] costs b in these steps; None where b is not determined by them."""
+    """Return the error of b by `jitter` [s] in these steps; None if they do not determine b."""
     rng = np.random.default_rng(DESIGN.seed)
     even = _bulk(rig, played, terms, filtering, {})
     if even is None:

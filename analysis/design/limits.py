@@ -1,9 +1,9 @@
-"""How much of each limit an excitation uses, and a linear forecast of that for another one.
+"""The share of each limit that an excitation uses, with a linear forecast for another one.
 
-A share of 1 is at the limit. Limits are those of the rig file and, more strictly than `check`,
-what spoils records: chamber pressures stay between tank and supply, the pump carries the flow.
-The forecast takes the twin's response line by line (its best linear approximation, Pintelon and
-Schoukens, ch. 3) and so costs one FFT per signal instead of a simulation.
+A share of 1 is at the limit. Limits are those of the rig file and, more strictly than in `check`,
+those of usable records: chamber pressures between tank and supply, flow within the pump's. The
+forecast uses the twin's response at each line (its best linear approximation, Pintelon and
+Schoukens, ch. 3), one FFT per signal instead of a simulation.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Bound:
 
     @property
     def share(self) -> float:
-        """The largest part of the way from the mean to a limit that the signal goes."""
+        """The largest deviation from the mean over that to the limit."""
         return _share(self.signal, self.low, self.high)
 
 
@@ -47,7 +47,7 @@ def _share(signal: Array, low: float, high: float) -> float:
 
 
 def bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> list[Bound]:
-    """Return what a step's motion on the twin must stay within."""
+    """Return the signals of a step's motion on the twin with their limits."""
     out: list[Bound] = []
     demand = np.zeros(len(motion["piston"]))
     for j in step.waves:
@@ -58,10 +58,10 @@ def bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> list[Bound]
         least, most = -rig.supply.flow / cylinder.rod_area, rig.supply.flow / cylinder.cap_area
         out.append(Bound("pump flow", j, speed, least, most))
     if len(step.waves) > 1:
-        # Flow has no sign; laid out both ways its mean is zero like the others'.
+        # The flow is positive; with its mirror image appended its mean is zero like the others'.
         both = np.append(demand, -demand)
         out.append(Bound("pump flow", -1, both, -rig.supply.flow, rig.supply.flow))
-    for j, tolerance in step.gives.items():
+    for j, tolerance in step.yields.items():
         piston, allowed = motion["piston"][:, j], DESIGN.lock_share * tolerance
         out.append(Bound("closed lock", j, piston - piston.mean(), -allowed, allowed))
     return out
@@ -97,8 +97,8 @@ def _joint_bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array], j: int)
 def _under_loop(piston: Array, command: Array, loop: float, rate: float) -> Array:
     """Return a period (n,) of the piston, about zero, while a loop [V/m] centres it beforehand.
 
-    With w_c = loop times the piston's speed per volt, a line goes by j w / (j w + w_c). Slow lines
-    shrink, but others turn against one another: the peaks may grow.
+    With w_c = loop times the piston's speed per volt, a line is multiplied by j w / (j w + w_c).
+    Slow lines shrink and phases change, so that peaks may grow.
     """
     n = len(piston)
     w = 2 * np.pi * np.fft.rfftfreq(n, 1.0 / rate)
@@ -119,8 +119,8 @@ def used(rig: Rig, played: Played) -> tuple[float, str]:
 class LimitForecast:
     """The linear response of every bounded signal to one joint's command, about its mean.
 
-    `lines` (k,) are those it knows, `responses` (b, k), `low` and `high` (b,) how far below and
-    above its mean each signal may go; `n` samples a period.
+    `lines` (k,) are the known lines, `responses` (b, k), `low` and `high` (b,) how far below and
+    above its mean each signal may go; `n` samples per period.
     """
 
     n: int
@@ -142,10 +142,10 @@ class LimitForecast:
         )
 
     def flattened(self, spectrum: Spectrum, rounds: int) -> tuple[Spectrum, float]:
-        """Return the spectrum with other phases whose worst share is lower, and that share.
+        """Return the spectrum with phases of lower worst share, and that share.
 
-        The worst signal is clipped and the phases of what is left are taken: time-frequency
-        swapping (Van der Ouderaa, Schoukens and Renneboog 1988), for whichever signal is worst.
+        The worst signal is clipped and the phases of the result are used: time-frequency swapping
+        (Van der Ouderaa, Schoukens and Renneboog 1988), for whichever signal is worst.
         """
         best, lowest = spectrum, float("inf")
         size = np.abs(spectrum)

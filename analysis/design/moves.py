@@ -1,4 +1,4 @@
-"""Changes of one joint's spectrum that the search for a better excitation tries."""
+"""Changes of one joint's spectrum in the search for a better excitation."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ KINDS = ("shape", "bump", "lines", "phases")
 
 @dataclass(frozen=True)
 class Tone:
-    """The lines that one joint of one step may use, and the amplitude and phase of each [V].
+    """Lines that one joint of one step may use, with the amplitude and phase of each [V].
 
-    `empty` lines stay so; `spectrum` (lines,) is zero where a line is not used.
+    `empty` lines stay empty; `spectrum` (lines,) is zero where a line is not used.
     """
 
     joint: int
@@ -37,7 +37,7 @@ class Tone:
 
 
 def mutated(tone: Tone, early: bool, rng: np.random.Generator) -> tuple[Spectrum, int]:
-    """Return the tone's spectrum with one random change, and how many plays that is worth.
+    """Return the tone's spectrum with one random change, and how many simulations to spend on it.
 
     `early` in a search, large changes are more frequent.
     """
@@ -66,14 +66,14 @@ def mutated(tone: Tone, early: bool, rng: np.random.Generator) -> tuple[Spectrum
 
 
 def tilted(tone: Tone, tilt: float, rng: np.random.Generator) -> tuple[Spectrum, int]:
-    """Return all lines with amplitudes f^-tilt, of the tone's power, and its worth in plays."""
+    """Return all lines with amplitudes f^-tilt and the tone's power, and simulations to spend."""
     size = tone.lines.astype(np.float64) ** -tilt
     size *= np.linalg.norm(tone.spectrum) / np.linalg.norm(size)
     return np.asarray(size * np.exp(2j * np.pi * rng.random(len(size)))), 4
 
 
 def reshaped(tone: Tone, rng: np.random.Generator) -> Array:
-    """Return amplitudes f^-tilt in a random band above the lowest lines, which stay."""
+    """Return amplitudes f^-tilt in a random band above the lowest lines, which are kept."""
     size = np.abs(tone.spectrum)
     lowest = np.flatnonzero(size > 0)[: DESIGN.anchors]
     many, first = len(size), int(lowest[-1]) + 1
@@ -107,7 +107,7 @@ def tone_of(joint: int, wave: Array, empty: Sequence[int]) -> Tone:
 
 
 def envelope(tone: Tone) -> Array:
-    """Return the amplitude (lines,) a line would have among its neighbours in use."""
+    """Return the amplitude (lines,) of each line, interpolated between the lines in use."""
     size = np.abs(tone.spectrum)
     in_use = size > 0
     return np.asarray(np.interp(tone.lines, tone.lines[in_use], size[in_use]))

@@ -1,15 +1,14 @@
-"""Improving an excitation: lines, amplitudes and phases for what is identified worst.
+"""Improvement of an excitation: lines, amplitudes and phases for the worst parameters.
 
 A seeded evolution strategy (one parent, one child) over the spectra of the steps. A child changes
-one joint's spectrum in one step: a smooth bump of its amplitudes, another band, a few lines left
-out or brought back, a new tilt, or its phases; phases are then changed until the forecast peaks
-are low, and the whole is scaled to fill the tightest limit. It is judged by the predicted
-covariance on the twin (`prediction`), rows and noise as in the identification itself, and lives
-if the criterion falls and no other parameter pays too much for it (`KEEP`). The information
-of the other steps is kept, so a trial costs one step's simulation. Criteria, of the covariance
-relative to the nominal parameters (Pintelon and Schoukens, ch. 5; Pronzato and Pazman, Design of
-Experiments in Nonlinear Models, ch. 5): D log det, E the largest eigenvalue, or one parameter's
-variance.
+one joint's spectrum in one step: a smooth bump of its amplitudes, another band, a few lines removed
+or added, a new tilt, or its phases. Phases are then changed until the forecast peaks are low, and
+the whole is scaled to reach the tightest limit. It is judged by the predicted covariance on the
+twin (`predict`), with rows and noise as in the identification, and accepted if the criterion falls
+and no other parameter becomes too poor (`kept_error`). The information of the other steps is
+reused, so a trial costs one step's simulation. Criteria, of the covariance relative to the nominal
+parameters (Pintelon and Schoukens, ch. 5; Pronzato and Pazman, Design of Experiments in Nonlinear
+Models, ch. 5): D log det, E the largest eigenvalue, or one parameter's variance.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ Passes = Callable[[TwinStep, Mapping[int, Tone]], bool]
 
 @dataclass(frozen=True)
 class Candidate:
-    """One step as designed so far: its tones by joint, the twin's motion, the information."""
+    """One step of a design: its tones by joint, the twin's motion, the information."""
 
     tones: Mapping[int, Tone]
     simulated: Played
@@ -77,8 +76,8 @@ def improve(
     """Improve the steps' multisines with `budget` simulations of a step on the twin.
 
     `empty` names the detection lines of (step, 0-based joint) at the step's period; `criterion` is
-    D, E or a parameter; `passes` may refuse a step that is about to be kept. Raises InputError
-    for an unknown criterion and where no step has a multisine.
+    D, E or a parameter; `passes` may refuse a step before it is accepted. Raises InputError for an
+    unknown criterion and where no step has a multisine.
     """
     search = _Search(rig, criterion, rng)
     candidates = [search.first(step, empty) for step in steps]
@@ -116,7 +115,7 @@ def improve(
 
 
 class _Search:
-    """What all children share: rig, model, criterion, random stream, the guarded errors."""
+    """Shared by all children: rig, model, criterion, random stream, errors at the start."""
 
     def __init__(self, rig: Rig, criterion: str, rng: np.random.Generator) -> None:
         self.rig, self.criterion, self.rng = rig, criterion, rng
@@ -132,13 +131,13 @@ class _Search:
         self.gains: dict[str, Mapping[int, float]] = {}
 
     def begin(self, steps: Sequence[StepInformation]) -> None:
-        """Refuse steps that leave the wanted undetermined; remember how good each parameter was."""
+        """Store the first errors; raise InputError if a wanted parameter is undetermined."""
         errors = self.errors(steps)
         lost = [n for n, e in errors.items() if not math.isfinite(e)]
         wanted = lost if self.criterion in ("D", "E") else [n for n in lost if n == self.criterion]
         if wanted:
             raise InputError(
-                f"the steps do not determine {' '.join(wanted)}; no excitation cures that: "
+                f"the steps do not determine {' '.join(wanted)}; no excitation helps: "
                 "add a step that excites the joint concerned"
             )
         known = {n: e for n, e in errors.items() if math.isfinite(e)}
@@ -147,7 +146,7 @@ class _Search:
         self.allowed = {n: max(DESIGN.kept_error * e, about) for n, e in known.items()}
 
     def loosen(self, steps: Sequence[StepInformation]) -> None:
-        """Rate a start that had to be made smaller to keep the limits by that smaller motion."""
+        """Take the errors at the start from a start that was scaled down to keep the limits."""
         for name, error in self.errors(steps).items():
             if name in self.allowed:
                 self.allowed[name] = max(self.allowed[name], 1.001 * error)
@@ -167,7 +166,7 @@ class _Search:
         return out
 
     def value(self, steps: Sequence[StepInformation]) -> float:
-        """Return the criterion, smaller is better; infinite where a parameter got too poor."""
+        """Return the criterion, smaller is better; infinite where a parameter became too poor."""
         covariances = self.relative(steps)
         errors = self.errors(steps)
         if any(not errors[n] <= limit for n, limit in self.allowed.items()):
@@ -179,7 +178,7 @@ class _Search:
         return errors[self.criterion] ** 2
 
     def text(self, value: float) -> str:
-        """Say a criterion's value as a relative error."""
+        """Return a criterion's value in words, as a relative error."""
         if self.criterion == "D":
             size = sum(len(names) for names in self.names.values())
             return f"D: {100 * math.exp(0.5 * value / size):.4f} % geometric mean"
@@ -187,7 +186,7 @@ class _Search:
         return f"{what}: {100 * math.sqrt(value):.4f} %"
 
     def first(self, step: TwinStep, empty: Mapping[tuple[str, int], tuple[int, ...]]) -> Candidate:
-        """Play the protocol's own step and lay its tones out."""
+        """Simulate the protocol's own step and determine its tones."""
         tones = {
             j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()
         }
@@ -196,13 +195,13 @@ class _Search:
         return candidate
 
     def judged(self, step: TwinStep, tones: Mapping[int, Tone]) -> Candidate:
-        """Play a step; raises InputError where the twin cannot."""
+        """Simulate a step; raises InputError where the twin cannot."""
         simulated = play(self.rig, step)
         step_information = information(self.rig, simulated, self.terms)
         return Candidate(tones, simulated, step_information, *used(self.rig, simulated))
 
     def fitted(self, candidate: Candidate) -> tuple[Candidate, int]:
-        """Make a step that passes a limit smaller until it keeps them all."""
+        """Scale a step that exceeds a limit down until it keeps them all."""
         cost = 0
         while candidate.share > DESIGN.fill and cost < 6:
             smaller = {
@@ -221,7 +220,7 @@ class _Search:
         """Return a changed copy of one step that keeps the limits, or None, and its cost.
 
         With a `tilt` all lines are used, amplitudes f^-tilt; without, the change is random. The
-        forecast is made anew from each play, because the twin is not linear.
+        forecast is renewed from each simulation, because the twin is not linear.
         """
         tone = parent.tones[joint]
         spectrum, plays = (
@@ -248,10 +247,10 @@ class _Search:
         return fitting, plays
 
     def centrable(self, candidate: Candidate) -> bool:
-        """Return whether the pistons still follow their commands about as they did at first.
+        """Return whether the pistons' gains are about the same as at the start.
 
-        The bench trims its biases by that gain; excited only near its resonance a joint shows
-        none, and could not be kept in its stroke.
+        The bench trims its biases by that gain; excited only near its resonance a joint shows none,
+        and could not be kept within its stroke.
         """
         simulated = candidate.simulated
         first = self.gains[simulated.step.name]

@@ -1,13 +1,13 @@
-"""Identifiability before the experiment: each parameter's standard error, predicted.
+"""Predicted standard error of each parameter, before the experiment.
 
-The plan's steps are played on the twin (nominal parameters), their rows are built exactly as
+The plan's steps are simulated on the twin (nominal parameters), their rows are built exactly as
 `identify` builds them, and the rig's stated sensor noise is carried through the filters
 (`prediction_noise`). With A = sum n_s X_s'X_s and n_s repeats of step s the coupled solution has
     cov beta = A^-1 [ sum n_s cov g_s ] A^-1.
-What is predicted is the scatter between repeats. Model error is not noise and is not in it; what
-the oil's temperature does to b from step to step is given apart (`oil`), because it shows between
-experiments and not between the repeats of one. Glossary: `std` standard error of one experiment,
-`half` half width of its 95 % interval, both relative to the nominal value.
+The prediction is the scatter between repeats. It excludes model error; the effect of the oil's
+temperature on b between steps is separate (`oil`), because it differs between experiments but not
+between the repeats of one. Glossary: `std` standard error of one experiment, `half` half width of
+its 95 % interval, both relative to the nominal value.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ Filters = Callable[[Record], Filtering]
 
 @dataclass(frozen=True)
 class StepInformation:
-    """What one record of a step adds, by family: X'X, cov g, the noise's own [X y]'[X y], rows.
+    """Information of one record of a step, by family: X'X, cov g, noise moments, rows.
 
-    `moments` is (k+1, k+1) or empty where it was not asked for; `triangle` is R of [X y].
+    `moments` is (k+1, k+1), the noise's part of [X y]'[X y], or empty if not requested; `triangle`
+    is R of [X y].
     """
 
     step: str
@@ -72,10 +73,10 @@ class ParameterPrediction:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Half widths expected of an experiment, by parameter, and its conditioning by family.
+    """Expected half widths of an experiment, by parameter, and its conditioning by family.
 
-    `covariance` is of the rows' coefficients (1/b), relative to their nominal values. `lateness`
-    is what a host-timed device's samples cost b; its interval includes that.
+    `covariance` is of the rows' coefficients (1/b), relative to their nominal values. `lateness` is
+    the error of b by a host-timed device's samples; its interval includes that.
     """
 
     parameters: Mapping[str, ParameterPrediction]
@@ -99,11 +100,11 @@ def predict(
     jitter: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Prediction:
-    """Predict what identifying these steps on this rig will give.
+    """Predict the result of identifying these steps on this rig.
 
     `jitter` [s] is that of a host-timed device's samples, None where the device has the clock;
-    `progress` receives after each step which share of them is done.
-    Raises InputError for a rig without nominal values and for steps the twin cannot follow.
+    `progress` receives after each step the share of them that is done. Raises InputError for a rig
+    without nominal values and for steps the twin cannot follow.
     """
     used = tuple(Used(term) for term in baseline())
     played, parts = [], []
@@ -134,10 +135,10 @@ def information(
     *,
     moments: bool = False,
 ) -> StepInformation:
-    """Return what one record of a played step adds; `moments` also predicts the noise's share."""
+    """Return the information of one record of a simulated step; `moments` adds noise moments."""
     exact, record = ideal(rig), played.record
-    # An end stop gives a little on a real bench, how much no rig file says. Where it shows, the
-    # analysis lets that piston's noise into the rows; so does the prediction.
+    # A real end stop yields a little, by an amount that no rig file states. Where it is visible,
+    # the analysis includes that piston's noise in the rows; so does the prediction.
     moving = np.ones(len(rig.joints), dtype=bool)
     filters = filtering(record)
     signals = condition(exact, record, filters.channels, moving)
@@ -221,7 +222,7 @@ def covariance(
 ) -> tuple[Array, Array]:
     """Return cov beta (k, k) of one family and Satterthwaite's degrees of freedom (k,).
 
-    Entries outside `kept` are NaN; columns that no row fills count as outside.
+    Entries outside `kept` are NaN; columns without rows count as outside.
     """
     A = np.sum([s.repeats * s.matrix[family] for s in steps], axis=0)
     kept = np.diag(A) > 0 if kept is None else kept & (np.diag(A) > 0)
@@ -253,7 +254,7 @@ def _oil_scatter(rig: Rig, steps: Sequence[StepInformation], kept: NDArray[np.bo
 
 
 def to_json(prediction: Prediction) -> dict[str, object]:
-    """Return it as plain data: relative figures, null where a parameter is not determined."""
+    """Return the prediction as plain data: relative figures, null where not determined."""
     return {
         "parameters": {
             name: {

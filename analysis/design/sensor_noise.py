@@ -1,4 +1,4 @@
-"""Sensor noise carried exactly, to first order, from the converters to the normal equations.
+"""Propagation of sensor noise, to first order, from the converters to the normal equations.
 
 The residual of one equation is e(t) = y - X beta, built point by point from filtered channels,
 then low-passed and decimated as a whole row. White noise n_c of channel c (its stated noise and
@@ -8,9 +8,9 @@ the rounding of its converter, step^2 / 12) enters through every derivative k th
 
 The scores g = X'e of all equations of a record therefore have the covariance
     cov g = sum_c sigma_c^2 B_c B_c',   B_c = sum_eq X' D H_rows sum_k diag(S_ck) H_k,
-and B_c is had by running the filters backwards (their transposes) over the columns of X. Nothing
-is drawn at random, noise shared between equations is shared here, and the correlation that the
-filters put between rows is in it. Source: linear error propagation.
+and B_c is computed by applying the transposed filters to the columns of X. Nothing is drawn at
+random; noise shared between equations and the correlation that the filters cause between rows are
+included. Source: linear error propagation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Input:
-    """One filtered signal that equations are built from: a derivative of one channel.
+    """One filtered signal of the equations: a derivative of one channel.
 
     `field` is its name among the signals, `joint` 0-based or None for the bench.
     """
@@ -56,7 +56,7 @@ def sensor_variance(sensor: AnySensor) -> float:
 
 
 def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:
-    """Return the inputs of the rows; a joint that does not move is held and lets no noise in."""
+    """Return the inputs of the rows; a joint that does not move is held and adds no noise."""
     inputs = []
     for i in range(len(rig.joints)):
 
@@ -134,7 +134,7 @@ def score_covariance(
     """
     channels = filtering.channels
     if not isinstance(channels, FirSmoother):
-        raise InputError(f"noise cannot be carried through the filter {channels.name!r}")
+        raise InputError(f"noise cannot be propagated through the filter {channels.name!r}")
     n = len(signals.t)
     back = {name: _backwards(r, filtering, n, signals.rate) for name, r in rows.items()}
     out = {family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()}
@@ -161,7 +161,7 @@ def score_covariance(
 
 
 def _backwards(rows: Rows, filtering: Filtering, n: int, rate: float) -> Array:
-    """Return (D H_rows)' X (n, k): what each instant's residual adds to the scores."""
+    """Return (D H_rows)' X (n, k): the weight of each instant's residual in the scores."""
     places = np.rint(rows.time * rate).astype(int)
     spread = np.zeros((n, rows.matrix.shape[1]))
     spread[places] = rows.matrix
@@ -169,7 +169,7 @@ def _backwards(rows: Rows, filtering: Filtering, n: int, rate: float) -> Array:
 
 
 def _transposed(weights: Array, taps: Array) -> Array:
-    """Return H'w of the filter y = taps * x: convolution with the taps turned round, (n, k)."""
+    """Return H'w of the filter y = taps * x: convolution with the reversed taps, (n, k)."""
     filled = np.flatnonzero(weights.any(axis=0))
     out = np.zeros_like(weights)
     if len(filled):

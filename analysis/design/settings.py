@@ -8,17 +8,17 @@ from typing import Final
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """Margins of a design on the twin, moves of the search, and the twin's own settling."""
+    """Margins of a design on the twin, moves of the search, start of the twin."""
 
     # Limits: share of the supply kept from tank and supply pressure, share of a closed lock's
-    # tolerance used (beyond half of it the engine closes it anew).
+    # tolerance used (beyond half of it the engine closes it again).
     pressure_margin: float = 0.03
     lock_share: float = 0.6
     # Peaks are clipped at this share of the worst signal's in the search for phases.
     peak_clip: float = 0.85
 
     # Lines of a new shape: times the protocol's highest and lowest, tilts t of amplitudes f^-t, how
-    # many of the lowest stay (they move the piston and so centre it), and the fewest of a tone.
+    # many of the lowest are kept (they move the piston and so centre it), and the fewest of a tone.
     highest_line: float = 1.6
     lowest_line: float = 0.6
     tilts: tuple[float, float] = (-0.8, 1.3)
@@ -31,13 +31,14 @@ class DesignSettings:
     first_tilts: tuple[float, ...] = (0.0, 0.5, -0.5)  # tried on every tone before anything random
 
     # Share of the tightest limit that a design uses on the twin; below `near_fill` of it a
-    # candidate is scaled up and played again, above `over_fill` down, by `largest_scaling` at most.
+    # candidate is scaled up and simulated again, above `over_fill` down, by `largest_scaling` at
+    # most.
     fill: float = 0.95
     near_fill: float = 0.93
     over_fill: float = 1.02
     largest_scaling: float = 3.0
-    # Times its first error is what a parameter may lose, or more while it stays better than that
-    # which the criterion is about was at first.
+    # A parameter's error may grow to this multiple of its first, or more while it stays smaller
+    # than the first error of the criterion's parameter.
     kept_error: float = 1.5
     phase_rounds: int = 40  # of the search for phases, for each candidate
     gain_band: float = (

@@ -1,8 +1,8 @@
-"""A planned step played on the twin: the noise-free record that it would leave.
+"""A planned step simulated on the twin: its noise-free record.
 
-Between a lock at an end stop, which holds, and one by a closed valve there is a difference that
-identification lives on: a closed valve is a spring of oil, and the joint behind it gives (2 mm on
-the seed bench). So only joints held by an end stop are held here; a closed valve is simulated.
+A lock at an end stop holds a joint, but one by a closed valve is a spring of oil that yields under
+load (2 mm on the seed bench), and this motion carries information. So only joints at an end stop
+are held here; a closed valve is simulated.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class TwinStep:
 
     `waves` maps an excited joint to one period of its command [V] (all the same length), `lines`
     are multiples of 1/period; `held` maps a joint at an end stop, `closed` one behind a closed
-    valve, to its piston [m]; `centres` and `biases` [V] belong to the excited joints; `samples`
-    are those of one record. A closed joint may give by `gives` [m]; an excited one is centred to
-    within `offsets` [m], by a loop of `loops` [V/m] before the records; `strokes` are the pistons
-    [m] it starts from, where not its centres.
+    valve, to its piston position [m]; `centres` and `biases` [V] belong to the excited joints;
+    `samples` are those of one record. A closed joint may yield by `yields` [m]; an excited one is
+    centred to within `offsets` [m], by a loop of `loops` [V/m] before the records; `strokes` are
+    the piston positions [m] it starts from, if not its centres.
     """
 
     name: str
@@ -45,7 +45,7 @@ class TwinStep:
     samples: int
     repeats: int
     strokes: Mapping[int, float] = field(default_factory=dict)
-    gives: Mapping[int, float] = field(default_factory=dict)
+    yields: Mapping[int, float] = field(default_factory=dict)
     offsets: Mapping[int, float] = field(default_factory=dict)
     loops: Mapping[int, float] = field(default_factory=dict)
 
@@ -62,11 +62,11 @@ class TwinStep:
 
 @dataclass(frozen=True)
 class Played:
-    """What the twin did: the noise-free `record`, the step with its found biases, the motion.
+    """The twin's simulation of a step: noise-free `record`, the step with found biases, motion.
 
     `motion` holds the twin's signals within the record, (samples, N) each, by the names of
-    `twin.simulate_commands`, and `command` [V]; `gains` [m/(s V)] how the excited pistons follow
-    their commands, as the bench will measure it to centre them.
+    `twin.simulate_commands`, and `command` [V]; `gains` [m/(s V)] are the excited pistons' gains
+    from their commands, as the bench will measure them to centre the pistons.
     """
 
     step: TwinStep
@@ -76,7 +76,7 @@ class Played:
 
 
 def ideal(rig: Rig) -> Rig:
-    """Return the rig with channels that show the tick's instant: the twin has no multiplexer."""
+    """Return the rig with channels sampled at the tick: the twin has no multiplexer."""
     sensors = rig.sensors
     parts = {
         name: part.model_copy(update={"delay": 0.0})
@@ -87,9 +87,9 @@ def ideal(rig: Rig) -> Rig:
 
 
 def play(rig: Rig, step: TwinStep) -> Played:
-    """Play a step on the twin, trimming the biases until the pistons stay where they belong.
+    """Simulate a step on the twin, trimming the biases until the pistons stay centred.
 
-    Raises InputError where the twin's state ceases to exist or it cannot be centred.
+    Raises InputError where the twin's simulation fails or a piston cannot be centred.
     """
     for attempt in range(DESIGN.trims):
         commands, start, lead = _commands(rig, step)
@@ -116,7 +116,7 @@ def _held_positions(rig: Rig, step: TwinStep) -> dict[int, float]:
 
 
 def _commands(rig: Rig, step: TwinStep) -> tuple[Array, Array, int]:
-    """Return commands (n, N) [V] that end with a record, start pistons (N,), and its first."""
+    """Return commands (n, N) [V] that end with a record, start pistons (N,), first sample."""
     rate, joints = rig.sample_rate, len(rig.joints)
     lead = min(step.period, round(DESIGN.lead * rate))
     commands = np.zeros((lead + step.samples, joints))

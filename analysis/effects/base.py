@@ -1,4 +1,4 @@
-"""What an effect is: a term plus what the trace must know to name it, or to refuse to.
+"""An effect: a term with the information that the trace needs to name or reject it.
 
 An effect is one more term (`analysis.terms.base`): it may change the signals that all terms see
 (`prepare`), add columns to rows, and contribute in simulation. Linear coefficients come from least
@@ -28,14 +28,14 @@ SENSOR, NULL, LAG, EDGES, SUPPLY, PLANT = range(6)
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape parameter: its parameter name, SI unit, physical bounds and points of first look.
+    """A shape parameter: its name, SI unit, physical bounds and grid of starting points.
 
-    At `neutral` the effect is not there; None where its size is a linear coefficient. With
-    `resolution` the low bound is only what data resolve: to lie there contradicts nothing. Where a
-    shape `saturates` so is the high one, beyond which its curve hardly changes. A `detail` of the
-    form stands last, and a shape may do without it: it is searched only where the records ask for
-    it, makes no explanation less simple than another, and at a bound refuses none. What is `fixed`,
-    a knot of a curve, is placed by the data beforehand and never searched.
+    At `neutral` the effect vanishes; None where its size is a linear coefficient. With `resolution`
+    the low bound is only the resolution of the data, so that a value there is acceptable. Where a
+    shape `saturates` so is the high bound, beyond which its curve hardly changes. A `detail` is an
+    optional shape parameter, last in the list: it is searched only where the records require it,
+    does not count as complexity, and does not reject an effect at its bounds. A `fixed` one, a knot
+    of a curve, is placed by the data beforehand and never searched.
     """
 
     parameter: str
@@ -50,12 +50,12 @@ class Shape:
     fixed: bool = False
 
     def given(self, value: float) -> bool:
-        """Whether a form has this parameter; at 0 below its bounds it does without."""
+        """Return whether a form has this parameter; a 0 below its bounds means that it has not."""
         return value != 0.0 or self.low <= 0.0
 
     @property
     def middle(self) -> float:
-        """The middle point of first look."""
+        """The middle point of the grid."""
         return self.grid[len(self.grid) // 2]
 
 
@@ -65,7 +65,7 @@ BETWEEN_SAMPLES: Final = 0.2
 
 
 def between_samples(rig: Rig, seconds: float) -> str:
-    """Say that a spool's delay is less than its path between two samples may be bent ('' if not).
+    """Return why a spool delay cannot be told from its path between samples ('' if it can).
 
     A first-order spool of time constant tau under a held command seems off by dt^2 / (12 tau).
     """
@@ -93,14 +93,14 @@ class Branch:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the records offer an effect that chooses its points of first look by the data.
+    """Records for an effect that chooses its starting points by the data.
 
-    `signals` are those of each averaged record that a joint moves in, as the model sees them;
-    `left` holds its residual by equation: instants (m,) [s] and whitened residual (m,).
+    `signals` are those of each averaged record in which a joint moves, as the model sees them;
+    `residuals` holds its residual by equation: instants (m,) [s] and whitened residual (m,).
     """
 
     signals: Sequence[Signals]
-    left: Sequence[Mapping[str, tuple[Array, Array]]]
+    residuals: Sequence[Mapping[str, tuple[Array, Array]]]
 
     def of_joint(self, joint: int, values: Callable[[Signals], Array]) -> Array:
         """Return values (n,) of all records in which a joint moves."""
@@ -110,22 +110,23 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Effect(Term):
-    """A candidate of the trace at one place (`where`); a subclass overrides what it needs.
+    """A candidate of the trace at one place (`where`); a subclass overrides methods as needed.
 
-    `variable` names in plain words what the effect's contribution moves with; `confounders` are
-    effects whose columns look alike on poor excitation, `separated_by` an excitation on which
-    they differ; `includes` names effects that it becomes at a limit of its own numbers, in whose
-    place it stands, or `beside` which, as another part of their law. `stage` orders the terms'
-    `prepare` (see `ordered`): what a sensor distorts is undone first, then comes what acts on the
-    spool, in the oil's own order. `alters` names the families of rows that
-    `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks
-    what acts on oil, valve or cylinder, and is not for electric joints. `least` and `least_shape`
-    are the coefficients and shapes [SI] of the smallest size that a person would want to know of on
-    a bench of some kW at some MPa. `mechanism` is where in the physics it acts, `element` the part
-    of the machine: base, load, supply, tank, or of its joint the joint, piston, valve, chamber or
-    sensor. `free` marks a mechanism without a name for its form, whose curve the data draw (see
-    `curve`): no candidate as long as a named effect explains the records. `by_data` says that its
-    points of first look follow from the records (`points`).
+    `variable` names in plain words what the effect's contribution depends on; `confounders` are
+    effects whose columns are similar on poor excitation, `separated_by` an excitation on which they
+    differ; `includes` names effects that it equals at a limit of its own numbers and replaces, and
+    `beside` those that it may accompany as another part of their law.
+
+    `stage` orders the terms' `prepare` (see `ordered`): sensor errors are undone first, then come
+    effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
+    others need not be rebuilt for another shape. `hydraulic` marks effects on oil, valve or
+    cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
+    [SI] of the smallest size of interest on a bench of some kW at some MPa.
+
+    `mechanism` is the physical law, `element` the part of the machine: base, load, supply, tank, or
+    of its joint the joint, piston, valve, chamber or sensor. `free` marks a mechanism without a
+    named form, whose curve is estimated from the data (see `curve`): tried only where no named
+    effect explains the records. `by_data`: its starting points follow from the records (`points`).
     """
 
     family: ClassVar[str] = ""
@@ -146,7 +147,7 @@ class Effect(Term):
 
     @property
     def place(self) -> str:
-        """Where it is, in the contract's words: `bench`, `joint I` or `joint I cap|rod`."""
+        """Its place as reported: `bench`, `joint I` or `joint I cap|rod`."""
         words = self.where.split()
         if words[0] == "bench":
             return "bench"
@@ -162,33 +163,33 @@ class Effect(Term):
 
     @property
     def side(self) -> str:
-        """What `where` says after the joint: `cap`, `rod`, a sensor, or nothing."""
+        """The part of `where` after the joint: `cap`, `rod`, a sensor, or ''."""
         return self.where.split()[2] if len(self.where.split()) > 2 else ""
 
     @property
     def least_joints(self) -> int:
-        """How many joints must move for it to be anything of its own."""
+        """Return how many joints must move for it to differ from other effects."""
         return 1
 
     def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return the shape with every number inside a limit that depends on its other numbers."""
+        """Return the shape limited to bounds that depend on its other numbers."""
         return tuple(shape)
 
     def least_shapes(self) -> tuple[float, ...]:
-        """Return the first shapes of its smallest size of interest."""
+        """Return the shapes of its smallest size of interest."""
         return self.least_shape
 
     def absorbed(self, rig: Rig) -> str:
-        """Say why the baseline's free parameters hide it completely ('' if they do not)."""
+        """Return why the baseline's free parameters hide it completely ('' if they do not)."""
         return ""
 
     def twins(self) -> tuple[tuple[str, str], ...]:
-        """Return (name, where) of effects that no data of this rig can tell from it."""
+        """Return (name, where) of effects that no data of this rig can separate from it."""
         return ()
 
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return every `where` this effect can be at on a rig, none without the oil it acts on."""
+        """Return every `where` of this effect on a rig; none without the oil it acts on."""
         return () if cls.hydraulic and "fluid" not in rig.families else cls.all_places(rig)
 
     @classmethod
@@ -205,11 +206,11 @@ class Effect(Term):
         return ()
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return the shapes of first look of an effect that takes them from the data."""
+        """Return the starting points of shapes that follow from the data."""
         raise NotImplementedError
 
     def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
-        """Return shapes of first look beside the grid, in another form of the effect."""
+        """Return starting points in addition to the grid, in another form of the effect."""
         return ()
 
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
@@ -217,14 +218,14 @@ class Effect(Term):
         return ()
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Say why sign or size of the fitted parameters is not physical ('' if it is).
+        """Return why sign or size of the fitted parameters is not physical ('' if it is).
 
         `values` holds the effect's own linear coefficients and the model's other parameters.
         """
         return ""
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State a size at the conditions of the records ('' where its parameter is given there)."""
+        """State a size at the conditions of the records ('' where its parameter states it)."""
         return ""
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
@@ -232,22 +233,22 @@ class Effect(Term):
         raise NotImplementedError
 
     def shape_of(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return the shape, or each parameter's middle point of first look where none is given."""
+        """Return the shape, or the middle of each parameter's grid where none is given."""
         if len(shape):
             return tuple(shape)
         return tuple(s.middle for s in self.shapes(rig) if not s.detail)
 
     def whole(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return `shape_of` with 0 for each parameter that the shape does without."""
+        """Return `shape_of` with 0 for each detail that the shape lacks."""
         given = self.shape_of(rig, shape)
         return (*given, *(0.0 for _ in self.shape_names()[len(given) :]))
 
     def remembers(self, shape: Sequence[float]) -> bool:
-        """Whether the effect, if it has a hidden state, uses it in the form of a shape."""
+        """Return whether the effect has memory (a hidden state in use) at a shape."""
         return len(shape) > 0
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return the shape with the details that it does without, at their first look."""
+        """Return the shape with missing details at their starting points."""
         return (*shape, *(s.middle for s in self.shapes(rig)[len(shape) :]))
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
@@ -255,16 +256,16 @@ class Effect(Term):
         return ()
 
     def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
-        """Name the effect of `includes` that this one has become at its own numbers ('' if none).
+        """Return the name of the effect of `includes` that this one equals ('' if none).
 
-        `values` holds the effect's linear coefficients; `times` widens what still counts as equal.
+        `values` holds the effect's linear coefficients; `times` widens the tolerance.
         """
         return ""
 
     def outside(self, rig: Rig, shape: Sequence[float]) -> str:
-        """Say which shape parameter lies on or beyond its physical bounds ('' if none).
+        """Return which shape parameter lies on or beyond its bounds, in words ('' if none).
 
-        A detail of the form is not asked: it says nothing of whether the effect is there.
+        Details are not tested: their value does not decide whether the effect exists.
         """
         for s, value in zip(self.shapes(rig)[: len(shape)], shape, strict=True):
             if s.detail or s.fixed or not s.given(value):
@@ -282,7 +283,7 @@ class Effect(Term):
 
 
 def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.0) -> str:
-    """Say that a coefficient is not within (low, high) ('' if it is)."""
+    """Return that a coefficient is not within (low, high), in words ('' if it is)."""
     if low < value < high:
         return ""
     shown, least, most = (plain(x, 4) for x in (value, low, high))
@@ -309,13 +310,13 @@ def _nothing(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-de
     pass
 
 
-NO_KERNEL: Kernel = _nothing  # of effects that the plant does not feel
+NO_KERNEL: Kernel = _nothing  # of effects that do not act on the plant
 
 
 def open_shapes(rig: Rig, used: Used) -> bool:
-    """Return whether a term is an effect that is nothing without a shape, and has none.
+    """Return whether a term is an effect that needs a shape and has none.
 
-    A contact's presliding is what data resolve: without one it is dry.
+    A contact's presliding distance is optional: without one the friction is dry.
     """
     if len(used.shape) or not isinstance(used.term, Effect):
         return False

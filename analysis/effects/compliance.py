@@ -39,8 +39,8 @@ class EntrainedAir(Effect):
     """A share alpha of free air at atmospheric pressure p0 makes the oil softer at low pressure.
 
     1/b_eff = 1/b + alpha / (n (p + p0)) (p0 / (p + p0))^(1/n), p gauge (Merritt 1967, chapter 2).
-    The polytropic exponent n, a shape, is 1 where bubbles keep the oil's temperature and 1.4 where
-    they keep their heat (Wylie and Streeter 1993). Linear in alpha.
+    The polytropic exponent n, a shape, is 1 for isothermal and 1.4 for adiabatic bubbles (Wylie and
+    Streeter 1993). Linear in alpha.
     """
 
     mechanism: ClassVar[str] = "bulk_modulus_curve"
@@ -52,7 +52,7 @@ class EntrainedAir(Effect):
     variable: ClassVar[str] = "the pressure rate at low chamber pressure"
     confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag", "channel_delay")
     separated_by: ClassVar[str] = (
-        "fast pressure changes at low and at high chamber pressure: dead volume is equally soft"
+        "fast pressure changes at low and at high chamber pressure: dead volume acts alike at both"
     )
 
     @property
@@ -80,7 +80,7 @@ class EntrainedAir(Effect):
         return (Shape(name, "", low, high, (1.2,), resolution=True, detail=True),)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the gas with an exponent to be found."""
+        """Return the form with a variable exponent."""
         return () if len(shape) else ((1.2,),)
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
@@ -103,7 +103,7 @@ class EntrainedAir(Effect):
         return out
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse air that stiffens, and froth."""
+        """Reject a negative share, and one above `MOST_AIR`."""
         return beyond("alpha_air", values["alpha_air"], "", MOST_AIR)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
@@ -124,8 +124,9 @@ class DeadVolume(Effect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
 
     Enters as V_dead dp/dt / b (continuity; Merritt 1967, chapter 3), in proportion to the 1/b
-    that all chambers share: a shape, so that b stays one. One chamber alone is separated from a
-    smaller b by the others; the same in all chambers is not, but for V's change with the piston.
+    that all chambers share: a shape, so that b stays one. For one chamber the others separate it
+    from a smaller b; the same volume in all chambers is separated only by the change of V with the
+    piston.
     """
 
     mechanism: ClassVar[str] = "chamber_volume"
@@ -187,7 +188,7 @@ class DeadVolume(Effect):
         return np.array([self.joint, V * (self.side == "cap"), V * (self.side == "rod")])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a volume at its bounds."""
+        """Reject a volume at its bounds."""
         return self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:

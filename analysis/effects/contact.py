@@ -1,6 +1,6 @@
-"""The contact of a seal: a state z, -1 <= z <= 1, that turns over with the direction of motion.
+"""The contact of a seal: a state z, -1 <= z <= 1, that follows the direction of motion.
 
-After each reversal z goes over to the new direction within the presliding distance d (Dahl 1968;
+After each reversal z changes to the new direction within the presliding distance d (Dahl 1968;
 Armstrong-Helouvry, Dupont and Canudas de Wit 1994; Jelali and Kroll 2003), and rubber is the
 stiffer the faster it is deformed (Ferry 1980), here in proportion, with the stiffening k:
 
@@ -30,7 +30,7 @@ PRESLIDING: Final = (5e-6, 40e-6, 150e-6)  # [m] seals give a few hundredths of 
 PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
 SHEAR: Final = 0.02  # of the bore: a third of a seal's section, which is a fifteenth of the bore
 STIFFENING: Final = 30.0  # [s/m] where a search begins
-STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] less is a tenth at 0.1 m/s: nothing
+STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] a smaller one is below a tenth at 0.1 m/s: negligible
 FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
 # Speed of the transition through rest [m/s, or rad/s] where no shape is given. A jump
 # would make the integrator chatter where a joint sticks; this creeps by less than 0.1 mm/s there.
@@ -42,16 +42,16 @@ TRANSITION_START: Final = 1e-3  # [m/s] where a search begins
 
 
 def presliding(name: str, bore: float) -> Shape:
-    """Return a presliding distance's shape [m]; a contact may be stiffer than sensors resolve.
+    """Return the presliding distance's shape [m]; it may be below the sensors' resolution.
 
-    A seal's section grows with the cylinder's `bore` [m], and with it what it yields in shear.
+    A seal's section grows with the cylinder's `bore` [m], and with it its shear travel.
     """
     low, high = PRESLIDING_BOUNDS
     return Shape(name, "m", low, max(high, SHEAR * bore), PRESLIDING, resolution=True)
 
 
 def stiffening(name: str) -> Shape:
-    """Return a stiffening's shape [s/m]; a contact may stiffen less than can be seen."""
+    """Return the stiffening's shape [s/m]; it may be too small to be visible."""
     return Shape(name, "s/m", *STIFFENING_BOUNDS, (STIFFENING,), resolution=True, detail=True)
 
 

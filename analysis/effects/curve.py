@@ -1,8 +1,8 @@
-"""A curve that the data draw: a cubic spline, straight beyond the data, by values at a few knots.
+"""A free curve: a cubic spline by values at a few knots, straight beyond the data.
 
 Between knots it is a cubic with continuous slope and curvature, the first and the last two pieces
 being one cubic each (de Boor 1978, chapter IV: not-a-knot); beyond the first and the last knot it
-is a straight line. It is linear in its values y at the knots t, and they carry its unit:
+is a straight line. It is linear in its values y at the knots t, which have its unit:
 
     f(x) = a y_j + b y_j+1 + ((a^3 - a) m_j + (b^3 - b) m_j+1) h^2 / 6,
     b = (x - t_j) / h, a = 1 - b, h = t_j+1 - t_j, m = S y (second derivatives, `bending`).
@@ -86,9 +86,9 @@ def curve_at(x, par, first, K):  # type: ignore[no-untyped-def]
 
 
 def freed(gauge: Array) -> Array:
-    """Return the values at the knots (K, K - 1) by all of them but the one of the largest weight.
+    """Return the values at the knots (K, K - 1) per free value; that of the largest weight depends.
 
-    That one follows from gauge (K,) times the values being zero.
+    It follows from gauge (K,) times the values being zero.
     """
     K, last = len(gauge), int(np.argmax(np.abs(gauge)))
     others = [k for k in range(K) if k != last]
@@ -111,7 +111,7 @@ def shortest_wave(knots: Array) -> Array:
 
 
 def spread_knots(values: Array, shares: Sequence[float], low: float | None = None) -> Array:
-    """Return knots (K,) at quantiles of values (n,), apart from each other; the first may be given.
+    """Return knots (K,) at quantiles of values (n,), spaced apart; `low` may fix the first.
 
     Empty where the values do not spread.
     """
@@ -138,11 +138,11 @@ def knot_shapes(names: Sequence[str], unit: str, low: float, high: float) -> tup
 
 
 def shown(knots: Sequence[float]) -> Array:
-    """Return the abscissae (m,) at which a curve between its outer knots is shown."""
+    """Return the abscissae (m,) at which a curve between its outer knots is plotted."""
     return np.linspace(knots[0], knots[-1], POINTS)
 
 
 def refuse_large(y: Array, limit: float, what: str) -> str:
-    """Say that a curve (m,) exceeds a limit ('' if it does not)."""
+    """Return that a curve (m,) exceeds a limit, in words ('' if it does not)."""
     most = float(np.max(np.abs(y))) if len(y) else 0.0
     return "" if most < limit else f"{what} reaches {most:.4g}, more than {limit:.4g}"

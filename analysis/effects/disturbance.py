@@ -34,9 +34,9 @@ FINE: Final = 4  # frequencies looked at within one over the record's length
 class PeriodicDisturbance(Effect):
     """Torque T_sin sin(2 pi f t) + T_cos cos(2 pi f t) on the joint, t since the record began.
 
-    An eccentric, a hum, a controller's dither that begins with the record (one Fourier line). One
-    with another phase in every repeat is found in what the repeats differ by; its amplitude is
-    then given, and no model or free run contains it.
+    For example an eccentric, mains hum, or a controller's dither that begins with the record (one
+    Fourier line). One whose phase differs between repeats is found in the differences between
+    them; its amplitude is then reported, and no model or free run contains it.
     """
 
     mechanism: ClassVar[str] = "disturbance"
@@ -46,7 +46,7 @@ class PeriodicDisturbance(Effect):
     variable: ClassVar[str] = "time, at one frequency"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring")
     separated_by: ClassVar[str] = (
-        "another excitation: effects of the joint's motion change with it, this does not"
+        "another excitation, which changes effects of the joint's motion but not this one"
     )
     per_joint: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
@@ -74,9 +74,9 @@ class PeriodicDisturbance(Effect):
         return (Shape(self.shape_names()[0], "Hz", *FREQUENCY, (7.0,)),)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return the frequencies at which the joint's torque rows keep most."""
+        """Return the frequencies of the largest residual in the joint's torque rows."""
         name = equation("torque", self.joint)
-        parts = [record[name] for record in evidence.left if name in record]
+        parts = [record[name] for record in evidence.residuals if name in record]
         if not parts:
             return ()
         step = float(np.median(np.diff(parts[0][0])))
@@ -92,7 +92,7 @@ class PeriodicDisturbance(Effect):
         return tuple((float(f[k]),) for k in at[np.argsort(-power[at])][:PEAKS])
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return -sin and -cos: the disturbance stands with the drive."""
+        """Return -sin and -cos: the disturbance is on the drive's side."""
         angle = 2 * np.pi * self.shape_of(rig, shape)[0] * signals.t
         waves = (-np.sin(angle), -np.cos(angle))
         return {equation("torque", self.joint): dict(zip(self._names(), waves, strict=True))}
@@ -103,7 +103,7 @@ class PeriodicDisturbance(Effect):
         return np.array([self.joint, *linear, 2 * np.pi * self.shape_of(rig, shape)[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse more than half of what the joint's drive can do, and a frequency at its bounds."""
+        """Reject more than half of the drive's torque, and a frequency at its bounds."""
         amplitude = math.hypot(*(values[name] for name in self._names()))
         limit = torque_limit(rig, self.joint)
         if not amplitude < limit:

@@ -2,10 +2,10 @@
 
     opening = (x + (|x|^n + r^n)^(1/n)) / 2, n = 2 + c
 
-Radial clearance lets oil pass before the edge and beside it, r the rounding, 0 of a sharp edge, and
-c = 0 (Merritt 1967, chapter 5: the orifice is as wide as the hypotenuse of opening and clearance).
-What is worn round is straight again a little way off: the larger c, the corner, the sooner. At the
-edge itself it is open by r / 2 with any c.
+Radial clearance passes oil before and beside the edge: r is the rounding, 0 for a sharp edge, and c
+= 0 (Merritt 1967, chapter 5: the orifice is as wide as the hypotenuse of opening and clearance). A
+worn edge approaches the straight line at a small distance: the larger c, the corner, the smaller
+that distance. At x = 0 the opening is r / 2 for any c.
 """
 
 from __future__ import annotations

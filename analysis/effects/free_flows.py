@@ -51,7 +51,7 @@ OPENINGS: Final = 5  # knots of |u|, the first at the null; that and the last ha
 SOFTENS: Final = 0.2  # of a bulk modulus curve's range that it may soften by: its uncertainty
 DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
 PRESSURES: Final = 4  # knots of the oil's pressure; the last has no value: it is 1/b
-BACKWARDS: Final = 0.05  # of its largest that an edge or a leak may pass against: uncertainty
+BACKWARDS: Final = 0.05  # of its largest flow that an edge or a leak may reverse: uncertainty
 EDGES: Final = ("pp", "pm", "mp", "mm")
 
 
@@ -148,7 +148,7 @@ class MeteringCurve(Effect):
         return tuple(out)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse an edge that passes oil backwards or closes as the spool opens it."""
+        """Reject an edge that passes oil backwards or closes as the spool opens it."""
         knots = self.shape_of(rig, shape)
         at = shown(knots)
         for edge, gain in zip(EDGES, gain_names(self.joint + 1), strict=True):
@@ -258,7 +258,7 @@ class LeakageCurve(Effect):
         return (Branch("leakage over pressure", at, weights, "Pa", "m^3/s"),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a leak that pumps, and one of more than half the pump's flow."""
+        """Reject a leak that pumps, and one of more than half the pump's flow."""
         knots = self.shape_of(rig, shape)
         flow = spline(knots, shown(knots)) @ self._values(values)
         if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
@@ -350,13 +350,13 @@ class BulkModulusCurve(Effect):
         return (Branch("bulk modulus over pressure", at, weights, "Pa", "Pa", reciprocal=True),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse oil that gives way to no pressure, or the more the higher the pressure is."""
+        """Reject oil that is not compressible, or softer at higher pressure."""
         knots = self.shape_of(rig, shape)
         b = values.get("b", rig.nominal.get("b", math.nan))
         soft = spline(knots, shown(knots)) @ self._values(values) + 1.0 / b
         if np.min(soft) <= 0.0:
             return "the oil would not be compressible"
-        # Air and hoses are the softest at low pressure, and oil stiffens with it.
+        # Air and hoses are softest at low pressure, and oil stiffens with pressure.
         rise = float(np.max(soft - np.minimum.accumulate(soft)))
         falls = rise <= SOFTENS * float(np.ptp(soft))
         return "" if falls else "the oil would be softer at higher pressure"

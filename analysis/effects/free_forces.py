@@ -43,7 +43,7 @@ from rig.model.rig import Rig
 
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
 PLACES: Final = 6  # knots of s
-ALIKE: Final = 0.03  # of gravity that a curve of s leaves: less, and the records show one pose
+ALIKE: Final = 0.03  # of gravity that a curve of s cannot fit: below, the records have one pose
 DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its uncertainty
 # Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
 # slope from the first to the last knot is the baseline's viscous friction there. Elsewhere that
@@ -141,7 +141,7 @@ class FrictionCurve(Friction):
         return (Branch("friction over speed", v, weights, "m/s", unit),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse friction that drives, and more than half of the cylinder's force."""
+        """Reject driving friction, and more than half of the cylinder's force."""
         (line,) = self.branches(rig, self.shape_of(rig, shape))
         parts = {name: w * values.get(name, 0.0) for name, w in line.weights.items()}
         whole = np.asarray(sum(parts.values()))
@@ -168,7 +168,7 @@ class PositionForce(Effect):
 
     One of its values follows from the others, by weights (`gauge`) that come with the knots. Where
     the records have one pose of the joints below, gravity is a force over position too, and the
-    curve is what gravity does not explain; elsewhere its shortest wave is left out.
+    curve is the remainder; elsewhere the highest divided difference is zero.
     """
 
     name: ClassVar[str] = "position_force"
@@ -213,10 +213,10 @@ class PositionForce(Effect):
         return ((*map(float, knots), *map(float, gauge)),)
 
     def _weight(self, rig: Rig, evidence: Evidence, knots: Array) -> Array | None:
-        """Return the gauge (K,) that leaves the joint's weight to gravity.
+        """Return the gauge (K,) that assigns the joint's weight to gravity.
 
         None where the records determine the weight by itself: a joint below moves too, or stands in
-        several poses, or nothing weighs.
+        several poses, or there is no weight.
         """
         i = self.joint
         below = any(s.moving is not None and s.moving[:i].any() for s in evidence.signals)
@@ -265,7 +265,7 @@ class PositionForce(Effect):
         return (Branch("force over position", at, weights, "m", unit),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse more than half of the cylinder's force."""
+        """Reject more than half of the cylinder's force."""
         y = np.array([values[name] for name in self._names()])
         return refuse_large(y, force_limit(rig, self.joint), "the force")
 

@@ -24,7 +24,7 @@ from analysis.signals.conditioning import Signals
 from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, Kernel, U, equation, kernel
 from rig.model.rig import Rig
 
-FLOWS: Final = 3  # knots of the flow, the first at rest, where nothing is lost
+FLOWS: Final = 3  # knots of the flow, the first at zero, without a drop
 LOOKS: Final = (0.05, 0.2)  # of the supply pressure, lost at the pump's flow, of first look
 
 
@@ -76,7 +76,7 @@ class SupplyCurve(PortEffect):
         return np.array([0.0, *shape[FLOWS:]])
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Take the drop from the supply pressure."""
+        """Subtract the drop from the supply pressure."""
         given = self.shape_of(rig, shape)
         flow = port_flow(rig, signals, drawn=True)
         return replace(signals, p_s=signals.p_s - spline(given[:FLOWS], flow) @ self._drops(given))
@@ -95,7 +95,7 @@ class SupplyCurve(PortEffect):
         return (Branch("supply's drop over flow", at, weights, "m^3/s", "Pa"),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse drops at their bounds, and one that falls as the flow rises."""
+        """Reject drops at their bounds, and one that falls as the flow rises."""
         given = self.shape_of(rig, shape)
         drop = spline(given[:FLOWS], shown(given[:FLOWS])) @ self._drops(given)
         if np.min(np.diff(drop)) < -1e-3 * float(np.max(np.abs(drop))):

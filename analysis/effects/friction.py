@@ -1,17 +1,17 @@
 """Dry friction of a cylinder's seals, in four forms that act as a force on the piston.
 
 Torque row of joint i (friction is on the load's side): ... + G F_f = G F. Every form is a level
-[N] times the state z of the seal's contact (`contact`), -1 <= z <= 1, which turns over within a
+[N] times the state z of the seal's contact (`contact`), -1 <= z <= 1, which reverses within a
 presliding distance d of travel after each reversal (Dahl 1968; Jelali and Kroll 2003), the sooner
 the faster it is (stiffening k; of rubber: Ferry 1980):
 
     dz/ds = (1 + k |s'|) (sign(s') - z) / d
 
-The piston's path alone decides z, so that the rows have it from the measured piston; the
-simulation carries the deflection y = d z [m] as a hidden state. A presliding distance of 0 means
-the contact without memory, z = erf(s'/w) with the transition speed w (`TRANSITION` in a model
-without a shape). d, k and w are shape parameters; the rows decide between a distance and a
-transition speed. Stribeck's and asymmetric friction have k = 0.
+The piston's path alone decides z, so that the rows use the measured piston; the simulation
+integrates the deflection y = d z [m] as a hidden state. A presliding distance of 0 means the
+contact without memory, z = erf(s'/w) with the transition speed w (`TRANSITION` in a model without a
+shape). d, k and w are shape parameters; the rows decide between a distance and a transition speed.
+Stribeck's and asymmetric friction have k = 0.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 BREAKAWAY: Final = 0.1  # of the sliding level: less is the form of the contact, not a breakaway
-LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it has long vanished: no division by zero
+LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it is negligible: prevents division by zero
 
 
 @dataclass(frozen=True)
 class Friction(Effect):
-    """What the four forms share: joint, the state z of the contact, with memory or without.
+    """Common parts of the four forms: joint, the contact's state z, with memory or without.
 
-    Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen.
-    A shape with a transition speed has no memory, and 0 for distance and stiffening. `before` and
-    `after` count the shape parameters that stand before and behind the contact's own.
+    Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen. A
+    shape with a transition speed has no memory, and 0 for distance and stiffening. `before` and
+    `after` count the shape parameters before and after the contact's own.
     """
 
     mechanism: ClassVar[str] = "friction_curve"
@@ -113,7 +113,7 @@ class Friction(Effect):
         return len(self.shape_names()) - self.after - 1
 
     def remembers(self, shape: Sequence[float]) -> bool:
-        """Whether the contact has a memory: a presliding distance above 0."""
+        """Return whether the contact has memory: a presliding distance above 0."""
         return len(shape) > self.before and shape[self.before] > 0.0
 
     def contact_of(self, shape: Sequence[float]) -> tuple[float, float, float]:
@@ -128,12 +128,12 @@ class Friction(Effect):
         return (own[0] if len(own) else 0.0), rate, speed
 
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:
-        """Return the path (n,) [m] that the contact is worked along."""
+        """Return the path (n,) [m] of the contact, with its stiffening."""
         i = self.joint
         return worked(signals.s[:, i], signals.sd[:, i], self.contact_of(shape)[1])
 
     def tolerance(self, shape: Sequence[float]) -> float:
-        """Return a fine one for the contact without memory: coarser, creep at rest is noise."""
+        """Return a fine tolerance without memory: with a coarser one, creep at rest is noise."""
         if self.remembers(shape):
             return self.rate_tolerance
         return 1e-3 * self.contact_of(shape)[2]
@@ -187,7 +187,7 @@ def bore(rig: Rig, joint: int) -> float:
 
 
 def force_limit(rig: Rig, joint: int) -> float:
-    """Return half of what cylinder or drive exerts [N]: more dry friction would stop the joint."""
+    """Return half of the force of cylinder or drive [N]; more dry friction would stop the joint."""
     return 0.5 * rig.largest_force(joint)
 
 
@@ -234,7 +234,7 @@ class CoulombFriction(Friction):
         return self.row({f"Fc{self.joint + 1}": signals.G[:, self.joint] * z})
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse friction that drives or falls with speed, and half of the cylinder's force."""
+        """Reject friction that drives or falls with speed, and half of the cylinder's force."""
         name = f"Fc{self.joint + 1}"
         level, joint = values[name], rig.joints[self.joint]
         viscous = values.get(f"Fv{self.joint + 1}", 0.0) / float(joint.geometry(0.0)[1]) ** 2
@@ -311,7 +311,7 @@ class StribeckFriction(Friction):
         return np.array([self.joint, values[f"Fs{self.joint + 1}"], falling, distance, speed])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds.
+        """Reject a breakaway below Coulomb's level, too much of it, and a speed at its bounds.
 
         One of less than `BREAKAWAY` of Coulomb's level beside it is a detail of the contact.
         """

@@ -34,7 +34,7 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is not asymmetric
+DIFFERENCE: Final = 0.1  # of the mean level: with a smaller difference it is not asymmetric
 LEAST_SHARE: Final = 0.1  # of the other level: those of a seal do not differ by more
 DIFFERENCE_LOAD: Final = -1.0  # weight of the rod pressure where the difference presses the seal
 
@@ -108,7 +108,7 @@ class AsymmetricFriction(Friction):
         return np.array([self.joint, *linear, *distances, self.contact_of(shape)[2]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a driving direction, too much, and directions that do not differ."""
+        """Reject a driving direction, too much, and directions that do not differ."""
         limit = force_limit(rig, self.joint)
         levels = [values[name] for name in self._names()]
         least = LEAST_SHARE * max(map(abs, levels))
@@ -223,7 +223,7 @@ class PressureDependentFriction(Friction):
         return np.array([self.joint, k, *self.contact_of(shape), rig.supply.pressure, weight])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse friction that drives, and more than half of the cylinder's force."""
+        """Reject friction that drives, and more than half of the cylinder's force."""
         name = f"k_friction_{self.joint + 1}"
         return beyond(name, values[name], "m^2", 0.5 * rig.joints[self.joint].cylinder.cap_area)
 

@@ -42,7 +42,7 @@ class _Leakage(Effect):
     where: str = "joint 1"
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a leak that pumps, and one of more than half the pump at full pressure."""
+        """Reject a leak that pumps, and one of more than half the pump at full pressure."""
         limit = 0.5 * rig.supply.flow / rig.supply.pressure
         name = self.coefficients(rig)[0].parameter
         return beyond(name, values[name], UNIT, limit)

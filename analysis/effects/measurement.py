@@ -1,12 +1,12 @@
-"""Effects of measurement: a channel that is late or lags, a wrong gain, an offset, cross-talk.
+"""Effects of measurement: delay or lag of a channel, wrong gain, offset, cross-talk.
 
 They transform the data, not the model: `prepare` undoes them in the signals, and the plant's
-equations hold between the corrected signals. `correct` does the same to sampled channels, so that
-a simulation is compared with what a correct sensor would have shown.
+equations hold between the corrected signals. `correct` does the same to sampled channels, so that a
+simulation is compared with the readings of a correct sensor.
 
 `where` is `joint I cap|rod` for a chamber's pressure, `joint I piston|spool` for those sensors
-(reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure. What
-all channels of a kind share has the place `bench pressure|piston|spool` (reported as `bench`).
+(reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure. An
+effect on all channels of a kind has the place `bench pressure|piston|spool` (reported as `bench`).
 Source: each is the first-order model of a sensor, tau y' + y = gain x(t - delay) + offset.
 """
 
@@ -32,7 +32,7 @@ MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
 
 @dataclass(frozen=True)
 class Sensor(Effect):
-    """What the three share: the channel, and the way from one channel to all that follows."""
+    """Common parts of sensor effects: the channel, and the signals that follow from it."""
 
     mechanism: ClassVar[str] = "sensor"
     element: ClassVar[str] = "sensor"
@@ -43,7 +43,7 @@ class Sensor(Effect):
 
     @property
     def kernel(self) -> Kernel:
-        """The plant does not feel its sensors."""
+        """Return a kernel that does nothing: sensors do not act on the plant."""
         return NO_KERNEL
 
     @property
@@ -53,7 +53,7 @@ class Sensor(Effect):
 
     @property
     def least_joints(self) -> int:
-        """How many joints must move: with one, all pistons are that joint's."""
+        """Return how many joints must move; with one, all pistons are that joint's."""
         return 2 if self.shared in ("piston", "spool") else 1
 
     def each(self, rig: Rig) -> tuple[Sensor, ...]:
@@ -79,7 +79,7 @@ class Sensor(Effect):
         return (*(f"joint {i} {side}" for i in joints for side in KINDS), *supply)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: what a sensor distorts stands in every column."""
+        """Return nothing: a sensor's error is in every column."""
         return ()
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -95,7 +95,7 @@ class Sensor(Effect):
         raise NotImplementedError
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Undo the distortion in the channel's signal and all that is made of it."""
+        """Undo the error in the channel's signal and in all that follows from it."""
         if self.shared:
             for channel in self.each(rig):
                 signals = channel.prepare(rig, signals, self.shape_of(rig, shape))
@@ -144,7 +144,7 @@ class Sensor(Effect):
     def correct(
         self, rig: Rig, channels: Mapping[str, Array], rate: float, shape: Sequence[float]
     ) -> dict[str, Array]:
-        """Return the channels as a right sensor would have sampled them, each (n,)."""
+        """Return the channels as a correct sensor would have sampled them, each (n,)."""
         out = dict(channels)
         for channel in self.each(rig) if self.shared else ():
             out = channel.correct(rig, out, rate, self.shape_of(rig, shape))
@@ -154,11 +154,11 @@ class Sensor(Effect):
         return out
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a shape at its bounds."""
+        """Reject a shape at its bounds."""
         return self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the channel, in the rows where it stands first."""
+        """Return the channel, in the rows in which it occurs first."""
         if self.shared:
             parts = [channel.abscissa(rig, signals) for channel in self.each(rig)]
             return {name: x for channel in parts for name, x in channel.items()}
@@ -182,7 +182,7 @@ class Sensor(Effect):
 
 @dataclass(frozen=True)
 class Late(Sensor):
-    """What delays and lags share: they may be those of all channels of a kind."""
+    """Common parts of delays and lags, which may act on all channels of a kind."""
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -191,7 +191,7 @@ class Late(Sensor):
         return (*super().all_places(rig), *(f"bench {kind}" for kind in kinds))
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a shape at its bounds, and a spool later than its path between samples bends."""
+        """Reject a shape at its bounds, and a spool delay within its path between samples."""
         spool = "spool" in (self.side, self.shared)
         bent = between_samples(rig, self.shape_of(rig, shape)[0]) if spool else ""
         return super().problem(rig, values, shape) or bent
@@ -294,7 +294,7 @@ class SensorCrosstalk(Sensor):
         return (Shape(self.shape_names()[0], "", -0.3, 0.3, (-0.06, -0.015, 0.015, 0.06), 0.0),)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Take the other chamber's share from the pressure and its rate."""
+        """Subtract the other chamber's share from the pressure and its rate."""
         share, i = self.shape_of(rig, shape)[0], self.joint
         other = "rod" if self.side == "cap" else "cap"
         new = {}
@@ -307,7 +307,7 @@ class SensorCrosstalk(Sensor):
     def correct(
         self, rig: Rig, channels: Mapping[str, Array], rate: float, shape: Sequence[float]
     ) -> dict[str, Array]:
-        """Return the channels as a right sensor would have sampled them, each (n,)."""
+        """Return the channels as a correct sensor would have sampled them, each (n,)."""
         out = dict(channels)
         other = ch.channel(KINDS["rod" if self.side == "cap" else "cap"], self.joint + 1)
         if self.channel in out and other in out:
@@ -333,7 +333,7 @@ class SensorGain(Sensor):
     )
 
     def absorbed(self, rig: Rig) -> str:
-        """Say that the flow gains take up a spool's."""
+        """Return that the flow gains absorb a spool's gain."""
         return "the flow gains absorb a spool's gain completely" if self.side == "spool" else ""
 
     def shape_names(self) -> tuple[str, ...]:
@@ -371,12 +371,12 @@ class SensorOffset(Sensor):
     )
 
     def least_shapes(self) -> tuple[float, ...]:
-        """Return the offset that matters of a pressure or a piston, none of other channels."""
+        """Return the offset of interest of a pressure or a piston, none of other channels."""
         kind = ch.kind_of(self.channel)[0]
         return {ch.PISTON: (0.3e-3,), ch.SPOOL: (), ch.TEMPERATURE: ()}.get(kind, (0.03e6,))
 
     def twins(self) -> tuple[tuple[str, str], ...]:
-        """Return the null's offset for a spool: valve and sensor are one to the data."""
+        """Return the null's offset for a spool: data cannot separate valve and sensor."""
         return (("spool_offset", self.place),) if self.side == "spool" else ()
 
     @classmethod

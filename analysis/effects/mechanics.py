@@ -36,9 +36,9 @@ def torque_limit(rig: Rig, joint: int) -> float:
 class BaseInclination(Effect):
     """All absolute angles turned by one angle alpha: link k pulls W_k g sin(theta_k + alpha).
 
-    Inertia sees differences of absolute angles only, so turning them changes gravity alone
-    (docs/n-joints.md); W_k cos(alpha) and W_k sin(alpha) share one alpha, which is therefore a
-    shape and not N linear unknowns.
+    Inertia depends on differences of absolute angles only, so that turning them changes gravity
+    alone (docs/n-joints.md); W_k cos(alpha) and W_k sin(alpha) share one alpha, which is therefore
+    a shape and not N linear unknowns.
     """
 
     mechanism: ClassVar[str] = "gravity"
@@ -86,7 +86,7 @@ class BaseInclination(Effect):
         return {}
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse an angle at its bounds."""
+        """Reject an angle at its bounds."""
         return self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
@@ -101,8 +101,8 @@ def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
             x[THETA, i] += par[0]
 
 
-LEAST_REACH: Final = 0.1  # of the joint's reach: against a stiffer spring it cannot move so far
-RESTS: Final = 5  # rest angles of first look, evenly in the joint's reach
+LEAST_REACH: Final = 0.1  # of the joint's range: against a stiffer spring it cannot move so far
+RESTS: Final = 5  # rest angles to start from, evenly in the joint's range
 
 
 @dataclass(frozen=True)
@@ -140,10 +140,10 @@ class JointSpring(Effect):
         return (f"rest_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the rest angle [rad], in the joint's reach or as far again beyond its ends.
+        """Return the rest angle [rad], within the joint's range or as far beyond its ends.
 
-        A preloaded spring rests where the joint does not come. Far from the true angle a search
-        ends at a spring that pushes away: several are looked at.
+        A preloaded spring rests outside the range. Far from the true angle a search ends at a
+        spring that pushes away, so that several are tried.
         """
         low, high = _reach(rig, self.joint)
         reach = high - low
@@ -163,7 +163,7 @@ class JointSpring(Effect):
         return np.array([self.joint, k, self.shape_of(rig, shape)[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a spring that pushes away, one too stiff to move, a rest far out of reach."""
+        """Reject a negative stiffness, one too stiff to move, a rest angle far out of range."""
         name = f"k_spring_{self.joint + 1}"
         low, high = _reach(rig, self.joint)
         stiffest = torque_limit(rig, self.joint) / (LEAST_REACH * (high - low))
@@ -229,7 +229,7 @@ class TorqueOffset(Effect):
         return (Coefficient(self._name(rig)[0], unit, "mechanical"),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return -1: the offset stands with the drive (electric: +1)."""
+        """Return -1: the offset is on the drive's side (electric: +1)."""
         name, sign = self._name(rig)
         return {equation("torque", self.joint): {name: np.full(len(signals.t), sign)}}
 
@@ -239,13 +239,13 @@ class TorqueOffset(Effect):
         return np.array([self.joint, sign * values[name]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse more than half of what the joint's drive can do."""
+        """Reject more than half of the drive's torque."""
         name = self._name(rig)[0]
         limit = torque_limit(rig, self.joint)
         return beyond(name, values[name], "N*m", limit, -limit)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the joint's angle [rad]: the offset is level over it."""
+        """Return the joint's angle [rad], over which the offset is constant."""
         return {equation("torque", self.joint): signals.q[:, self.joint]}
 
 

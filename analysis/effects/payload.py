@@ -35,9 +35,9 @@ class Payload(Effect):
     """A point mass m at the tip: R_ij grows by m l_i l_j, W_i by m l_i.
 
     Its columns are a sum of the baseline's own, so M, R and W of records that all carry it absorb
-    it COMPLETELY: no excitation of them shows it. It is seen only against a reference: records
-    that are known to be without it (`Signals.loaded`), where it has no columns, or parameters of a
-    model identified without it, M, R and W held there.
+    it COMPLETELY: no excitation of them shows it. It is found only against a reference: records
+    that are known to be without it (`Signals.loaded`), where it has no columns, or a model
+    identified without it, whose M, R and W are held.
     """
 
     mechanism: ClassVar[str] = "gravity"
@@ -61,7 +61,7 @@ class Payload(Effect):
         return () if getattr(rig, "prismatic", False) else ("bench",)
 
     def absorbed(self, rig: Rig) -> str:
-        """Say that the baseline's M, R and W take it all."""
+        """Return that the baseline's M, R and W absorb it."""
         return (
             "M, R and W of records that all carry the same payload absorb it completely; compare "
             "with records without it"
@@ -89,7 +89,7 @@ class Payload(Effect):
         return np.array([values["m_payload"], rig.gravity, *(j.link_length for j in rig.joints)])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a mass below nothing or beyond any bench."""
+        """Reject a negative mass, or one beyond any bench."""
         return beyond("m_payload", values["m_payload"], "kg", HEAVIEST)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
@@ -98,7 +98,7 @@ class Payload(Effect):
 
 
 def growth(rig: Rig) -> dict[str, float]:
-    """Return by how much each mechanical parameter grows per kilogram at the tip."""
+    """Return the increase of each mechanical parameter per kilogram at the tip."""
     lengths = np.array([j.link_length for j in rig.joints])
     names = inertia_names(len(lengths))
     # Of R = sum_k p_k E_k the coefficients are found by least squares on the disjoint patterns E.

@@ -1,8 +1,8 @@
 """Effects on the pressures at the valves' ports: supply sag, return pressure.
 
-Both follow the flow that all valves together take or give. The rows have that flow from the
-chambers' continuity, A s' + V p' / b with the rig's nominal b, or a usual one where the rig states
-none (the correction of a correction); the simulation solves the orifices for it.
+Both depend on the total flow of all valves. The rows compute that flow from the chambers'
+continuity, A s' + V p' / b with the rig's nominal b, or a usual one where the rig states none (the
+correction of a correction); the simulation solves the orifices for it.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from rig.model.units import plain
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
 LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in the line
-# Of the pump's flow: a line that takes all of the pressure at so little is the steepest looked for.
+# Of the pump's flow: the steepest line searched loses all of the pressure at this flow.
 LEAST_FLOW: Final = 0.05
 BULK_MODULUS: Final = 1e9  # [Pa] with hoses and some air (Jelali and Kroll 2003, section 2.3)
-WHOLE: Final = 0.5  # of the pump's flow: records that reach it need no word on the drop there
+WHOLE: Final = 0.5  # of the pump's flow: records that reach it need no remark on the drop there
 NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
 
 
 @dataclass(frozen=True)
 class PortEffect(Effect):
-    """What acts on the pressure at all valves' ports: no coefficient, only shapes."""
+    """An effect on the pressure at all valves' ports, with shapes only."""
 
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
@@ -60,7 +60,7 @@ class PortEffect(Effect):
         return ("bench",)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: pressures stand under the orifices' roots."""
+        """Return nothing: pressures are inside the orifices' roots."""
         return ()
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -68,7 +68,7 @@ class PortEffect(Effect):
         return {}
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a shape at its bounds."""
+        """Reject a shape at its bounds."""
         return self.outside(rig, shape)
 
 
@@ -78,10 +78,10 @@ def bulk_modulus(rig: Rig) -> float:
 
 
 def line_drop(name: str, rig: Rig, shares: tuple[float, ...]) -> Shape:
-    """Return a line's drop at the pump's whole flow [Pa]; `shares` of the supply pressure at first.
+    """Return a line's drop at the pump's whole flow [Pa], from `shares` of the supply pressure.
 
-    A pump is often rated for far more than an arm draws: the drop at its whole flow is then a
-    number only, and may be many times the supply pressure.
+    A pump is often rated for far more than an arm draws: the drop at its whole flow is then
+    nominal, and may be many times the supply pressure.
     """
     p = rig.supply.pressure
     nothing, first = NOTHING * p, tuple(share * p for share in shares)
@@ -89,7 +89,7 @@ def line_drop(name: str, rig: Rig, shares: tuple[float, ...]) -> Shape:
 
 
 def turning(name: str, first: tuple[float, ...]) -> Shape:
-    """Return the share of the pump's flow at which a line's flow turns turbulent."""
+    """Return the share of the pump's flow at which a line's flow becomes turbulent."""
     return Shape(name, "", 0.0, 3.0, first, resolution=True, saturates=True)
 
 
@@ -100,19 +100,19 @@ def packed_line(rig: Rig, dp: float, share: float) -> tuple[float, float]:
 
 
 def turbulent_part(dp: float, share: float) -> float:
-    """Return the drop [Pa] at the pump's whole flow that a line has without its laminar part."""
+    """Return the drop [Pa] at the pump's whole flow that a line would have without laminar flow."""
     return dp / math.cbrt(1.0 + share**3)
 
 
 def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> str:
     """State a line's drop at the largest flow [m^3/s] of the records where that is not the pump's.
 
-    `name` is of the drop `dp` [Pa] at the pump's whole flow, `share` is r_t.
+    `name` is that of the drop `dp` [Pa] at the pump's whole flow, `share` is r_t.
     """
     ratio = flow / rig.supply.flow
     if not 0.0 < ratio < WHOLE:
         return ""
-    drop, _ = lost(ratio, turbulent_part(dp, share), share)
+    drop, _ = drop_and_slope(ratio, turbulent_part(dp, share), share)
     return (
         f"{name} is the drop at the pump's whole {plain(6e4 * rig.supply.flow, 2)} l/min; at the "
         f"largest flow of these records, {plain(6e4 * flow, 2)} l/min, it is "
@@ -123,9 +123,9 @@ def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> st
 def grid_at_flow(
     rig: Rig, effect: Effect, evidence: Evidence, drawn: bool, powers: Sequence[int]
 ) -> tuple[tuple[float, ...], ...]:
-    """Return a grid of first look that means the same at the largest flow that the records have.
+    """Return a starting grid scaled to the largest flow of the records.
 
-    `powers` say how each shape changes with the pump's flow over that flow.
+    `powers` are the exponents with which each shape scales with the pump's flow over that flow.
     """
     flow = largest_flow(rig, evidence.signals, drawn)
     if flow <= 0.0:
@@ -139,12 +139,12 @@ def grid_at_flow(
 
 
 def largest_flow(rig: Rig, signals: Sequence[Signals], drawn: bool) -> float:
-    """Return the largest flow [m^3/s] of records that all valves draw, or give to the tank."""
+    """Return the largest flow [m^3/s] in records that all valves draw, or return to the tank."""
     return max((float(port_flow(rig, s, drawn).max()) for s in signals), default=0.0)
 
 
 def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
-    """Return the flow (n,) [m^3/s] that all valves draw from the supply, or give to the tank."""
+    """Return the flow (n,) [m^3/s] that all valves draw from the supply, or return to the tank."""
     softness = 1.0 / bulk_modulus(rig)
     total = np.zeros(len(signals.t))
     for i, joint in enumerate(rig.joints):
@@ -168,10 +168,9 @@ class SupplySag(PortEffect):
     between sensor and valves: laminar below the share r_t of the pump's flow, turbulent above
     (Merritt 1967, chapter 3; the two asymptotes joined as in Churchill and Usagi 1972). Where it
     does not, the pressure of pump or relief valve falls nearly in proportion to the flow. A sudden
-    demand is met by the oil V_supply between sensor and valves, or an accumulator of equal
-    capacity, until the line follows: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation
-    leaves that out.
-    dp, r_t and V_supply are shapes; a line that is laminar throughout has any large r_t.
+    demand is first met by the oil V_supply between sensor and valves, or by an accumulator of equal
+    capacity: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation leaves that out. dp, r_t
+    and V_supply are shapes; a line that is laminar throughout has any large r_t.
     """
 
     mechanism: ClassVar[str] = "supply_curve"
@@ -191,7 +190,7 @@ class SupplySag(PortEffect):
         return _sag
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the drop, where it turns turbulent, and the oil between."""
+        """Name the drop, its laminar share and the oil volume."""
         return ("dp_supply", "laminar_share", "V_supply")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
@@ -204,7 +203,7 @@ class SupplySag(PortEffect):
         )
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return drops, shares and volumes of first look at the flow drawn."""
+        """Return starting drops, shares and volumes at the flow drawn."""
         return grid_at_flow(rig, self, evidence, drawn=True, powers=(2, -1, -1))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
@@ -213,7 +212,7 @@ class SupplySag(PortEffect):
         return line_remark(rig, largest_flow(rig, signals, drawn=True), "dp_supply", dp, share)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Take the drop from the supply pressure."""
+        """Subtract the drop from the supply pressure."""
         dp, share, volume = self.shape_of(rig, shape)
         turbulent = turbulent_part(dp, share)
         ratio = np.ascontiguousarray(port_flow(rig, signals, drawn=True) / rig.supply.flow)
@@ -235,7 +234,7 @@ class SupplySag(PortEffect):
 class TankPressure(PortEffect):
     """The return pressure is p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
 
-    The line's part is turbulent; Q is the flow that the valves give back.
+    The line's part is turbulent; Q is the flow that the valves return.
     """
 
     mechanism: ClassVar[str] = "return_line"
@@ -277,7 +276,7 @@ class TankPressure(PortEffect):
         return np.array([constant, back / rig.supply.flow**2, *edge_gains(rig, values, (2, 1))])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse pressures at their bounds, but for a line's part that is not there."""
+        """Reject pressures at their bounds, except a line's part of zero."""
         constant, back = self.whole(rig, shape)
         if constant <= 1e-3 * rig.supply.pressure:
             more = "" if back <= constant else ": this is return_line"
@@ -288,7 +287,7 @@ class TankPressure(PortEffect):
         return self.outside(rig, tuple(kept))
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the pressure of the chamber that gives to the tank [Pa]."""
+        """Return the pressure of the chamber that is open to the tank [Pa]."""
         out: dict[str, Array] = {}
         for i in range(signals.joints):
             out[equation("flow_cap", i)] = signals.p_cap[:, i]
@@ -301,8 +300,8 @@ class ReturnLine(PortEffect):
     """The return pressure is its line's drop, dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3).
 
     r = Q / Q_pump, and dp is the drop at the pump's whole flow. Laminar below the share r_t of the
-    pump's flow, turbulent above (as `supply_sag`; Merritt 1967, chapter 3). A pressure that is
-    there at zero flow too is `tank_pressure`.
+    pump's flow, turbulent above (as `supply_sag`; Merritt 1967, chapter 3). A pressure at zero flow
+    is `tank_pressure`.
     """
 
     name: ClassVar[str] = "return_line"
@@ -310,7 +309,7 @@ class ReturnLine(PortEffect):
     mechanism: ClassVar[str] = "return_line"
     element: ClassVar[str] = "tank"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
-    variable: ClassVar[str] = "the flow given back to the tank"
+    variable: ClassVar[str] = "the flow returned to the tank"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag")
     separated_by: ClassVar[str] = (
         "two amplitudes: a tank's own pressure stays the same, the line's grows"
@@ -322,7 +321,7 @@ class ReturnLine(PortEffect):
         return _return_line
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the drop and where it turns turbulent."""
+        """Name the drop and its laminar share."""
         return ("dp_return", "return_laminar")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
@@ -333,11 +332,11 @@ class ReturnLine(PortEffect):
         )
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return drops of first look at the flow given back."""
+        """Return starting drops at the flow returned."""
         return grid_at_flow(rig, self, evidence, drawn=False, powers=(2,))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State the drop at the largest flow given back."""
+        """State the drop at the largest flow returned."""
         dp, share = self.whole(rig, shape)
         return line_remark(rig, largest_flow(rig, signals, drawn=False), "dp_return", dp, share)
 
@@ -354,12 +353,12 @@ class ReturnLine(PortEffect):
         return np.array([*line, *edge_gains(rig, values, (2, 1))])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the flow given back [m^3/s]."""
+        """Return the flow returned [m^3/s]."""
         return _everywhere(signals, port_flow(rig, signals, drawn=False))
 
 
 def edge_gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -> list[float]:
-    """Return for each joint the gains of its two chosen edges, that of a positive spool first."""
+    """Return each joint's gains of its two chosen edges, that of a positive spool first."""
     names = (gain_names(i) for i in range(1, len(rig.joints) + 1))
     return [values[joint[k]] for joint in names for k in chosen]
 
@@ -370,7 +369,7 @@ def _everywhere(signals: Signals, variable: Array) -> dict[str, Array]:
 
 
 @njit(cache=True, error_model="numpy")
-def lost(Q, turbulent, turning):  # type: ignore[no-untyped-def]
+def drop_and_slope(Q, turbulent, turning):  # type: ignore[no-untyped-def]
     """Return drop and slope of turbulent Q (Q^3 + turning^3)^(1/3) for a flow Q >= 0."""
     inner = Q**3 + turning**3
     if inner <= 0.0:
@@ -381,30 +380,30 @@ def lost(Q, turbulent, turning):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _line(ratio, step, turbulent, share, capacity):  # type: ignore[no-untyped-def]
-    # Between two samples the demand is a straight line and the time constant stands still.
+    # Between two samples the demand is linear and the time constant is constant.
     drop = np.zeros_like(ratio)
     through = ratio[0]
     for k in range(len(ratio)):
         if k and capacity > 0.0:
-            late = max(capacity * lost(through, turbulent, share)[1], 1e-9)
+            late = max(capacity * drop_and_slope(through, turbulent, share)[1], 1e-9)
             kept = math.exp(-step / late)
             rise = ratio[k] - ratio[k - 1]
             through = ratio[k] - rise * (1 - kept) * late / step + kept * (through - ratio[k - 1])
         else:
             through = ratio[k]
-        drop[k] = lost(max(through, 0.0), turbulent, share)[0]
+        drop[k] = drop_and_slope(max(through, 0.0), turbulent, share)[0]
     return drop
 
 
 @njit(cache=True, error_model="numpy")
 def _valve_flow(x, level, sign, turbulent, turning, par, drawn):  # type: ignore[no-untyped-def]
-    """Solve Q = sum C |u| sqrt(dp_i - lost(Q)) for the common flow Q [m^3/s], by Newton.
+    """Solve Q = sum C |u| sqrt(dp_i - drop(Q)) for the common flow Q [m^3/s], by Newton.
 
-    dp_i is what each open edge has across it at Q = 0; the left grows and the right falls with Q.
+    dp_i is the pressure drop of each open edge at Q = 0; the left grows and the right falls with Q.
     """
     Q = 0.0
     for _ in range(NEWTON):
-        drop, slope_drop = lost(Q, turbulent, turning)
+        drop, slope_drop = drop_and_slope(Q, turbulent, turning)
         given, slope = 0.0, 0.0
         for i in range(x.shape[1]):
             u = x[U, i]
@@ -427,7 +426,7 @@ def _valve_flow(x, level, sign, turbulent, turning, par, drawn):  # type: ignore
 def _sag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE and par[0] > 0.0:
         Q = _valve_flow(x, bench[P_S], 1.0, par[0], par[1], par, True)
-        bench[P_S] -= lost(Q, par[0], par[1])[0]
+        bench[P_S] -= drop_and_slope(Q, par[0], par[1])[0]
 
 
 @kernel
@@ -443,7 +442,7 @@ def _tank(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
 def _return_line(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE and par[0] > 0.0:
         Q = _valve_flow(x, bench[P_TANK], -1.0, par[0], par[1], par, False)
-        bench[P_TANK] += lost(Q, par[0], par[1])[0]
+        bench[P_TANK] += drop_and_slope(Q, par[0], par[1])[0]
 
 
 TERMS = (SupplySag, TankPressure, ReturnLine)

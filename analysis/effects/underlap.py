@@ -34,12 +34,12 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class UnderlapLeakage(ValveEffect):
-    """Edges open by w at the null: opening max(w + u, 0) ahead and max(w - u, 0) astern, at once.
+    """Edges open by w at the null: opening max(w + u, 0) ahead and max(w - u, 0) astern.
 
-    What is added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
+    Openings added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
     d- = max(w - u, 0) - max(-u, 0), edges rounded as those of `valve_deadband`, each times its own
-    gain and root (Merritt 1967, chapter 5, open-centre valve). The gains are the orifices' own: the
-    columns add to theirs.
+    gain and root (Merritt 1967, chapter 5, open-centre valve). The gains are those of the orifices,
+    whose columns they add to.
     """
 
     name: ClassVar[str] = "underlap_leakage"

@@ -1,7 +1,7 @@
 """Effects between the spool's LVDT and the metering edges: dead band, null, lag, hysteresis.
 
-They change the opening u that the orifices see and leave the orifices' equations as they are, so
-all of them are shapes: dq = C(u_effective) sqrt(dp). (Underlap: `underlap.py`.)
+They change the opening u in the orifices' equations, so that all of them are shapes: dq =
+C(u_effective) sqrt(dp). (Underlap: `underlap.py`.)
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class ValveEffect(Effect):
-    """What the valve's effects share: one hydraulic joint, no linear unknown, spool as abscissa."""
+    """Common parts of valve effects: a hydraulic joint, no linear unknown, spool as abscissa."""
 
     mechanism: ClassVar[str] = "metering_curve"
     element: ClassVar[str] = "valve"
@@ -43,7 +43,7 @@ class ValveEffect(Effect):
     where: str = "joint 1"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: the gains stay the orifices'."""
+        """Return nothing: the gains are those of the orifices."""
         return ()
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -61,7 +61,7 @@ class ValveEffect(Effect):
         return np.array([self.joint, *self.whole(rig, shape)], dtype=np.float64)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a shape at its bounds."""
+        """Reject a shape at its bounds."""
         return self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
@@ -113,13 +113,13 @@ class ValveDeadband(ValveEffect):
         return (*laps, rounding(r, stroke), corner(c))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Take the dead band out of the spool's signal."""
+        """Remove the dead band from the spool's signal."""
         ahead, astern, r, c = self.whole(rig, shape)
         u = signals.u[:, self.joint]
         return self.with_opening(signals, opened(u - ahead, r, c) - opened(-u - astern, r, c))
 
     def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
-        """Limit the rounding: beyond, the valve is not shut at its null, and this no dead band."""
+        """Limit the rounding: a valve with a larger one is open at its null."""
         ahead, astern, *form = shape
         return (
             ahead,
@@ -163,15 +163,15 @@ class SpoolOffset(ValveEffect):
         return (Shape(self.shape_names()[0], "V", -0.1 * stroke, 0.1 * stroke, grid, 0.0),)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Take the null from the spool's signal."""
+        """Subtract the null from the spool's signal."""
         return self.with_opening(signals, signals.u[:, self.joint] - self.shape_of(rig, shape)[0])
 
     def twins(self) -> tuple[tuple[str, str], ...]:
-        """Return the LVDT's own offset: valve and sensor are one to the data."""
+        """Return the LVDT's own offset: data cannot separate valve and sensor."""
         return (("sensor_offset", f"joint {self.joint + 1} spool"),)
 
 
-TAKEN_UP: Final = 5e-4  # [s] in which the simulation remembers where the spool was pushed
+TAKEN_UP: Final = 5e-4  # [s] time constant of the play in simulation
 QUICKEST: Final = 1e-4  # [s] time constant that the integrator can follow
 
 
@@ -179,8 +179,8 @@ QUICKEST: Final = 1e-4  # [s] time constant that the integrator can follow
 class SpoolLag(ValveEffect):
     """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003).
 
-    x is a hidden state; the rows have it by the exact response to the sampled spool, drawn as
-    straight lines between samples.
+    x is a hidden state; the rows use the exact response to the sampled spool, linear between
+    samples.
     """
 
     mechanism: ClassVar[str] = "spool_dynamics"
@@ -212,7 +212,7 @@ class SpoolLag(ValveEffect):
         return 1
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Let the spool's signal lag."""
+        """Delay the spool's signal by the lag."""
         return self.with_opening(signals, self.hidden_path(rig, signals, {}, shape)[:, 0])
 
     def hidden_path(
@@ -223,7 +223,7 @@ class SpoolLag(ValveEffect):
         return lagged(u, self.shape_of(rig, shape)[0] * signals.rate)[:, None]
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a shape at its bounds, and a lag that a path between samples makes as well."""
+        """Reject a shape at its bounds, and a lag that a path between samples may cause."""
         return super().problem(rig, values, shape) or between_samples(
             rig, self.shape_of(rig, shape)[0]
         )
@@ -249,7 +249,7 @@ def lagged(u: Array, tau: float) -> Array:
 
 @dataclass(frozen=True)
 class SpoolHysteresis(ValveEffect):
-    """The opening follows the LVDT behind play: |u - x| <= w / 2, x moves where it is pushed.
+    """The opening follows the LVDT with play: |u - x| <= w / 2, x moves only when pushed.
 
     Backlash of a feedback spring or a linkage (the play operator: Krasnosel'skii and Pokrovskii
     1989). x is a hidden state.
@@ -286,7 +286,7 @@ class SpoolHysteresis(ValveEffect):
         return 1
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Take the play out of the spool's signal."""
+        """Remove the play from the spool's signal."""
         return self.with_opening(signals, self.hidden_path(rig, signals, {}, shape)[:, 0])
 
     def hidden_path(
@@ -294,16 +294,16 @@ class SpoolHysteresis(ValveEffect):
     ) -> Array:
         """Return the opening (n, 1) [V]."""
         u = np.ascontiguousarray(signals.u[:, self.joint])
-        return np.asarray(behind_play(u, 0.5 * self.shape_of(rig, shape)[0]))[:, None]
+        return np.asarray(play_output(u, 0.5 * self.shape_of(rig, shape)[0]))[:, None]
 
     def fastest(self, shape: Sequence[float]) -> float:
-        """Return the rate at which the simulated play is taken up."""
+        """Return the rate at which the simulated play follows the spool."""
         return 1.0 / TAKEN_UP
 
 
 @njit(cache=True)
-def behind_play(u, half):  # type: ignore[no-untyped-def]
-    """Return the path (n,) that u (n,) pushes before it, with `half` the play to either side."""
+def play_output(u, half):  # type: ignore[no-untyped-def]
+    """Return the output (n,) of a play operator with input u (n,) and half width `half`."""
     x = np.empty_like(u)
     x[0] = u[0]
     for k in range(1, len(u)):

@@ -23,18 +23,18 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-DRIVING: Final = 0.1  # of the larger slope that the other may lie below zero: its uncertainty
-DIFFERENCE: Final = 0.1  # of the mean slope: with less between directions they do not differ
+DRIVING: Final = 0.1  # of the larger slope that the other may be below zero: its uncertainty
+DIFFERENCE: Final = 0.1  # of the mean slope: with a smaller difference they count as equal
 
 
 @dataclass(frozen=True)
 class AsymmetricViscousFriction(Effect):
     """F = c_ext s' extending, c_ret s' retracting, beside the joint's Fv q': slopes by direction.
 
-    Wipers and lip seals drag less oil in one direction (Jelali and Kroll 2003). The slope of a
-    direction is its coefficient plus Fv G^-2; the records determine the difference well.
-    On an electric joint G is 1, Fv is the mean slope, and the one coefficient dFv, of the column
-    |q'|, is half the difference.
+    Wipers and lip seals carry less oil in one direction (Jelali and Kroll 2003). The slope of a
+    direction is its coefficient plus Fv G^-2; the records determine the difference well. On an
+    electric joint G is 1, Fv is the mean slope, and the one coefficient dFv, of the column |q'|, is
+    half the difference.
     """
 
     mechanism: ClassVar[str] = "friction_curve"
@@ -91,7 +91,7 @@ class AsymmetricViscousFriction(Effect):
         return np.array([self.joint, own[0], own[1] if len(own) == 2 else -own[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a direction that drives the joint, and directions that do not differ."""
+        """Reject a direction that drives the joint, and directions that do not differ."""
         slopes = self.slopes(rig, values)
         for way, slope in zip(("extending", "retracting"), slopes, strict=True):
             if slope < -DRIVING * max(slopes):

@@ -1,8 +1,8 @@
-"""What to do about parameters that records leave open: their combinations, and the step to add.
+"""Find combinations of parameters that records do determine, and steps that would add the rest.
 
-A step that would help is found by geometry alone: a candidate (one joint excited, the joints beyond
-it at an end stop or at mid-stroke) gets a motion within its stroke, and its torque rows are held
-against the null directions of the records. What a direction turns into there, it shows.
+A step is judged by geometry alone: a candidate (one joint excited, the joints beyond it at an end
+stop or at mid-stroke) moves within its stroke, and its torque rows are multiplied by the null
+directions of the records. The step determines a null direction whose product is not small.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
-    """State, for each family with parameters lost, what is determined and what would help."""
+    """State, for each family with undetermined parameters, what is determined, what would help."""
     out = []
     for family, solution in solutions.items():
         if not solution.unidentifiable or not len(solution.triangle):
@@ -46,8 +46,8 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
 
 
 def _help(rig: Rig, family: str, lacking: Determinacy) -> list[str]:
-    # The steps of electric rigs are not planned: no stroke says what motion is to be had. What an
-    # effect's own parameters need stands in the catalogue, not here.
+    # No steps are planned for electric rigs, whose motion has no known stroke. What an effect's own
+    # parameters need is in its catalogue entry.
     known = parameter_names(len(rig.joints))
     if rig.electric or any(name not in known for name in lacking.names):
         return []
@@ -61,7 +61,7 @@ def _joined(helps: Sequence[str]) -> str:
 
 
 def fluid_help(rig: Rig, lacking: Determinacy) -> list[str]:
-    """Return what would show gains and bulk modulus."""
+    """Return the steps, in words, that would determine the flow gains and the bulk modulus."""
     helps = []
     for joint in range(1, len(rig.joints) + 1):
         if set(gain_names(joint)) & set(lacking.lost):
@@ -72,19 +72,20 @@ def fluid_help(rig: Rig, lacking: Determinacy) -> list[str]:
 
 
 def mechanical_help(rig: Rig, lacking: Determinacy) -> list[str]:
-    """Return the fewest steps found that show every null direction, in words."""
+    """Return, in words, the fewest steps found that determine every null direction."""
     undetermined = lacking.null
     steps = list(_candidates(rig))
     rows = [_rows(rig, excited, places) for excited, places in steps]
     scale = np.maximum(np.linalg.norm(np.vstack(rows), axis=0), 1e-300)
-    # Each candidate against itself: an outer joint's torques are small, and determine as much.
+    # Each candidate is scaled by its own size: an outer joint's small torques determine as much.
     rows = [X / np.linalg.norm(X / scale, 2) for X in rows]
     helps = []
     while len(undetermined):
         basis = np.linalg.qr((undetermined * scale).T)[0]
         seen = [np.linalg.svd(X / scale @ basis, full_matrices=True) for X in rows]
         ranks = [int(np.sum(sigma > IDENTIFY.visible_direction)) for _, sigma, _ in seen]
-        # As many directions as possible, then as clearly; a closed valve gives, a stop does not.
+        # Prefer most directions, then the clearest; a closed valve yields under load, a stop does
+        # not.
         clear = [
             float(np.sum(sigma)) * 0.9 ** steps[i][1].count(0.0)
             for i, (_, sigma, _) in enumerate(seen)

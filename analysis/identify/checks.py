@@ -1,7 +1,7 @@
-"""Statements about records before, and about what was solved after, an identification.
+"""Checks of the records before an identification and of its result afterwards.
 
-What makes a number meaningless is refused (InputError naming record and channel); what a person
-should know is a `Check`, ok or not, with the figures.
+Records that make a number meaningless are refused (InputError naming record and channel);
+everything else that a user should know is a `Check`, ok or not, with the figures.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Check:
-    """One statement: its name, whether all is well, and the figures."""
+    """One statement: its name, whether it is ok, and the figures."""
 
     name: str
     ok: bool
@@ -38,9 +38,9 @@ class Check:
 
 
 def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
-    """Return the rig all runs share; raises InputError where they differ or hold no record.
+    """Return the rig that all runs share, with the largest tolerance of each number.
 
-    Where runs state different tolerances, it has the largest of each.
+    Raises InputError where the rigs differ or the runs hold no record.
     """
     if not runs or not any(run.records for run in runs):
         raise InputError("no records to work on: the run holds none (was it aborted at once?)")
@@ -71,12 +71,12 @@ def spans_of(record: Record) -> dict[str, tuple[float, float]]:
     }
 
 
-def refuse_dead_channels(
+def refuse_constant_channels(
     rig: Rig, record: Record | RecordHead, spans: Mapping[str, tuple[float, float]] | None = None
 ) -> None:
-    """Raise InputError for an excited joint that never moved or a channel that stood still.
+    """Raise InputError for an excited joint that never moved or a channel that is constant.
 
-    `spans` are the channels' extremes where the record is known by its head only.
+    `spans` are the channels' extremes, for a record of which only the head is in memory.
     """
     if spans is None:
         spans = spans_of(record) if isinstance(record, Record) else {}
@@ -110,11 +110,11 @@ def refuse_dead_channels(
             )
 
 
-def refuse_dead_records(rig: Rig, runs: Iterable[Run]) -> None:
-    """Raise InputError for a record of the runs with a dead channel (`refuse_dead_channels`)."""
+def refuse_constant_records(rig: Rig, runs: Iterable[Run]) -> None:
+    """Raise InputError for a constant channel in a record (`refuse_constant_channels`)."""
     for run in runs:
         for record in run.records:
-            refuse_dead_channels(rig, record)
+            refuse_constant_channels(rig, record)
 
 
 def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
@@ -129,9 +129,9 @@ def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
 def clipping(
     rig: Rig, counted: Iterable[tuple[Record | RecordHead, Mapping[str, int]]]
 ) -> list[Check]:
-    """State every sensor that touched an end of its range, by step, with the worst record.
+    """State every sensor that reached an end of its range, with the worst record of each step.
 
-    `counted` holds what `clipped_counts` says of every record.
+    `counted` holds the result of `clipped_counts` for every record.
     """
     worst: dict[tuple[str, str], tuple[int, float, str]] = {}
     for head, counts in counted:
@@ -154,7 +154,7 @@ def clipping(
 
 
 def lost_samples(counted: Iterable[tuple[Record | RecordHead, int]]) -> Check:
-    """State how many samples never arrived, `counted` being (record, its lost samples)."""
+    """State how many samples never arrived; `counted` holds (record, its lost samples)."""
     pairs = [(lost, head) for head, lost in counted]
     total = sum(lost for lost, _ in pairs)
     if not total:
@@ -169,25 +169,25 @@ def lost_samples(counted: Iterable[tuple[Record | RecordHead, int]]) -> Check:
 
 
 def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
-    """State the repeats behind the intervals, `strata` being (run, step) -> repeats."""
+    """State the repeats that the intervals are based on; `strata` maps (run, step) to repeats."""
     single = sorted({step for (_, step), count in strata.items() if count < 2})
     if single:
         return Check(
             "repeats",
             False,
-            f"only one repeat of {' '.join(single)}: scatter between repeats cannot be had; the "
+            f"only one repeat of {' '.join(single)}: the scatter between repeats is unknown; the "
             "intervals come from segments within the record and may be too narrow",
         )
     return Check("repeats", True, f"{min(strata.values())} or more repeats of every step")
 
 
 def is_hold(rig: Rig, head: Record | RecordHead) -> bool:
-    """Whether a record was taken with every valve closed: it has no equations of motion."""
+    """Return whether a record was taken with every valve closed, without equations of motion."""
     return set(range(1, len(rig.joints) + 1)) <= set(head.locked)
 
 
 def leak_down(rig: Rig, records: Sequence[Record | RecordHead]) -> list[Check]:
-    """State how far pistons crept in the records of a hold, with every valve closed."""
+    """State how far pistons crept while every valve was closed (the records of a hold)."""
     creeps = [
         (abs(float(creep)) * head.sample_rate / head.samples, abs(float(creep)), i, head)
         for head in records
@@ -246,9 +246,9 @@ def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
 
 
 def noise_bias(solutions: Mapping[str, Solution], unbiased: bool = False) -> Check:
-    """State the worst relative bias that sensor noise in the columns is predicted to make.
+    """State the worst relative bias that sensor noise in the columns is predicted to cause.
 
-    It is that of least squares; `unbiased` says that the values come from what it cannot bias.
+    The prediction is for least squares; `unbiased` says that the estimator used is not affected.
     """
     biases = [
         (abs(bias / value), name)

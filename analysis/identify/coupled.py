@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 _UNREFINED = Check(
     "estimator",
     True,
-    "plain: least squares with intervals from the scatter between repeats alone; what the other "
-    "estimators refine (every row in memory, parameters linear in them) was not applied",
+    "plain: least squares with intervals from the scatter between repeats alone; the other "
+    "estimators, which need every row in memory and linear parameters, were not applied",
 )
 
 
@@ -86,9 +86,9 @@ def conclude(
     refined: Callable[[Mapping[str, Solution]], Refinement] | None = None,
     geometry: GeometryShifts | None = None,
 ) -> Identification:
-    """Solve the reductions of all records of the runs `sources`, and judge what comes out.
+    """Solve the reductions of all records of the runs `sources`, and check the result.
 
-    `geometry` widens the intervals by what the rig's tolerances leave unknown.
+    `geometry` widens the intervals by the uncertainty of the rig's geometry.
     """
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
@@ -144,10 +144,10 @@ def _statements(
 
 
 def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
-    """Return the estimator for a model: what refines the fluid's rows has none on electric rigs.
+    """Return the estimator for a model, or raise InputError where it does not apply.
 
-    Those have plain least squares and output error. None but the plain one is for parameters that
-    are not linear in the rows (`Term.reduction`).
+    Electric rigs have plain least squares and output error only. Parameters that are not linear in
+    the rows (`Term.reduction`) have plain least squares only.
     """
     reducing = [use.term.name for use in used if use.term.reduction(rig) is not None]
     if estimator == PLAIN or not (rig.electric or reducing):

@@ -1,4 +1,4 @@
-"""Solve the rows of an identification by the estimator asked for, with intervals and checks."""
+"""Solve the rows of an identification by the chosen estimator, with intervals and checks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from analysis.identify.estimators.instruments import (
     steps_without_instruments,
 )
 from analysis.identify.estimators.robust import robust
-from analysis.identify.estimators.shifts import certain_shift, including, shifts_of
+from analysis.identify.estimators.shifts import including, shifts_of, significant_shift
 from analysis.identify.estimators.statements import (
     noise_statement,
     nuisance_statement,
@@ -60,7 +60,7 @@ _FITS: Mapping[str, Callable[[Sequence[RepeatBlock]], EquationFit]] = {
 
 @dataclass(frozen=True)
 class EstimationJob:
-    """What to estimate from: rig, runs, the model's terms, and the rows built with them."""
+    """Input of an estimation: rig, runs, the model's terms, and the rows built with them."""
 
     rig: Rig
     runs: Sequence[Run]
@@ -73,7 +73,7 @@ class EstimationJob:
 
 @dataclass(frozen=True)
 class Refinement:
-    """Solutions by family as the estimator has them, and what it has to say."""
+    """An estimator's solutions by family, and its checks."""
 
     solutions: dict[str, Solution]
     checks: tuple[Check, ...]
@@ -88,10 +88,10 @@ def refuse_unknown(estimator: str) -> None:
 
 
 def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
-    """Solve again by the job's estimator, nuisances beside the parameters, with intervals.
+    """Solve again by the job's estimator, with the nuisance columns and with intervals.
 
     `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
-    InputError for an estimator that needs repeats where a step has one only.
+    InputError for an estimator that needs repeats where a step has only one.
     """
     refuse_unknown(job.estimator)
     counted = repeats_of((rows.conditioned.run, rows.record) for rows in job.built)
@@ -141,7 +141,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         beta, total, fit = fits[p.family]
         shift = np.zeros(p.parameters)
         if estimator == "ls" and tests:
-            shift = certain_shift(tests[p.family], p)
+            shift = significant_shift(tests[p.family], p)
         total = including(total, shift)
         new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
@@ -154,11 +154,14 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
 def _bootstrap_ends(
     job: EstimationJob, p: FamilyBlocks, estimator: str, fit: EquationFit, shift: Array
 ) -> dict[str, tuple[float, float]]:
-    """Return the bootstrap's intervals by name, extended by a shift (k,) that no draw can show."""
+    """Return the bootstrap's intervals by name, extended by a shift (k,) of the value.
+
+    No resampling shows this shift, because it is the same in every repeat.
+    """
     rng = job.rng or np.random.default_rng(0)
     error = spread([pieces(fit)], fit.inverse)
     drawn = bootstrap(p.blocks, _redo(p, _FITS[estimator], error), job.bootstrap, rng)
-    # Towards where instruments have it.
+    # Towards the estimate by instruments.
     low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
     high = drawn.high[: p.parameters] - np.minimum(shift, 0.0)
     ends = zip(p.names, low, high, strict=False)
@@ -168,7 +171,7 @@ def _bootstrap_ends(
 def _prepare(
     job: EstimationJob, solutions: Mapping[str, Solution]
 ) -> tuple[list[FamilyBlocks], list[Check]]:
-    """Build rows with the nuisances; one that the data contradict is left out, and said."""
+    """Build rows with the nuisance columns, without one that the data contradict (reported)."""
     values: dict[str, float] = {}
     for s in solutions.values():
         for name, v in zip(s.names, s.value, strict=True):
@@ -187,7 +190,7 @@ def _prepare(
         prepared = _family(built, family, columns, mine, beside)
         for name in tuple(beside):
             fit = least_squares(prepared.blocks)
-            # Anew each time: a nuisance that was left out has shifted the columns.
+            # Rebuilt each time: leaving out a nuisance shifts the columns.
             beliefs = {b.name: b for b in nu.beliefs(prepared.names, fit.beta)}
             if name not in beliefs:
                 continue
@@ -228,7 +231,7 @@ def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, Equ
 def _redo(
     p: FamilyBlocks, kind: Callable[[Sequence[RepeatBlock]], EquationFit], error: CovarianceParts
 ) -> Callable[[Sequence[RepeatBlock]], Array]:
-    """Return the estimate of resampled blocks; what is known beforehand weighs as before."""
+    """Return the function that estimates from resampled blocks, with the same prior knowledge."""
 
     def estimate(blocks: Sequence[RepeatBlock]) -> Array:
         fit = kind(blocks)

@@ -1,9 +1,9 @@
-"""What the tolerances of a rig's areas, volumes and pin distances leave unknown of the parameters.
+"""Uncertainty of the parameters from the tolerances of a rig's areas, volumes and pin distances.
 
 The rows of an identification take the rig's geometry as exact, so that a wrong area shifts the
-parameters the same way in every repeat and no scatter shows it. For every number g_j of the rig
-file with a tolerance sigma_j (`rig.model.tolerances`) the same records are solved again by least
-squares with that number larger by sigma_j, and the shifts
+parameters equally in every repeat and causes no scatter. For every number g_j of the rig file with
+a tolerance sigma_j (`rig.model.tolerances`) the same records are solved again with that number
+increased by sigma_j, and the shifts
 
     s_j = theta(g_j + sigma_j) - theta(g_j)
 
@@ -42,7 +42,7 @@ NAME = "geometry"
 
 @dataclass(frozen=True)
 class GeometryShifts:
-    """How far each of J uncertain numbers, larger by one sigma, moves the rows' coefficients.
+    """Shifts of the rows' coefficients when each of J uncertain numbers is one sigma larger.
 
     `shifts` holds (k, J) for each family, its coefficients in the order of `names`.
     """
@@ -52,7 +52,7 @@ class GeometryShifts:
     shifts: Mapping[str, Array]
 
     def covariance(self, family: str) -> Array:
-        """Return what the numbers add to the covariance (k, k) of one family's coefficients."""
+        """Return the covariance (k, k) that the numbers add to one family's coefficients."""
         shift = self.shifts[family]
         return np.asarray(shift @ shift.T)
 
@@ -60,7 +60,7 @@ class GeometryShifts:
 def shifts_of_rows(
     rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows]
 ) -> GeometryShifts | None:
-    """Return the shifts by the rows of records in memory; None for a rig without tolerances."""
+    """Return the shifts from the rows of records in memory; None for a rig without tolerances."""
     if not rig.uncertain_numbers:
         return None
     others = map(rig.with_moved, rig.uncertain_numbers)
@@ -74,7 +74,7 @@ def shifts_of_reductions(
     reductions: Sequence[RecordReduction],
     moved: Sequence[Sequence[RecordReduction]],
 ) -> GeometryShifts | None:
-    """Return the same from reductions: of all records, and `moved` for each uncertain number."""
+    """Return the shifts from the reductions of all records and, in `moved`, of each number."""
     if not rig.uncertain_numbers:
         return None
     return _shifts(rig, terms, _collected(reductions), [_collected(each) for each in moved])
@@ -87,7 +87,7 @@ def widened(
     covariance: Array,
     geometry: GeometryShifts,
 ) -> tuple[dict[str, Estimate], Array]:
-    """Return the estimates and their covariance (k, k) with the tolerances in them."""
+    """Return the estimates and their covariance (k, k) with the tolerances included."""
     S = parameter_shifts(rig, terms, estimates, geometry)
     more = np.linalg.norm(S, axis=1)
     grown = {
@@ -113,7 +113,8 @@ def parameter_shifts(
 ) -> Array:
     """Return the shifts (k, J) of the parameters in the order of `estimates`, to first order.
 
-    Of a reciprocal coefficient c = 1/b that is - b^2 dc. Those of what the rows do not hold are 0.
+    For a reciprocal coefficient c = 1/b that is - b^2 dc; for a parameter that is not in the rows
+    0.
     """
     coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
     order = {name: row for row, name in enumerate(estimates)}
@@ -132,7 +133,7 @@ def geometry_check(
     estimates: Mapping[str, Estimate],
     geometry: GeometryShifts,
 ) -> Check:
-    """State for every kind of tolerance which number moves which parameter most, and how far."""
+    """State, for every kind of tolerance, the number and parameter with the largest shift."""
     S = parameter_shifts(rig, terms, estimates, geometry)
     value = np.array([estimate.value for estimate in estimates.values()])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -154,12 +155,12 @@ def geometry_check(
     )
 
 
-def left_out(rig: Rig, method: str) -> Check:
-    """State that a method's intervals do not include the tolerances that the rig file has."""
+def tolerances_ignored(rig: Rig, method: str) -> Check:
+    """State that a method's intervals do not include the rig file's tolerances."""
     return Check(
         NAME,
         False,
-        f"the intervals of the method {method} take the geometry of {rig.name!r} for exact; "
+        f"the intervals of the method {method} take the geometry of {rig.name!r} as exact; "
         "--method coupled includes the tolerances of the rig file",
     )
 
@@ -187,7 +188,7 @@ def to_json(
 def _rows_again(
     rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows], other: Rig
 ) -> Iterable[Mapping[str, Rows]]:
-    """Yield the rows of every record as the rig `other` has them."""
+    """Yield the rows of every record, rebuilt with the rig `other`."""
     for item in built:
         signals = of_other_geometry(rig, item.conditioned.signals, other)
         yield record_rows(other, terms, signals, item.conditioned.filtering)
@@ -210,7 +211,7 @@ def _collected(reductions: Sequence[RecordReduction]) -> Parts:
 
 
 def _shifts(rig: Rig, terms: Sequence[Used], own: Parts, moved: Sequence[Parts]) -> GeometryShifts:
-    """Return the shifts from the triangles of the rig itself and of it with each number moved."""
+    """Return the shifts from the triangles of the rig itself and with each number increased."""
     names = {f: names for f in FAMILIES if (names := parameters_of(rig, terms, f))}
     shifts = {
         family: np.column_stack(

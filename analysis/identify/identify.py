@@ -10,7 +10,7 @@ import numpy as np
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
 from analysis.identify.estimation import refuse_unknown
-from analysis.identify.geometry import left_out
+from analysis.identify.geometry import tolerances_ignored
 from analysis.identify.methods import SearchOptions, identify_by
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.settings import IDENTIFY
@@ -38,9 +38,9 @@ def identify(
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
-    `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
-    sensor noise as well, for studies of just that. Another `method` is `analysis.identify.methods`'
-    work, `search` being for those that search. `estimator` is one of
+    `terms` defaults to the paper's model. `reject_noise` False also returns parameters that are
+    determined mostly by sensor noise, for studies. Other methods than "coupled" are in
+    `analysis.identify.methods`; `search` is for pso and ga. `estimator` is one of
     `analysis.identify.estimation.ESTIMATORS` ("auto": least squares, or instruments where noise in
     the regressors biases it and that matters), "plain" the bare solution without nuisances;
     `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
@@ -59,10 +59,10 @@ def identify(
 
 
 def _with_exact_geometry(rig: Rig, result: Identification) -> Identification:
-    """Return the result of a method without tolerances, which says so where the rig has some."""
+    """Return the result of a method that ignores tolerances, with a check if the rig has some."""
     if not rig.uncertain_numbers:
         return result
-    checks = (*result.checks, left_out(rig, result.method))
+    checks = (*result.checks, tolerances_ignored(rig, result.method))
     failed = [c.name for c in checks if not c.ok]
     model = replace(result.model, provenance={**result.model.provenance, "checks_failed": failed})
     return replace(result, checks=checks, model=model)
@@ -78,7 +78,7 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
         refuse_unknown(estimator)
     if bootstrap and bootstrap < IDENTIFY.least_draws:
         raise InputError(
-            f"{bootstrap} bootstrap draws give no 95 % interval; "
+            f"{bootstrap} bootstrap draws are too few for a 95 % interval; "
             f"take {IDENTIFY.least_draws} or more"
         )
     if bootstrap and estimator in (PLAIN, "output-error"):

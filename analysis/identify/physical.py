@@ -1,12 +1,12 @@
-"""Parameters that rigid bodies and real oil can have, and the price that the data ask for them.
+"""Physically possible parameters (rigid bodies, real oil), and their cost in the residual.
 
 Level 1, *signs*: friction, flow gains and 1/b are not negative, and the chain's R is positive
 semidefinite. M_ij(q) sums R_kl cos(theta_k - theta_l) (`terms.inertia`), and the cosines form a
 Gram matrix, so by Schur's product theorem M(q) is then so in every posture; with all links in line
-M(q) is made of R alone, so over all postures nothing weaker would do.
-Level 2, *rigid bodies*: R_ij = l_i W_j for i < j besides, l_i being the rig's link lengths
-(`terms.inertia`). Both levels together say exactly that there are links with masses m_k > 0, first
-moments h_k and pseudo-inertias [[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:
+M(q) is made of R alone, so no weaker condition holds in all postures. Level 2, *rigid bodies*: R_ij
+= l_i W_j for i < j besides, l_i being the rig's link lengths (`terms.inertia`). Both levels
+together say exactly that there are links with masses m_k > 0, first moments h_k and pseudo-inertias
+[[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:
     R_kk = I_k + l_k^2 m_beyond(k),  W_k = h_k + l_k m_beyond(k),  m_beyond(k) = sum_{j>k} m_j;
 eliminating the links from the tip inwards takes the same Schur complements as R >= 0.
 
@@ -14,7 +14,7 @@ Solved as constrained least squares on the triangle that the identification has 
 consistent parameters are those nearest to the free ones in the metric X'X of all rows. A
 constraint that moves the parameters further than their scatter between repeats explains is
 *rejected by the data* (Hotelling's T^2 on the active constraints, cluster covariance), and the
-parameters given out are then those of the level below.
+level below is returned instead.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ LEVELS = ("signs", "rigid bodies")
 
 
 @dataclass(frozen=True)
-class Price:
-    """What a level costs one family: `residual` is the relative growth of the residual's RMS.
+class Cost:
+    """The cost of a level for one family; `residual` is the relative growth of the residual's rms.
 
-    `active` says what holds the solution, `gap` by how much the data alone break each, in words;
-    `p` is the probability that scatter alone does so, NaN where it cannot be judged.
+    `active` names the constraints that hold, `gap` states by how much the data alone violate each;
+    `p` is the p value of that, NaN where it cannot be judged.
     """
 
     residual: float
@@ -65,27 +65,27 @@ class Price:
 
 @dataclass(frozen=True)
 class Level:
-    """One level's parameters and its price by family."""
+    """One level's parameters and their cost by family."""
 
     name: str
     estimates: Mapping[str, Estimate]
     covariance: Array
-    prices: Mapping[str, Price]
+    costs: Mapping[str, Cost]
     geometry: GeometryShifts | None = None  # with the directions that are held taken out
 
     @property
     def rejected(self) -> bool:
         """Whether any family's data contradict it."""
-        return any(price.rejected for price in self.prices.values())
+        return any(cost.rejected for cost in self.costs.values())
 
 
 @dataclass(frozen=True)
 class Physical:
-    """The free estimates, both levels, and which one is given out (its index)."""
+    """The free estimates, both levels, and the index of the level returned."""
 
     free: Mapping[str, Estimate]
     levels: tuple[Level, ...]
-    given: int
+    returned: int
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -120,7 +120,7 @@ def _rigid(rig: Rig, index: Mapping[str, int], weights: Array) -> tuple[Array, t
     N = len(rig.joints)
     inertia, rows, labels = inertia_names(N), [], []
     for i in range(N):
-        # A robot of electric joints may leave its lengths unsaid.
+        # An electric rig may omit its link lengths.
         length = getattr(rig.joints[i], "link_length", None)
         for j in range(i + 1, N):
             if length is None or f"W{j + 1}" not in index:
@@ -135,9 +135,9 @@ def _rigid(rig: Rig, index: Mapping[str, int], weights: Array) -> tuple[Array, t
 
 
 def physical(result: Identification) -> Physical:
-    """Return physically consistent parameters and what they cost.
+    """Return physically consistent parameters and their cost.
 
-    Raises InputError where a parameter is not identified: nothing can be constrained then.
+    Raises InputError where a parameter is not identified, because nothing can be constrained then.
     """
     lost = [n for n, e in result.estimates.items() if not e.identified]
     if lost:
@@ -147,13 +147,13 @@ def physical(result: Identification) -> Physical:
         )
     levels = tuple(_level(result, name, rigid=bool(k)) for k, name in enumerate(LEVELS))
     accepted = [k for k, level in enumerate(levels) if not level.rejected]
-    # Signs hold for every body there is: the last resort even where data speak against them.
+    # Signs hold for every body: level 1 is the last resort even where the data contradict it.
     return Physical(result.estimates, levels, max(accepted, default=0))
 
 
 def with_physics(result: Identification, physical: Physical) -> Identification:
     """Return the identification with the consistent parameters in place of the free ones."""
-    level = physical.levels[physical.given]
+    level = physical.levels[physical.returned]
     checks = (*result.checks, *physical.checks)
     provenance = {
         **result.model.provenance,
@@ -171,11 +171,11 @@ def with_physics(result: Identification, physical: Physical) -> Identification:
 
 def _level(result: Identification, name: str, rigid: bool) -> Level:
     rig, geometry = result.model.rig, result.geometry
-    solutions, prices, shifts = {}, {}, {}
+    solutions, costs, shifts = {}, {}, {}
     for family, solution in result.solutions.items():
         k = len(solution.names)
         X, y = solution.triangle[:k, :k], solution.triangle[:k, k]
-        # An estimator may have moved the free solution off the triangle's own: project that one.
+        # An estimator's solution may differ from the triangle's: project the estimator's.
         minimum = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
         P = _projection(X, minimum)
         solutions[family] = _constrained(solution, P, minimum)
@@ -183,23 +183,23 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
         if geometry is not None:
             shifts[family] = P @ geometry.shifts[family]
             free = replace(solution, covariance=solution.covariance + geometry.covariance(family))
-        prices[family] = _price(rig, free, X, y, minimum)
+        costs[family] = _cost(rig, free, X, y, minimum)
     estimates, covariance = estimates_of(rig, result.model.terms, solutions)
     held = None if geometry is None else replace(geometry, shifts=shifts)
     if held is not None:
         estimates, covariance = widened(rig, result.model.terms, estimates, covariance, held)
-    return Level(name, estimates, covariance, prices, held)
+    return Level(name, estimates, covariance, costs, held)
 
 
 def _constrained(solution: Solution, P: Array, minimum: Minimum) -> Solution:
-    """Return the solution moved; its covariance loses the directions that are held."""
+    """Return the constrained solution; its covariance is zero along the directions held."""
     if not len(minimum.active):
         return solution
     return replace(solution, value=minimum.beta, covariance=P @ solution.covariance @ P.T)
 
 
 def _projection(X: Array, minimum: Minimum) -> Array:
-    """Return P (k, k), which takes from a small change what the active constraints hold."""
+    """Return P (k, k), which removes from a small change what the active constraints hold."""
     k, C = len(minimum.beta), minimum.active
     if not len(C):
         return np.eye(k)
@@ -211,7 +211,7 @@ def _projection(X: Array, minimum: Minimum) -> Array:
     return np.asarray(P * np.outer(scale, 1.0 / scale))
 
 
-def _price(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) -> Price:
+def _cost(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) -> Cost:
     k = len(minimum.beta)
     rest = solution.triangle[k, k] ** 2
     before = float(np.sum((y - X @ solution.value) ** 2)) + rest
@@ -219,17 +219,17 @@ def _price(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) -
     growth = float(np.sqrt(after / before) - 1.0) if before > 0 else 0.0
     C = minimum.active
     if not len(C):
-        return Price(0.0, (), (), 1.0)
+        return Cost(0.0, (), (), 1.0)
     apart = C @ solution.value
     gap = tuple(
         _constraint_text(label, rig, solution, row, value)
         for label, row, value in zip(minimum.labels, C, apart, strict=True)
     )
-    return Price(growth, minimum.labels, gap, _probability(solution, C, apart))
+    return Cost(growth, minimum.labels, gap, _probability(solution, C, apart))
 
 
 def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -> str:
-    """Say how far the data alone are from one active constraint."""
+    """State how far the data alone are from one active constraint."""
     std = float(np.sqrt(row @ solution.covariance @ row))
     far = f", {abs(apart) / std:.3g} standard errors" if std > 0 else ""
     if "=" not in label or ">=" in label:
@@ -244,7 +244,7 @@ def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, apart
 
 
 def _probability(solution: Solution, C: Array, apart: Array) -> float:
-    """Return p of T^2 = d' (C V C')^-1 d, Hotelling's with the least dof of what C touches."""
+    """Return p of T^2 = d' (C V C')^-1 d (Hotelling), with the least dof of the parameters in C."""
     V = C @ solution.covariance @ C.T
     dof = float(np.min(solution.dof[np.abs(C).sum(axis=0) > 0]))
     q = len(C)
@@ -258,29 +258,29 @@ def _probability(solution: Solution, C: Array, apart: Array) -> float:
 
 
 def _statement(level: Level) -> Check:
-    active = [label for price in level.prices.values() for label in price.active]
+    active = [label for cost in level.costs.values() for label in cost.active]
     name = f"physical: {level.name}"
     if not active:
-        return Check(name, True, "the free estimate is inside already: nothing was changed")
+        return Check(name, True, "the free estimate satisfies it already: nothing was changed")
     costs = "; ".join(
-        f"{family}: residual {price.residual:+.3%}, {_verdict(price)} ({'; '.join(price.gap)})"
-        for family, price in level.prices.items()
-        if price.active
+        f"{family}: residual {cost.residual:+.3%}, {_verdict(cost)} ({'; '.join(cost.gap)})"
+        for family, cost in level.costs.items()
+        if cost.active
     )
     return Check(name, not level.rejected, costs)
 
 
-def _verdict(price: Price) -> str:
-    if not np.isfinite(price.p):
-        return "the repeats are too few to tell whether the data allow it"
-    word = "REJECTED by the data" if price.rejected else "compatible with the data"
-    return f"{word}, p = {price.p:.2g}"
+def _verdict(cost: Cost) -> str:
+    if not np.isfinite(cost.p):
+        return "the repeats are too few to test it against the data"
+    word = "REJECTED by the data" if cost.rejected else "compatible with the data"
+    return f"{word}, p = {cost.p:.2g}"
 
 
 def to_json(physical: Physical) -> dict[str, Any]:
     """Return both levels as plain data."""
     return {
-        "given": physical.levels[physical.given].name,
+        "given": physical.levels[physical.returned].name,
         "levels": [
             {
                 "name": level.name,
@@ -288,11 +288,11 @@ def to_json(physical: Physical) -> dict[str, Any]:
                 "parameters": {n: estimate_json(e) for n, e in level.estimates.items()},
                 "price": {
                     family: {
-                        "residual_growth": finite(price.residual),
-                        "active": list(price.active),
-                        "p_value": finite(price.p),
+                        "residual_growth": finite(cost.residual),
+                        "active": list(cost.active),
+                        "p_value": finite(cost.p),
                     }
-                    for family, price in level.prices.items()
+                    for family, cost in level.costs.items()
                 },
             }
             for level in physical.levels

@@ -1,6 +1,6 @@
-"""One record reduced to what an identification needs of it: triangles, counts, noise.
+"""One record reduced to the quantities that an identification needs: triangles, counts, noise.
 
-A reduction is a few kilobytes whatever the record's length. It is made where the samples are (in
+A reduction has a few kilobytes for any length of the record. It is made where the samples are (in
 this process, in another, on a worker of a cluster) and only it is sent on;
 `analysis.identify.coupled` joins the reductions of all records. Every record is kept in SEGMENTS
 parts of its duration: a step of one record has no repeats to compare, and compares its parts.
@@ -41,10 +41,10 @@ Part = tuple[Array, int]  # triangle (k+1, k+1) of [X y] and its rows
 
 @dataclass(frozen=True)
 class RecordReduction:
-    """What one record says: by family, one triangle per part; what was left out; its noise.
+    """The reduction of one record: by family, a triangle per part, masked rows, noise moments.
 
     `run` numbers the run; `noise` is the part of [X y]'[X y] that sensor noise makes, by family,
-    None where another record of the step stands for it.
+    None where another record of the step represents it.
     """
 
     run: int
@@ -58,7 +58,7 @@ class RecordReduction:
 
 @dataclass(frozen=True)
 class RecordTask:
-    """One record to reduce, by where it is; picklable as long as terms and filtering are."""
+    """A record to reduce, by its path; picklable as long as terms and filtering are."""
 
     rig: Rig
     run: int
@@ -98,7 +98,7 @@ class StepTask:
 
 
 def steps_of(rig: Rig, path: str, heads: Sequence[RecordHead]) -> list[StepTask]:
-    """Return the steps with a locked joint; all repeats of one decide together what moves."""
+    """Return the steps with a locked joint, whose repeats decide together which joints move."""
     names: dict[str, list[str]] = {}
     for head in heads:
         names.setdefault(head.step, []).append(head.name)
@@ -107,7 +107,7 @@ def steps_of(rig: Rig, path: str, heads: Sequence[RecordHead]) -> list[StepTask]
 
 
 def moving_task(task: StepTask) -> tuple[bool, ...]:
-    """Return which joints (N,) move in a step; of its records only positions are kept."""
+    """Return which joints (N,) move in a step; only positions are kept in memory."""
     repeats = []
     for name in task.records:
         with open_record(task.path, name) as reader:
@@ -144,7 +144,7 @@ def reduce_rows(
 
 
 def first_of_steps(records: Sequence[Record | RecordHead]) -> set[str]:
-    """Return the names of the records that stand for the noise of their step's repeats."""
+    """Return the names of the records whose noise represents all repeats of their step."""
     first: dict[str, str] = {}
     for record in records:
         first.setdefault(record.step, record.name)
@@ -161,7 +161,7 @@ def reduce_record(
     stretch: int = REGRESSION.chunk_samples,
     moving: Mask | None = None,
 ) -> RecordReduction:
-    """Reduce one record, a long one chunk by chunk; raises InputError for one that is unusable.
+    """Reduce one record, a long one chunk by chunk; raises InputError for an unusable one.
 
     `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
     of this record alone.
@@ -175,7 +175,7 @@ def reduce_record(
     parts, masked = _folded(rig, terms, chunks, head.samples / head.sample_rate)
     noise = None
     if with_noise:
-        # Of a long record the first chunk stands for the whole.
+        # The first chunk represents a long record.
         count = min(head.samples, stretch) if divisible(filters) else head.samples
         part = source.read(0, count)
         signals = condition(rig, part, filters.channels, moving)
@@ -188,7 +188,7 @@ def reduce_record(
 def _folded(
     rig: Rig, terms: Sequence[Used], chunks: Iterable[Mapping[str, Rows]], duration: float
 ) -> tuple[dict[str, tuple[Part, ...]], int]:
-    """Return one triangle per family and part of a record of `duration` [s], and rows masked."""
+    """Return a triangle per family and part of a record of `duration` [s], and masked rows."""
     sums = {
         family: [
             Accumulator(len(parameters_of(rig, terms, family)))
@@ -217,7 +217,7 @@ def parts_of(rows: Rows, duration: float) -> list[slice]:
 
 
 def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int]]:
-    """Count lost and clipped samples; refuses a channel or joint that stood still."""
+    """Count lost and clipped samples; raises InputError for a constant channel or joint."""
     head = source.head
     lost, clipped = 0, dict[str, int]()
     spans: dict[str, tuple[float, float]] = {}
@@ -229,14 +229,14 @@ def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int
         for name, (low, high) in ck.spans_of(part).items():
             before = spans.get(name, (np.inf, -np.inf))
             spans[name] = (min(low, before[0]), max(high, before[1]))
-    ck.refuse_dead_channels(rig, head, spans)
+    ck.refuse_constant_channels(rig, head, spans)
     return lost, clipped
 
 
 def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:
-    """Return the parts of all records, those of a repeat alike in their key.
+    """Return the parts of all records, with one key for those of a repeat.
 
-    Where a step has this record only, its parts stand for repeats and have keys of their own.
+    Where a step has one record only, its parts replace repeats and have a key each.
     """
     repeats = repeats_of((reduction.run, reduction.head) for reduction in reductions)
     out: list[RowCluster] = []
@@ -250,7 +250,7 @@ def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowC
 
 
 def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None:
-    """Return the noise moments of all records, each step's by the record that stands for it."""
+    """Return the summed noise moments of all records; one record represents each step."""
     counts: dict[tuple[int, str], int] = {}
     for reduction in reductions:
         key = (reduction.run, reduction.head.step)

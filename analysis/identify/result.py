@@ -1,4 +1,4 @@
-"""What an identification found, as data and as the contract's JSON."""
+"""The result of an identification, as data and as JSON."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between 
 
 @dataclass(frozen=True)
 class Identification:
-    """What an identification found: estimates, conditioning, rows used and left out, checks.
+    """The result of an identification: estimates, conditioning, rows used, masked rows, checks.
 
-    `built` are the rows it was solved from; none where they were not all in memory. `geometry` is
-    what the rig's tolerances shift; None where it has none, or the method does not include them.
+    `built` are the rows it was solved from; none where they were not all in memory. `geometry`
+    holds the shifts by the rig's tolerances; None where there are none, or the method ignores them.
     """
 
     method: str
@@ -44,7 +44,7 @@ class Identification:
 
 
 def to_json(result: Identification) -> dict[str, Any]:
-    """Return the identification as the contract's JSON; null where a number does not exist."""
+    """Return the identification as JSON data; null where a number does not exist."""
     return {
         "method": result.method,
         "estimator": str(result.model.provenance.get("estimator", PLAIN)),
@@ -63,7 +63,7 @@ def to_json(result: Identification) -> dict[str, Any]:
 
 
 def by_geometry(result: Identification) -> dict[str, float]:
-    """Return the standard uncertainty of each parameter that the rig's tolerances make, by name."""
+    """Return each parameter's standard uncertainty due to the rig's tolerances, by name."""
     if result.geometry is None:
         return {}
     model = result.model
@@ -114,7 +114,7 @@ def _estimate(
     if value == 0:
         return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
     slope = -1.0 / value**2
-    # An interval of 1/b that reaches zero leaves b unbounded above.
+    # An interval of 1/b that includes zero leaves b unbounded above.
     ends = (1.0 / high, 1.0 / low if low > 0 else np.inf) if value > 0 else (np.nan, np.nan)
     estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
     return estimate, float(slope)

@@ -8,7 +8,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class IdentifySettings:
-    """What is checked, when an estimator is preferred, how far an iteration goes.
+    """Limits of checks, choice of estimators, convergence of iterations.
 
     Those of the estimators were set by `python -m tests.studies estimators`.
     """
@@ -27,9 +27,9 @@ class IdentifySettings:
     normal_quantile: float = 1.96  # half of a 95 % interval over the standard error, known sigma
     record_segments: int = 10  # parts of a record whose residuals are compared
 
-    # -- what other experiment would identify a parameter --------------------------------------
+    # -- experiments that would identify a parameter --------------------------------------
     visible_direction: float = 0.02  # of unit columns: the size from which a step shows it
-    most_poses: int = 81  # of the locked joints that are looked at
+    most_poses: int = 81  # of the locked joints that are examined
     advice_seconds: float = 4.0  # [s] of the motion tried in each
     advice_lines: tuple[tuple[float, float], ...] = (  # [Hz], share of the motion
         (0.5, 1.0),
@@ -79,7 +79,7 @@ class IdentifySettings:
     # -- other methods -------------------------------------------------------------------------
     stage_precision: float = 0.02  # a step yields a value below this relative 95 % half-width
     worst_shown: int = 3  # disagreements that the check spells out; the table has them all
-    dead_error: float = 1e6  # error of a candidate without a state, far above any with one
+    failed_error: float = 1e6  # error of a candidate without a state, far above any with one
     idle_value: float = 1.0  # of parameters without effect and without a nominal value
     at_bound: float = 0.02  # of the decades searched: nearer to an end, the bound made the value
 

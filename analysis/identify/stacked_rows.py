@@ -1,4 +1,4 @@
-"""The regression rows of all records of a set of runs, built once and shared by all who need them.
+"""The regression rows of all records of a set of runs, built once and shared.
 
 The solution, the estimators that refine it and the report all read the same `RecordRows`; columns
 that an estimator fits beside the model's are appended to them (`with_columns`).
@@ -33,7 +33,7 @@ class RecordRows:
 
     @property
     def group(self) -> tuple[int, str]:
-        """Which repeats belong together: the run and the step."""
+        """The (run, step) that the repeat belongs to."""
         return self.conditioned.group
 
     def family(self, family: str) -> list[Rows]:
@@ -50,9 +50,9 @@ def build_rows(
 ) -> list[RecordRows]:
     """Return the filtered, decimated rows of every record; raises InputError for a bad one.
 
-    `progress` receives which share of the runs is done.
+    `progress` receives the share of the runs that is done.
     """
-    ck.refuse_dead_records(rig, runs)
+    ck.refuse_constant_records(rig, runs)
     out: list[RecordRows] = []
     for number, run in enumerate(runs):
         for conditioned in condition_runs(rig, [run], filtering):
@@ -68,8 +68,8 @@ def with_columns(
 ) -> list[RecordRows]:
     """Return the rows of `terms` with the columns of the terms `extra` appended, in their order.
 
-    The extra terms may neither change the signals nor mask rows; equations without one of their
-    columns get none.
+    The extra terms may neither change the signals nor mask rows; equations without any of their
+    columns are unchanged.
     """
     if not extra:
         return list(built)

@@ -1,14 +1,14 @@
-"""Which combinations of parameters records determine where they do not determine every one.
+"""The combinations of parameters that records determine, where not all are determined.
 
 Rows [X] determine c'p exactly where c is orthogonal to the null space of X. With m null directions
 m parameters are chosen to be *dependent* (columns that pivoted QR of the null space finds best
 conditioned) and are regrouped into the others:
  c_i = e_i - sum_d B_id e_d,  B = Z_ind Z_dep^-1,  Z (k, m) the null space.
-The remaining k - m *base parameters* are the fewest that say all that the records can say.
-Source: Gautier, Numerical calculation of the base inertial parameters of robots (1991).
+The remaining k - m *base parameters* are the fewest that describe the records completely. Source:
+Gautier, Numerical calculation of the base inertial parameters of robots (1991).
 
-Columns are scaled to unit norm throughout, so that "zero" means the same for kg m^2 and kg m. A
-direction that shows mostly the sensors' noise counts as null (`analysis.regression.noise`).
+Columns are scaled to unit norm throughout, so that one threshold suits kg m^2 and kg m. A direction
+that consists mostly of sensor noise counts as null (`analysis.regression.noise`).
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Combination:
-    """A base parameter: parts (name, coefficient), the first with coefficient 1."""
+    """A base parameter: parts (name, coefficient), of which the first has coefficient 1."""
 
     parts: tuple[tuple[str, float], ...]
 
     @property
     def text(self) -> str:
-        """The combination as people write it: "R11 + R22 + 1.56 R12"."""
+        """The combination as text: "R11 + R22 + 1.56 R12"."""
         words: list[str] = []
         for name, coefficient in self.parts:
             size = abs(coefficient)
@@ -51,10 +51,10 @@ class Combination:
 
 @dataclass(frozen=True)
 class Determinacy:
-    """What rows determine of `names`: rank, condition number of the unit columns, and the rest.
+    """What rows determine of `names`: rank, condition number of the unit columns, base parameters.
 
-    `null` (m, k) are the directions of the parameters that do not show; `lost` the parameters in
-    them; `base` the identifiable combinations of those, `known` those that are identified alone.
+    `null` (m, k) are the undetermined directions, `lost` the parameters in them; `base` the
+    identifiable combinations of those, `known` the parameters that are identified individually.
     """
 
     names: tuple[str, ...]
@@ -72,7 +72,7 @@ class Determinacy:
 
 
 def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> Determinacy:
-    """Say what rows X (m, k), or their triangle, determine of the k parameters `names`.
+    """Return what rows X (m, k), or their triangle, determine of the k parameters `names`.
 
     `noise` (k, k) is the part of X'X that sensor noise makes.
     """
@@ -118,7 +118,7 @@ def _combinations(
     for i in independent:
         c = np.zeros(len(names))
         c[i], c[dependent] = 1.0, -(back @ null[:, i])
-        # A column of zeros carries nothing: it is lost alone, and in no combination.
+        # The parameter of a column of zeros is undetermined by itself, and in no combination.
         c[(np.abs(c) < REGRESSION.negligible_share * np.abs(c).max()) | ~shown] = 0.0
         parts = [int(p) for p in np.flatnonzero(c)]
         plain = c * scale

@@ -1,9 +1,9 @@
 """Rows of a long record, chunk by chunk, equal to those of the record as a whole.
 
-A row at sample c needs the samples within the channels' filter, the row filter and the alignment
-of it. A chunk owns the rows of the samples [first, last) and reads that much more either side,
-starting at a multiple of the decimation so that all chunks share one grid of rows. Which locked
-joints move and where the others stand is found beforehand, for all chunks alike.
+A row at sample c needs the samples within reach of the channel filter, the row filter and the
+alignment. A chunk contains the rows of the samples [first, last) and reads that many more on either
+side, starting at a multiple of the decimation so that all chunks share one grid of rows. Which
+locked joints move and where the others stand is decided beforehand, for all chunks.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Array = NDArray[np.float64]
 
 
 class Source(Protocol):
-    """A record whose samples are read when asked for."""
+    """A record whose samples are read on demand."""
 
     @property
     def head(self) -> RecordHead:
-        """What is known without samples."""
+        """The record's description without samples."""
 
     def read(self, first: int = 0, last: int | None = None) -> Record:
         """Return the samples [first, last) as a record of their own."""
@@ -55,14 +55,14 @@ class InMemory:
 
 @dataclass(frozen=True)
 class Locks:
-    """Which joints (N,) move, and where (N,) [m] the others stand: facts of a whole record."""
+    """Which joints (N,) move, and the position (N,) [m] of the others, for a whole record."""
 
     moving: Mask
     held: Array
 
 
 def overlap(rig: Rig, rate: float, filtering: Filtering) -> int:
-    """Return how many samples either side of a row's own decide it, and one grid step more."""
+    """Return the samples on either side that a row depends on, plus one grid step."""
     rows = 0 if filtering.rows is None else filtering.rows.reach
     return filtering.channels.reach + rows + align_reach(rig, rate) + filtering.step
 

@@ -1,4 +1,4 @@
-"""The records of runs, conditioned: filtered signals, with one decision a step on its locks."""
+"""The records of runs, conditioned: filtered signals, with one decision on the locks per step."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class ConditionedRecord:
-    """One record made ready: its signals under the channel filter, its filters, its equations.
+    """A conditioned record: its signals under the channel filter, its filters, its equations.
 
-    `run` numbers the run; `families` are the families of rows that are looked at, by default all.
+    `run` numbers the run; `families` are the families of rows that are used, by default all.
     """
 
     run: int
@@ -28,11 +28,8 @@ class ConditionedRecord:
     filtering: Filtering
     families: tuple[str, ...] = tuple(FAMILIES)
 
-    def again(self, rig: Rig, record: Record) -> ConditionedRecord:
-        """Return another record (repeats averaged, noise added) made ready as this one was.
-
-        Its samples have the weights of this one: noise in a weight is none in the balance.
-        """
+    def condition_alike(self, rig: Rig, record: Record) -> ConditionedRecord:
+        """Condition another record (averaged repeats, added noise) with this one's settings."""
         signals = condition(rig, record, self.filtering.channels, self.signals.moving)
         weight = self.signals.weight
         if weight is not None:
@@ -40,13 +37,13 @@ class ConditionedRecord:
         return replace(self, record=record, signals=signals)
 
     def samples_at(self, time: Array) -> Indices:
-        """Return the numbers of the samples (m,) nearest to instants (m,) [s]."""
+        """Return the indices of the samples (m,) nearest to the times (m,) [s]."""
         at = np.rint(time * self.record.sample_rate).astype(np.int64)
         return np.asarray(at.clip(0, len(self.signals.t) - 1))
 
     @property
     def group(self) -> tuple[int, str]:
-        """Which repeats belong together: the run and the step."""
+        """The (run, step) that the repeat belongs to."""
         return self.run, self.record.step
 
 

@@ -2,10 +2,10 @@
 
     minimise |X beta - y|^2   subject to   E beta = 0,   G beta >= 0,   sum_i beta_i F_i >= 0
 
-The problem is convex, so the answer is the answer. The equalities are eliminated with a basis of
-their null space, the inequalities enter as logarithmic barriers, and Newton's method follows the
-central path until the duality gap, (number of inequalities) / t, is negligible against |y|^2.
-Source: Boyd and Vandenberghe, Convex Optimization, sections 11.3 and 11.4.
+The problem is convex, so the minimum is global. The equalities are eliminated with a basis of their
+null space, the inequalities enter as logarithmic barriers, and Newton's method follows the central
+path until the duality gap, (number of inequalities) / t, is negligible against |y|^2. Source: Boyd
+and Vandenberghe, Convex Optimization, sections 11.3 and 11.4.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Feasible:
 
 @dataclass(frozen=True)
 class Minimum:
-    """The constrained solution, and rows C (q, k) with labels: what holds it, C beta = 0 there."""
+    """The constrained solution with its active constraints C beta = 0: rows C (q, k) and labels."""
 
     beta: Array
     active: Array
@@ -107,7 +107,7 @@ def _barrier(x: Array, G: Array, F: Array) -> tuple[float, Array, Array]:
 
 
 def _interior(x: Array, G: Array, F: Array) -> Array:
-    """Return a point strictly inside, by driving a common slack s below zero from where it holds.
+    """Return a point strictly inside, by reducing a common slack s below zero.
 
     Raises InputError where the constraints leave no interior.
     """
@@ -125,7 +125,7 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
         gradient, hessian = _shifted(z, wide, shifted, wider)
         target[:] = 0.0
         target[-1] = t / size
-        # Staying near the data's own point keeps the search bounded.
+        # Staying near the unconstrained solution keeps the search bounded.
         pull = 1e-3 * np.append(z[:-1] - x, 0.0) / size**2
         ridge = 1e-3 * np.diag(np.append(np.ones(len(x)), 0.0)) / size**2
         step = -np.linalg.solve(hessian + ridge, gradient + target + pull)

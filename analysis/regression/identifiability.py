@@ -1,9 +1,8 @@
-"""What an experiment will determine, before it is run: the regressor of motions on the twin.
+"""Identifiability of a planned experiment: the regressor of its motions on the twin.
 
-A step's motion gives the same rows that its record would (`analysis.regression.rows`), less the
-sensors' noise: rank and condition number of all steps' rows stacked say what can be identified at
-all. The row filter is left out: it takes noise, of which there is none, and does not change the
-rank.
+A step's motion results in the same rows as its record (`analysis.regression.rows`), without sensor
+noise: rank and condition number of all steps' rows stacked state what can be identified. The row
+filter is omitted: there is no noise to remove, and it does not change the rank.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
 
 
 def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determinacy]:
-    """Say, by family, what the rows of these steps determine together."""
+    """Return, by family, what the rows of these steps determine together."""
     used = tuple(Used(term) for term in baseline())
     out = {}
     for family in FAMILIES:

@@ -1,4 +1,4 @@
-"""Least squares with columns scaled to unit norm, and the one rule for what counts as zero.
+"""Least squares with columns scaled to unit norm, and the threshold for numerical rank.
 
 Columns have unlike units (kg m^2, N m s, 1/Pa); scaled by D = diag(1/|x_j|) all have norm 1, and a
 singular value of X D means the same for every problem. Directions whose singular value is below
@@ -32,7 +32,7 @@ class ScaledFactors:
 
     @property
     def strong(self) -> NDArray[np.bool_]:
-        """Which directions (k,) the rows determine."""
+        """Return the directions (k,) that the rows determine."""
         return np.asarray(self.sigma > REGRESSION.rank_tolerance * max(self.sigma[0], 1e-300))
 
     @property
@@ -82,8 +82,8 @@ def shortest(X: Array, y: Array, rank: float) -> Array:
 def scaled_inverse(A: Array) -> Array:
     """Invert a matrix A (k, k) of normal or estimating equations, its diagonal scaled to 1.
 
-    Weak directions stay in, for their large variance is what an interval must show; left out are
-    those beyond what double precision resolves (ROUNDING) and columns with a zero diagonal.
+    Weak directions are kept, because an interval must include their large variance. Left out are
+    directions beyond double precision (`rounding_share`) and columns with a zero diagonal.
     """
     scale = np.sqrt(np.abs(np.diag(A)))
     kept = scale > 0.0

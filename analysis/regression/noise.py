@@ -1,11 +1,11 @@
-"""What sensor noise does to the regressor: attenuation predicted from the stated noise.
+"""Attenuation of least squares by sensor noise in the regressor, predicted from stated noise.
 
-Noise in the columns biases least squares (attenuation). A record is disturbed once more by the
-rig's stated noise; the difference D of its rows [X y] before and after is, to first order, the
-noise that is in the rows already. With N = D'D and A = X'X,
+Noise in the columns biases least squares (attenuation). The rig's stated noise is added to a record
+once more; the difference D of its rows [X y] is, to first order, distributed like the noise that is
+in the rows already. With N = D'D and A = X'X,
  bias = - A^-1 (N_xx beta - n_xy),
 and the diagonal of A^-1 N_xx is the share of a column's own information that is noise: a parameter
-that rests on noise (the inertia of a joint that only trembles in its lock) is no parameter.
+determined mostly by noise (the inertia of a joint that hardly moves in its lock) is not identified.
 Source: Fuller, Measurement Error Models, section 2.2.
 """
 
@@ -48,12 +48,12 @@ def record_moments(
 ) -> dict[str, Array]:
     """Return N (k+1, k+1) of [X y] for each family of one record with the rows `before`.
 
-    `rng` draws the noise; by default each step has a stream of its own, so that the prediction
-    does not depend on the order of the records.
+    `rng` draws the noise; by default each step has its own stream, so that the prediction does not
+    depend on the order of the records.
     """
     if rng is None:
         rng = np.random.default_rng([0, zlib.crc32(conditioned.record.step.encode())])
-    again = conditioned.again(rig, disturbed(rig, conditioned.record, rng))
+    again = conditioned.condition_alike(rig, disturbed(rig, conditioned.record, rng))
     after = record_rows(rig, terms, again.signals, again.filtering)
     out: dict[str, Array] = {}
     for name, rows in before.items():
@@ -64,6 +64,6 @@ def record_moments(
 
 
 def _difference(rows: Rows, other: Rows) -> Array:
-    """Return the change of [X y] in the rows that both kept."""
+    """Return the change of [X y] in the rows that both have."""
     _, a, b = np.intersect1d(rows.time, other.time, return_indices=True)
     return np.column_stack((other.matrix[b] - rows.matrix[a], other.rhs[b] - rows.rhs[a]))

@@ -1,11 +1,11 @@
-"""Fewer parameters than linear unknowns: nonlinear least squares on the reduced rows alone.
+"""Nonlinear least squares on reduced rows, for fewer parameters than linear unknowns.
 
 Rows y = X x with x = h(p). Gauss and Newton's step from p0 is least squares of y - X c on X J,
 J = dh/dp at p0 and c = h(p0) - J p0; both follow from the triangle of [X y] by
 
     [X J, y - X c] = [X y] S,   S = [[J, -c], [0, 1]],
 
-so the rows are never touched again, and covariance, noise bias and identifiability are those of
+so the rows are not needed again, and covariance, noise bias and identifiability are those of
 `analysis.regression.solve` at the solution (the delta method). Source: Bjorck, Numerical Methods
 for Least Squares Problems, section 9.2.
 """
@@ -58,7 +58,7 @@ def _reduce(
     new = (*(names[i] for i in others), *reduction.parameters)
     x = np.nan_to_num(linear.value)
     p = np.concatenate((x[others], reduction.start(x[places])))
-    # All clusters as one: the step needs the sum only, the scatter comes at the end.
+    # The step needs only the sum over clusters; the scatter is computed at the end.
     whole = [RowCluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
     for _ in range(REGRESSION.rounds):
         change = _transform(reduction, places, others, p)

@@ -1,11 +1,11 @@
-"""Rows folded into triangles as they come: any number of rows in the memory of one block.
+"""Sequential QR: any number of rows reduced to a triangle in the memory of one block.
 
-[X y] = Q R block by block: the triangle so far on top of the next rows, one Householder QR, and
-only R (k+1, k+1) stays (a sequential TSQR: Golub and Van Loan, section 5.1.9 and the flat tree of
+[X y] = Q R block by block: the previous triangle on top of the next rows, one Householder QR, and
+only R (k+1, k+1) is kept (a sequential TSQR: Golub and Van Loan, section 5.1.9 and the flat tree of
 Demmel et al. 2012). Every block is small enough for the processor's cache, which is why this is
 faster than one QR of all rows. The clustered standard errors need X'(y - X beta) of each cluster,
-which its own triangle gives (`analysis.regression.solve.scores`): one triangle per repeat is all
-that is kept of its samples.
+which follows from its triangle (`analysis.regression.solve.scores`), so that one triangle per
+repeat is kept.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 class Accumulator:
-    """The triangle of all rows folded so far; memory does not grow with their number."""
+    """The triangle of all rows added so far, in memory independent of their number."""
 
     def __init__(self, columns: int, block_rows: int = REGRESSION.block_rows) -> None:
         self.rows = 0
@@ -35,7 +35,7 @@ class Accumulator:
         return self._R.copy()
 
     def fold(self, matrix: Array, rhs: Array) -> None:
-        """Fold rows (m, k), (m,) in; raises ValueError if they do not fit."""
+        """Add rows (m, k), (m,); raises ValueError if they do not fit."""
         if matrix.shape != (len(rhs), self._width - 1):
             raise ValueError(f"rows {matrix.shape}, {rhs.shape} do not fit {self._width - 1}")
         for first in range(0, len(rhs), self._block):
@@ -48,14 +48,14 @@ class Accumulator:
         self.rows += len(rhs)
 
     def merge(self, triangle: Array, rows: int) -> None:
-        """Fold another accumulator's triangle (or a part of one) in, which stands for `rows`."""
+        """Add the triangle of another accumulator (or a part of it) that represents `rows` rows."""
         space = self._stack(len(triangle))
         space[self._width :] = triangle
         self._reduce(space)
         self.rows += rows
 
     def fade(self, factor: float) -> None:
-        """Weaken everything folded so far: R'R by `factor` (exponential forgetting)."""
+        """Multiply R'R of all rows added so far by `factor` (exponential forgetting)."""
         self._R *= np.sqrt(factor)
 
     def _stack(self, count: int) -> Array:

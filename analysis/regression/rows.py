@@ -1,4 +1,4 @@
-"""Rows of the regression: what every term says about every equation of one record.
+"""Rows of the regression: every term's columns in every equation of one record.
 
 Used are the torque rows and the chamber-flow rows of the excited joints only: a locked joint's
 contact torque is unknown, and its valve is shut. Rows are built point by point from the filtered
@@ -39,11 +39,11 @@ WAVES = (np.sin, np.cos)
 
 @dataclass(frozen=True)
 class Filtering:
-    """The filters of one record: `channels` before, `rows` (or none) after.
+    """The filters of one record: `channels` before, `rows` (or none) after the rows are built.
 
-    The torque balances of joints `in_motion` (0-based) do not count samples at which these rest.
-    Those of the joints in `lines` (0-based, with a frequency [Hz]) are without their part at that
-    frequency: one sine of free amplitude and phase is fitted to every record and taken out.
+    Torque balances of joints `in_motion` (0-based) give no weight to samples at rest. From those of
+    the joints in `lines` (0-based, with a frequency [Hz]) the part at that frequency is removed:
+    one sine of free amplitude and phase is fitted to every record and subtracted.
     """
 
     channels: Smoother
@@ -57,8 +57,8 @@ class Filtering:
 class Rows:
     """Rows of one equation of one record: matrix (m, k), rhs (m,), time [s] of each row (m,).
 
-    `names` are the parameters of the columns; `masked` rows were dropped because a sample under
-    the filter lay outside the model, was clipped or was lost.
+    `names` are the parameters of the columns; `masked` rows were dropped because a sample within
+    reach of the filter lay outside the model, was clipped or was lost.
     """
 
     equation: str
@@ -70,7 +70,7 @@ class Rows:
 
 
 def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
-    """Return the places in either of the instants that two sets of rows have in common."""
+    """Return the indices, in either set of rows, of the instants that both have."""
     if np.array_equal(one.time, other.time):  # nearly always
         at = np.arange(len(one.time))
         return at, at
@@ -79,7 +79,7 @@ def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
 
 
 def default_filtering(record: Record) -> Filtering:
-    """Return the filters that the bias study chose, fitted to the record's excitation."""
+    """Return the default filters, adapted to the record's excitation."""
     rate = record.sample_rate
     cutoff = (
         REGRESSION.row_cutoff_electric
@@ -98,12 +98,12 @@ def lines_cutoff(record: Record) -> float:
 
 
 def paper_filtering(record: Record) -> Filtering:
-    """Return the paper's: a 20-sample average (zero-phase here), differences, every row used."""
+    """Return the paper's filters: 20-sample average (zero-phase here), differences, every row."""
     return Filtering(moving_average(record.sample_rate), None)
 
 
 def butterworth_filtering(record: Record) -> Filtering:
-    """Return a zero-phase Butterworth on the channels in place of the windowed sinc."""
+    """Return filters with a zero-phase Butterworth on the channels."""
     chosen = default_filtering(record)
     cutoff = min(80.0, 0.2 * record.sample_rate)
     return replace(chosen, channels=butterworth(record.sample_rate, cutoff))
@@ -148,7 +148,7 @@ def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ..
 
 
 def prepared(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
-    """Return the signals as the terms' columns see them, each term having prepared them in turn."""
+    """Return the signals as the terms' columns see them, after every term's preparation in turn."""
     for used in terms:
         signals = used.term.prepare(rig, signals, used.shape)
     return signals
@@ -178,9 +178,9 @@ def record_rows(
 
 @dataclass(frozen=True)
 class TermPart:
-    """What a term puts into one family's rows of the excited joints, by equation.
+    """A term's filtered columns (m,) by equation and parameter, before rows are dropped.
 
-    Filtered columns (m,) by parameter, before rows are dropped, and where (n,) the equation holds.
+    `valid` (n,) states, by equation, where the term's equation holds.
     """
 
     columns: dict[str, dict[str, Array]]
@@ -191,8 +191,8 @@ class TermPart:
 class RightPart:
     """An equation's filtered right side and its instants (m,) [s], before rows are dropped.
 
-    And where (n,) its sensors are right, where a sample never arrived, and the sines (m, 2 l) of
-    the l frequencies that are taken out.
+    `sensors` (n,) states where its sensors are valid, `lost` (n,) where a sample never arrived,
+    `sines` (m, 2 l) are the sines and cosines of the l frequencies that are removed.
     """
 
     side: Array
@@ -224,7 +224,7 @@ def term_part(
 
 
 def weighted(columns: Mapping[str, Array], signals: Signals, name: str) -> Mapping[str, Array]:
-    """Return an equation's columns (n,) times what each sample counts in it."""
+    """Return an equation's columns (n,) multiplied by the weight of each sample."""
     kind, number = name.rsplit("_", 1)
     if signals.weight is None or kind != "torque":
         return columns
@@ -241,12 +241,12 @@ def right_parts(
         if name not in sides:
             continue
         i = int(name.rsplit("_", 1)[1]) - 1
-        # Inertia couples: a clipped piston of any joint spoils every torque row.
+        # Inertia couples the joints: a clipped piston of any joint affects every torque row.
         joints = slice(None) if family == "mechanical" else slice(i, i + 1)
         side = low_passed(weighted({"": sides[name]}, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
-        if family == "fluid":  # below zero the oil cavitates, and no balance of flows holds
+        if family == "fluid":  # below zero the oil cavitates, and the flow balance does not hold
             sensors &= (signals.p_cap if "cap" in name else signals.p_rod)[:, i] >= 0.0
         sines = filtered_sines(signals, filtering, name)
         out[name] = RightPart(side, time, sensors, _lost(signals, joints), sines)
@@ -323,19 +323,19 @@ def instants(time: Array, filtering: Filtering, count: int) -> Array:
 
 
 def _inside(x: NDArray[Any], filtering: Filtering) -> NDArray[Any]:
-    """Return samples (n, ...) without those that the channel filter's edges have spoiled."""
+    """Return samples (n, ...) without those affected by the channel filter's edges."""
     edges = filtering.channels.reach
     return x[edges : len(x) - edges]
 
 
 def _dropped(bad: Mask, lost: Mask, filtering: Filtering, count: int) -> Mask:
-    """Return which filtered rows (m,) a masked sample is under."""
+    """Return which filtered rows (m,) have a masked sample within the filter's reach."""
     bad, lost = _inside(bad, filtering), _inside(lost, filtering)
     if filtering.rows is None:
         return np.asarray((bad | lost)[:: filtering.step])
     dropped = np.zeros(count, dtype=bool)
     weights = np.abs(filtering.rows.taps[0]) / np.abs(filtering.rows.taps[0]).sum()
-    # What stands for a lost sample is made up: not even the filter's tails may touch it.
+    # A lost sample is interpolated: not even the filter's tails may include it.
     for mask, taps, limit in (
         (bad, weights, REGRESSION.masked_share),
         (lost, np.ones(len(weights)), 0.5),

@@ -16,7 +16,8 @@ class RegressionSettings:
     row_cutoff_range: tuple[float, float] = (8.0, 30.0)
     lines_factor: float = 1.5
     # An electric joint's rows need one derivative less of anything noisy, and its friction reverses
-    # within milliseconds: narrower loses of the reversals (`python -m tests.studies emps`).
+    # within milliseconds: a narrower filter attenuates the reversals (`python -m tests.studies
+    # emps`).
     row_cutoff_electric: float = 30.0
     # A row is dropped where more than this share of the filter's weight is on masked samples.
     masked_share: float = 1e-3
@@ -28,16 +29,16 @@ class RegressionSettings:
     block_rows: int = 4096
 
     # Smallest over largest singular value of the scaled matrix. A direction below it is a thousand
-    # times less visible than the best; measured records show such directions by their noise alone.
+    # times weaker than the strongest; in measured records such directions consist of noise.
     rank_tolerance: float = 1e-3
     # The same of normal equations X'X, where rounding alone sets the limit.
     rank_tolerance_normal: float = 1e-12
 
-    # A parameter rests on noise where noise makes more than this share of its column's information,
-    # and is not identifiable with more than this share of a null direction.
+    # A parameter counts as undetermined where noise makes more than this share of its column's
+    # information, or where more than this share of it lies in a null direction.
     noise_share: float = 0.1
     null_share: float = 0.05
-    # Samples between rows that are looked at for identifiability: the next says the same.
+    # Samples between rows used for identifiability: neighbouring rows are nearly equal.
     sample_step: int = 5
     # Coefficients of a base parameter: left out below this share of the largest, written as a whole
     # number within this share of it.

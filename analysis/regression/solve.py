@@ -1,4 +1,4 @@
-"""Coupled least squares by QR, in a form that streams: factors merge, rows may be forgotten.
+"""Coupled least squares by QR of clusters of rows: triangles merge, rows need not be kept.
 
 The rows of all records are stacked and solved once, so that a parameter that appears in several
 steps has one value (Sakai and Maeshima's STEP4). Each cluster of rows is reduced to
@@ -7,7 +7,7 @@ the triangle R of [X y] = Q R, (k+1, k+1); triangles merge by another QR, and ev
 
 Standard errors are clustered by repeat: within one record residuals are correlated, so only whole
 repeats are independent. Steps are strata: the scores g = X'(y - X beta) of the repeats of a step
-are taken about their mean: an error of the model, the same in every repeat, is no scatter.
+are taken about their mean: an error of the model, equal in every repeat, does not count as scatter.
  V = A^-1 [ sum_steps n/(n-1) sum_r (g_r - mean g)(g_r - mean g)' ] A^-1,  A = X'X,
 and a parameter's t quantile has Satterthwaite's degrees of freedom over the steps (n - 1 each).
 Source: Liang and Zeger (1986) in its stratified form (Cochran, Sampling Techniques, ch. 11).
@@ -43,13 +43,13 @@ class RowCluster:
 
 @dataclass(frozen=True)
 class Solution:
-    """A solved family of rows: `value` and `covariance` in the rows' own coefficients.
+    """A solved family of rows: `value` and `covariance` of the rows' own coefficients.
 
     Entries of parameters in `unidentifiable` (name -> why) are NaN. `condition_number` is of the
     column-scaled matrix, over all columns that are not zero. `residual_rms` has the rows' unit.
-    `noise_bias` is the bias that the stated sensor noise predicts, NaN where not asked for.
-    `triangle` (k+1, k+1) of all rows and `noise`, as given (empty if not), serve questions asked
-    later (`analysis.regression.base_parameters`).
+    `noise_bias` is the bias that the stated sensor noise predicts, NaN where not requested.
+    `triangle` (k+1, k+1) of all rows and `noise`, as passed (empty if not), are kept for
+    `analysis.regression.base_parameters`.
     """
 
     names: tuple[str, ...]
@@ -71,7 +71,7 @@ def triangle(matrix: Array, rhs: Array) -> Array:
 
 
 def merge(triangles: Iterable[Array]) -> Array:
-    """Return the triangle of all rows behind the given triangles, (k+1, k+1)."""
+    """Return the triangle of all rows represented by the triangles, (k+1, k+1)."""
     return square(np.vstack(list(triangles)))
 
 
@@ -89,10 +89,10 @@ def solve(
     reject_noise: bool = True,
     scatter: Sequence[RowCluster] | None = None,
 ) -> Solution:
-    """Solve all clusters at once; parameters that the rows do not determine come out as NaN.
+    """Solve all clusters at once; parameters that the rows do not determine are NaN.
 
-    `noise` (k+1, k+1) is the part of [X y]'[X y] that sensors' noise makes
-    (`analysis.regression.noise`); with `reject_noise` a parameter that rests on it counts as
+    `noise` (k+1, k+1) is the part of [X y]'[X y] that sensor noise makes
+    (`analysis.regression.noise`); with `reject_noise` a parameter determined mostly by it counts as
     undetermined. The errors come from the clusters `scatter`, where those are others
     (`analysis.identify.streams.online`).
     """
@@ -108,7 +108,7 @@ def solve(
         share = np.diag(bread @ noise[:k, :k])
         for name, part in zip(names, share, strict=True):
             if reject_noise and part > REGRESSION.noise_share:
-                lost.setdefault(name, "what these records show of it is mostly sensor noise")
+                lost.setdefault(name, "its column in these records is mostly sensor noise")
     rows = sum(c.rows for c in clusters)
     squares = np.sum((y - X @ beta) ** 2) + R[k, k] ** 2
     residual_rms = float(np.sqrt(squares / max(rows, 1)))
@@ -122,7 +122,7 @@ def solve(
 
 
 def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[str, str]]:
-    """Return the inverse of X (k, k) with unit columns, their condition number, and who is lost.
+    """Return the inverse of X (k, k) with unit columns, its condition number, parameters lost.
 
     Columns that are zero, and directions below the rank tolerance, are left out of the inverse.
     """
@@ -139,7 +139,7 @@ def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[
 
 
 def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
-    """Say of every parameter in a null direction with which others it cannot be told apart."""
+    """State, for every parameter in a null direction, the parameters that it is confounded with."""
     lost = {}
     for direction in null:
         members = [
@@ -152,7 +152,7 @@ def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
 
 
 def scores(beta: Array, triangles: Array) -> Array:
-    """Return X'(y - X beta) (c, k) of clusters from their triangles (c, k+1, k+1) alone."""
+    """Return X'(y - X beta) (c, k) of clusters from their triangles (c, k+1, k+1)."""
     k = len(beta)
     X, y = triangles[:, :, :k], triangles[:, :, k]
     return np.asarray(np.einsum("cmk,cm->ck", X, y - X @ beta))
@@ -203,5 +203,5 @@ def satterthwaite(variance: Array, squares: Array) -> Array:
 
 
 def half_width(std: Array, dof: Array) -> Array:
-    """Return the half width of 95 % intervals, Student's t with `dof` (arrays alike)."""
+    """Return the half width of 95 % intervals by Student's t; `std` and `dof` of equal shape."""
     return np.asarray(stdtrit(np.maximum(dof, 1.0), 0.975) * std)

@@ -1,7 +1,7 @@
-"""Numbers and names for people: significant digits that fit the interval, display units, meanings.
+"""Numbers and names as text: significant digits that fit the interval, display units, meanings.
 
-A value is written to the decimal that its 95 % interval allows, never to fewer than three
-significant digits; what does not exist is a dash, what is unbounded is infinity.
+A value is written to the decimal that its 95 % interval allows, with at least three significant
+digits; a missing value is a dash, an unbounded one the sign of infinity.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def fit(value: float | None) -> str:
 
 
 def decimals(value: float, half_width: float) -> int:
-    """Return the decimals that a value with this half interval deserves (3 to 6 digits in all)."""
+    """Return the number of decimals for a value with this half interval (3 to 6 digits in all)."""
     if value == 0 or not math.isfinite(value):
         return 2
     leading = math.floor(math.log10(abs(value)))
@@ -86,19 +86,19 @@ def decimals(value: float, half_width: float) -> int:
 
 
 def fixed(value: float | None, places: int, scale: float = 1.0) -> str:
-    """Write scale * value with so many decimals; dash and infinity as `significant`."""
+    """Write scale * value with `places` decimals; dash and infinity as in `significant`."""
     if value is None or not math.isfinite(value):
         return significant(value)
     return _tidy(f"{scale * value:.{places}f}")
 
 
 def constant(value: float) -> str:
-    """Write a constant as it was given, without trailing zeros."""
+    """Write a constant without trailing zeros."""
     return f"{value:.6g}".replace("-", MINUS)
 
 
 def half_width(half: float, places: int) -> str:
-    """Write half an interval to the value's decimals, in powers of ten where those show nothing."""
+    """Write half an interval to the value's decimals, in powers of ten if those show only zeros."""
     if not math.isfinite(half) or round(half, places) == 0:
         return significant(half, 1)
     return fixed(half, places)
@@ -110,7 +110,7 @@ def count(number: int, noun: str, plural: str = "") -> str:
 
 
 def folder_name(source: str) -> str:
-    """Return the last part of a path of either kind: a report shows no directories."""
+    """Return the last part of a path of either kind, so that a report shows no directories."""
     name = PurePosixPath(source.replace("\\", "/")).name
     return name or source
 
@@ -121,7 +121,7 @@ _SPOOL = {"p": "spool +", "m": f"spool {MINUS}"}
 
 
 def meaning(name: str, joints: int) -> str:
-    """Say in a few words what a parameter is; '' for one that is not of the baseline."""
+    """Return a parameter's meaning in a few words; '' for one that is not of the baseline."""
     if name == "b":
         return "bulk modulus of the oil, all joints"
     if gain := _GAIN.match(name):
@@ -134,7 +134,7 @@ def meaning(name: str, joints: int) -> str:
     texts = {
         "M": f"inertia about joint {i}",
         "R": f"inertia of link {i}" if i == j else f"inertia coupling, links {i} and {j}",
-        "W": f"gravity, link {i} and what it carries",
+        "W": f"gravity, link {i} and the links beyond",
         "Fv": f"viscous friction, joint {i}",
     }
     return texts[kind]

@@ -41,7 +41,7 @@ def render(
     more = {
         "stopped": stopped,
         "count": fm.count(len(rounds), "round"),
-        "worth": worth(rounds),
+        "worth": separations(rounds),
         "rounds": [
             _round(r, train[k] if k < len(train) else None, r is last) for k, r in enumerate(rounds)
         ],
@@ -66,7 +66,7 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
         "runs": " and ".join(r.runs),
         "sentence": result.sentence,
         "excitation": None if run is None or r.experiment is None else excited(run, r.number),
-        # The last one stands below, with everything else about it.
+        # The last round has its own section below.
         "overview": None if last else trace_plots.over_noise(result, f"overnoise{r.number}"),
         "next": None if following is None else following["text"],
     }  # fmt: skip
@@ -83,7 +83,7 @@ def _names(effects: Any) -> str:
     )
 
 
-def worth(rounds: Sequence[Round]) -> Markup | None:
+def separations(rounds: Sequence[Round]) -> Markup | None:
     """Draw predicted and achieved separation of each experiment, and the error after each round."""
     if len(rounds) < 2:
         return None
@@ -96,7 +96,7 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
             if r.achieved is not None:
                 axes.bar(r.number + 0.18, r.achieved, 0.32, color=BLUE)
         axes.axhline(1.0, color=INK, lw=0.8, ls="--")
-        axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])  # room for the words
+        axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])  # room for the labels
         axes.set_xticks([r.number for r in rounds[1:]])
         axes.set_xlim(1.4, len(rounds) + 0.6)
         axes.set_xlabel("round")

@@ -1,4 +1,4 @@
-"""The page of a night: items, trips, identified parameters and their drift.
+"""The report of a queue's run: items, trips, identified parameters and their drift.
 
 Every number comes from the arguments; the page refers to nothing outside itself.
 """
@@ -37,9 +37,9 @@ class NightEstimate:
 
 @dataclass(frozen=True)
 class NightItem:
-    """One item as the page shows it; times are aware, None where it did not come to that.
+    """One item as the page shows it; times are aware, None where an item did not reach that point.
 
-    Counts are -1 where nothing is known; `unidentified` says why nothing was identified.
+    Counts are -1 where unknown; `unidentified` states why nothing was identified.
     """
 
     number: int
@@ -60,7 +60,7 @@ class NightItem:
 
 @dataclass(frozen=True)
 class Night:
-    """A whole night: items in the order they started, what the queue noted, and where it is."""
+    """A whole run of a queue: items in the order they started, the queue's notes, its place."""
 
     queue: str
     host: str
@@ -119,7 +119,7 @@ def _lead(night: Night, counts: Mapping[str, int]) -> str:
     others = [f"{number} {state}" for state, number in counts.items() if state != "done"]
     text = f"{first}; {', '.join(others)}." if others else f"{first}."
     if trips:
-        text += " The bench stays tripped until a person has looked at it and cleared it."
+        text += " The bench stays tripped until a person has examined it and cleared the trip."
     return text + (f" The queue is {night.paused}." if night.paused else "")
 
 
@@ -189,7 +189,7 @@ def _timeline(items: Sequence[NightItem]) -> Markup | None:
 
 
 def _identified(items: Sequence[NightItem]) -> dict[str, list[NightItem]]:
-    """Group what has parameters by rig, in the order of time."""
+    """Group items with parameters by rig, in the order of time."""
     by_rig: dict[str, list[NightItem]] = {}
     for item in items:
         if item.parameters and item.ended is not None:
@@ -210,7 +210,7 @@ def _drift(rig: str, items: Sequence[NightItem]) -> dict[str, Any]:
 
 
 def change(values: Sequence[NightEstimate]) -> tuple[float, float]:
-    """Return the last minus the first estimate, and over the two errors together (0: unknown).
+    """Return the last minus the first estimate, and that over the two errors together (0: unknown).
 
     The errors of two runs are independent: their squares add.
     """

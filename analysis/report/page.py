@@ -1,4 +1,4 @@
-"""HTML pages: a template filled in, and a file written whole or not at all."""
+"""HTML pages: a template filled in, and a file written atomically."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rig.runs.files import write_text
 
 
 def page(template: str, context: Mapping[str, Any]) -> str:
-    """Return a template filled in, with the pages' style."""
+    """Return a template filled in, with the common style."""
     environment = Environment(
         loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
@@ -25,7 +25,7 @@ def page(template: str, context: Mapping[str, Any]) -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a page whole or not at all; raises InputError where it cannot be written."""
+    """Write a page atomically; raises InputError where it cannot be written."""
     try:
         write_text(path, text)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The numbers the paper prints, as data in SI, to stand beside one's own.
+"""The numbers that the paper prints, as data in SI, for comparison.
 
 Source: Sakai and Maeshima, "A new method for parameter identification for N-DOF hydraulic robots",
 Table III (identified results) and Table IV (FIT ratio). Units follow docs/method.md: the
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-RIG: Final = "shinshu-2dof"  # the only rig these numbers belong to
+RIG: Final = "shinshu-2dof"  # the only rig that these numbers belong to
 REPEATS: Final = 10
 
 

@@ -60,9 +60,9 @@ class Residual:
 def coefficients(
     identification: Identification, per_record: Sequence[RecordRows]
 ) -> dict[str, Array]:
-    """Return the rows' coefficients (k,) per family, parameters not identified filled.
+    """Return the rows' coefficients (k,) per family, with values for unidentified parameters.
 
-    Where a combination only is determined, the shortest coefficients that fit the rows are taken:
+    Where only a combination is determined, the shortest coefficients that fit the rows are used:
     the residual does not depend on the choice.
     """
     out = {}
@@ -172,13 +172,13 @@ def per_repeat(
     by_equation: dict[str, list[float]] = {}
     for members in whole:
         for family, solution in identification.solutions.items():
-            alone = _solve_once(members, family, solution.names)
+            alone = _solve_repeat(members, family, solution.names)
             for name, value in inverted(model.rig, model.terms, alone).items():
                 by_equation.setdefault(name, []).append(value)
     return {name: _scatter(np.array(values)) for name, values in by_equation.items()}
 
 
-def _solve_once(
+def _solve_repeat(
     members: Sequence[RecordRows], family: str, names: Sequence[str]
 ) -> Mapping[str, float]:
     clusters = []

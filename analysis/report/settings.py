@@ -1,4 +1,4 @@
-"""What the pages of results show and how much of it: unit, meaning, origin."""
+"""Amounts and lengths of data that the reports show: unit, meaning, origin."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Final
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """Lengths of what is drawn, numbers of points and figures, digits.
+    """Lengths of plotted data, numbers of points and figures, digits.
 
-    What places things on a page (inches, colours) stands with what draws it.
+    Layout (inches, colours) is in the modules that draw.
     """
 
     # -- stretches of time that a figure shows ---------------------------------------------------
@@ -27,18 +27,19 @@ class ReportSettings:
     fewest_lines: int = 10  # multiples of the period drawn: a sine's harmonics too
 
     # -- how much a figure holds -----------------------------------------------------------------
-    most_figures: int = 18  # of one kind; the tables hold the rest
+    most_figures: int = 18  # of one kind; the tables hold all
     line_points: int = 700  # of a line in a card: more than its pixels
     free_run_points: int = 500  # of a free run's line
     scatter_points: int = 1500  # dots of a scatter
     scatter_means: int = 24  # means over bins, drawn on a scatter
     reach_grid: int = 9  # positions of each joint in the tip's reach
     reach_poses: int = 5000  # of all joints together, at most
-    # The axis of intervals ends at so many upper quartiles: one wide interval hides no other.
+    # The axis of intervals ends at so many upper quartiles: one wide interval does not hide the
+    # others.
     interval_span: float = 12.0
 
     # -- numbers ---------------------------------------------------------------------------------
-    most_digits: int = 6  # no measurement here is worth more
+    most_digits: int = 6  # no measurement here is more precise
 
 
 REPORT: Final = ReportSettings()

@@ -1,4 +1,4 @@
-"""The trace's report: one HTML page whose pictures alone make the point."""
+"""The trace's report: one HTML page with figures, effects and errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None 
 def body(
     holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
 ) -> dict[str, Any]:
-    """Return what the pages of a trace show, for `analysis.report.page.page`."""
+    """Return the template's context for a trace, for `analysis.report.page.page`."""
     rig = result.model_before.rig
     return {
         "title": TITLES[result.verdict],
@@ -89,7 +89,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
     out: list[dict[str, Any]] = []
 
     def add(effect: Effect | None, variable: str, equation: str, heading: str, key: str) -> None:
-        timed = equation not in [picture["equation"] for picture in out]  # once is enough
+        timed = equation not in [picture["equation"] for picture in out]  # each figure once
         drawn = _pair(rig, lines[equation], result, effect, variable, equation, key, timed)
         out.append({"heading": heading, "equation": equation, **drawn})
 
@@ -103,7 +103,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         equation = trace_plots.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {place_in_words(effect.where)}"
         add(effect, effect.variable, equation, heading, f"e{k}")
-    # A frequency is seen in time and in the lines, not against anything; noise moves with nothing.
+    # A frequency is visible over time and in the lines only; noise depends on no variable.
     drawn = [
         d for d in result.depends_on
         if d.variable != FREQUENCY
@@ -138,7 +138,7 @@ def _pair(
 
 
 def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
-    """Return the lines of the loudest residuals: picture and words."""
+    """Return the lines of the largest residuals: figures and captions."""
     changed = result.model_after is not result.model_before
     return [
         {

@@ -1,4 +1,4 @@
-"""Records to signals: aligned, filtered, differentiated, with the linkage's geometry beside them.
+"""Records to signals: aligned, filtered, differentiated, with the linkage's geometry.
 
 Glossary: n samples, N joints. `u` spool [V] (electric: drive), `s` piston [m] (electric: q), `q`
 joint angle [rad], `theta` absolute angle q_1 + ... + q_k, `G` = ds/dq [m], `p_cap p_rod` chamber
@@ -32,11 +32,11 @@ class Signals:
 
     `excited` (N,) marks the joints whose rows may be used; `valid` (n, N) is false where a sensor
     of the joint was clipped within the filter's reach or the filter runs over the record's edge.
-    `lost` (n, N) is true where a sample of the joint that never arrived is within that reach: what
-    stands there was made up by a straight line, and no row may see it. `moving` (N,) marks the
-    joints whose motion is the measured one; the others stand still. `weight` (n, N), where given,
-    is what each joint's torque balance counts at a sample (see `without_rests`). `loaded` says
-    whether the last link carries a load that it has not in other records; None: not known.
+    `lost` (n, N) is true where a sample within that reach never arrived: it was interpolated, and
+    no row may use it. `moving` (N,) marks the joints whose motion is the measured one; the others
+    stand still. `weight` (n, N), if given, weights each joint's torque balance (see
+    `without_rests`). `loaded` states whether the last link carries a load that it does not carry
+    in other records; None: not known.
     """
 
     rate: float
@@ -72,13 +72,13 @@ class Signals:
 
 
 def without_rests(signals: Signals, joints: Sequence[int]) -> Signals:
-    """Return signals by which the balances of some joints do not count samples at which they rest.
+    """Return signals that weight the torque balances of `joints` by 0 while they are at rest.
 
-    At rest dry friction is whatever holds the joint, anything up to its breakaway: no law of the
-    speed can be compared with it. A balance that holds at every sample holds under any weight, so
-    that both of its sides are weighted before they are filtered: by 0 at rest, by 1 from the
-    record's rms speed on, smoothly between. A steeper weight would carry noise of the acceleration
-    from high frequencies into the filter's band.
+    At rest, dry friction balances whatever holds the joint, up to its breakaway value, so that no
+    law of the speed applies. A balance that holds at every sample also holds when weighted, so both
+    of its sides are weighted before filtering: by 0 at rest, by 1 from the record's rms speed on,
+    smoothly between. A steeper weight would shift high-frequency noise of the acceleration into the
+    filter's band.
     """
     weight = np.ones_like(signals.sd)
     for i in joints:
@@ -103,7 +103,7 @@ def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
 
 
 def _shifts(rig: Rig, rate: float) -> dict[str, float]:
-    """Return how many samples later each channel shows the instant of the tick."""
+    """Return by how many samples each channel lags the instant of the tick."""
     return {
         name: (rig.sensors.of(ch.kind_of(name)[0]).delay - k * rig.sensors.skew) * rate
         for k, name in enumerate(rig.channels)
@@ -111,7 +111,7 @@ def _shifts(rig: Rig, rate: float) -> dict[str, float]:
 
 
 def align_reach(rig: Rig, rate: float) -> int:
-    """Return how many samples either side an aligned sample depends on."""
+    """Return how many samples on either side an aligned sample depends on."""
     shifts = [abs(shift) for shift in _shifts(rig, rate).values()]
     return SIGNALS.align_half_width + int(np.floor(max(shifts, default=0.0) + 0.5))
 
@@ -188,10 +188,10 @@ def condition(
 
 
 def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:
-    """Return the signals of `rig` as a rig with other linkages and cylinders has them.
+    """Return the signals of `rig` for another rig's linkages and cylinders.
 
-    Pistons and pressures are measured and stay; q, its rates, G and the volumes are anew, with
-    s'' = G q'' + (dG/dq) q'^2 of the linkages that the signals were made with.
+    Piston positions and pressures are measured and unchanged; q, its rates, G and the volumes are
+    recomputed, with s'' = G q'' + (dG/dq) q'^2 of the linkages that the signals were made with.
     """
     s = signals.s
     slope = np.column_stack([j.geometry(s[:, i])[2] for i, j in enumerate(rig.joints)])
@@ -206,7 +206,7 @@ def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:
 
 
 def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
-    """Return, per channel that touches an end of its sensor's range, where it does (n,)."""
+    """Return, for each channel that reaches an end of its sensor's range, where it does (n,)."""
     clipped = {}
     for name in rig.channels:
         if name in record.channels:

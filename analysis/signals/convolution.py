@@ -21,10 +21,7 @@ BLOCK: Final = 8  # a block is at least so many times as long as the taps
 
 
 def convolved(x: Array, taps: Array) -> Array:
-    """Return the convolution of x (n, ...) with taps (m,), only where all taps lie inside x.
-
-    Shape (n - m + 1, ...).
-    """
+    """Return the convolution of x (n, ...) with taps (m,) inside x, shape (n - m + 1, ...)."""
     m, n = len(taps), len(x)
     size = 1 << (BLOCK * m - 1).bit_length()
     fresh = size - m + 1
@@ -38,7 +35,7 @@ def convolved(x: Array, taps: Array) -> Array:
 
 
 def same_convolved(x: Array, taps: Array) -> Array:
-    """Return the convolution of x (n, ...) with an odd number of taps, shape of x; zeros beside."""
+    """Return the convolution of x (n, ...) with an odd number of taps, zero-padded, shape of x."""
     reach = len(taps) // 2
     wide = np.zeros((len(x) + 2 * reach, *x.shape[1:]))
     wide[reach : reach + len(x)] = x

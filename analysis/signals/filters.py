@@ -46,7 +46,7 @@ class Smoother(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is, with its settings, for tables and reports."""
+        """The filter with its settings, for tables and reports."""
 
     @property
     def reach(self) -> int:
@@ -159,7 +159,7 @@ def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:
 
 
 def channel_filter(rate: float) -> FirSmoother:
-    """Return the default filter of all channels: wide, scaled down for a slow sample rate."""
+    """Return the default filter of all channels, with a band scaled down for low sample rates."""
     scale = min(1.0, 0.3 * rate / (SIGNALS.channel_cutoff + SIGNALS.channel_transition))
     return windowed_sinc(rate, SIGNALS.channel_cutoff * scale, SIGNALS.channel_transition * scale)
 
@@ -171,7 +171,7 @@ def row_filter(rate: float, cutoff: float) -> FirSmoother:
 
 
 def row_step(rate: float, cutoff: float) -> int:
-    """Return the decimation that keeps every frequency the row filter lets through."""
+    """Return the decimation that keeps every frequency in the row filter's pass band."""
     return max(1, int(rate / (2 * 1.6 * min(cutoff, 0.25 * rate))))
 
 
@@ -199,7 +199,7 @@ def _interpolation(shift: float) -> Array:
 
 
 def bridged(x: Array) -> Array:
-    """Return x (n,) with a straight line over every gap of NaN, zeros if nothing is left of it."""
+    """Return x (n,) with every gap of NaN interpolated linearly; zeros if all are NaN."""
     missing = np.isnan(x)
     if not missing.any():
         return x

@@ -54,13 +54,13 @@ def moving_joints(rig: Rig, repeats: Sequence[Record]) -> Mask:
         every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in locked])
         # Repeats that were not synchronised after all would cancel in the mean.
         moving.append(
-            gives(every.mean(axis=0), rate, noise / np.sqrt(len(locked)))
-            or any(gives(signals, rate, noise) for signals in every)
+            accelerates(every.mean(axis=0), rate, noise / np.sqrt(len(locked)))
+            or any(accelerates(signals, rate, noise) for signals in every)
         )
     return np.array(moving)
 
 
-def gives(position: Array, rate: float, noise: float) -> bool:
+def accelerates(position: Array, rate: float, noise: float) -> bool:
     """Return whether a locked position (n,) accelerates visibly above its sensor's noise [m]."""
     band = row_filter(rate, SIGNALS.moving_band)
     if len(position) <= 4 * band.reach:

@@ -1,1 +1,1 @@
-"""The identified model as data and its simulation: free run, twin, validation."""
+"""The identified model as data, and its simulation: free run, twin, validation."""

@@ -1,9 +1,9 @@
-"""Generated right-hand sides, compiled, and kept on disk for the next process.
+"""Generated right-hand sides, compiled and cached on disk for later processes.
 
 A folder per source, named by the hash of the source, of the versions of Python, numba, llvmlite and
-numpy and of the processor. In it stand the source, numba's own files and `checksums.json`, written
-last. A folder counts only if every file has its checksum and the source is the one asked for;
-anything else is deleted and made again. The source that runs is the one in memory in any case.
+numpy and of the processor. It holds the source, numba's own files and `checksums.json`, written
+last. A folder is used only if every file matches its checksum and the source is the requested one;
+otherwise it is deleted and written anew. The source executed is always the one in memory.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LIBRARIES: Final = ("numba", "llvmlite", "numpy")
 
 
 def key_of(source: str) -> str:
-    """Return the hash of a source and of what compiles it."""
+    """Return the hash of a source and of everything that its compiled code depends on."""
     versions = [platform.python_version(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
     machine = [platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
     whole = "\n".join((*versions, *machine, str(config.CACHE_DIR), source))
@@ -43,25 +43,25 @@ def key_of(source: str) -> str:
 
 @functools.lru_cache(maxsize=256)
 def stored(source: str) -> Any | None:
-    """Return the compiled `rates` of a source if the disk has it unharmed, else None."""
+    """Return the compiled `rates` of a source if the disk has it undamaged, else None."""
     folder = cache_folder() / "rates" / key_of(source)
     if not folder.is_dir():
         return None
     if not _unharmed(folder, source):
-        log.warning("%s: compiled code is damaged; it is deleted and made again", folder)
+        log.warning("%s: compiled code is damaged; it is deleted and compiled again", folder)
         shutil.rmtree(folder, ignore_errors=True)
         return None
     try:
         return _run(source, folder / _SOURCE)
-    except Exception as error:  # numba raises what it likes over files that it cannot read
-        log.warning("%s: compiled code cannot be loaded (%s); it is made again", folder, error)
+    except Exception as error:  # numba raises exceptions of any class for files that it cannot read
+        log.warning("%s: compiled code cannot be loaded (%s); it is compiled again", folder, error)
         shutil.rmtree(folder, ignore_errors=True)
         return None
 
 
 @functools.lru_cache(maxsize=256)
 def compiled_now(source: str, subject: str) -> Any:
-    """Compile a source and keep it on disk; says that it does, for `subject`, and how long."""
+    """Compile a source and cache it on disk; logs `subject` and the time it took."""
     log.warning("compiling the equations of %s (once on this computer) ...", subject)
     began = time.perf_counter()
     root = cache_folder() / "rates"
@@ -77,7 +77,7 @@ def compiled_now(source: str, subject: str) -> Any:
         sums = {str(p.relative_to(building)): _checksum(p) for p in _files(building)}
         (building / _CHECKSUMS).write_text(json.dumps(sums), encoding="utf-8")
         if building.parent == root:
-            # Where another process was first, its folder stays and this one goes.
+            # If another process was first, its folder is used and this one deleted.
             building.replace(root / key_of(source))
     except OSError as error:
         log.debug("%s is not kept: %s", building, error)
@@ -88,8 +88,8 @@ def compiled_now(source: str, subject: str) -> Any:
 
 
 def _run(source: str, path: Path) -> Any:
-    """Execute a source as the file at `path`; numba compiles it, or loads it from beside it."""
-    # By its name numba finds the module again whose code it loads.
+    """Execute a source as the file at `path`; numba compiles it, or loads it from that folder."""
+    # numba finds the module of the code that it loads by this name.
     module = ModuleType(f"bramah_rates_{key_of(source)}")
     sys.modules[module.__name__] = module
     exec(compile(source, str(path), "exec"), module.__dict__)

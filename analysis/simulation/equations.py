@@ -1,12 +1,12 @@
-"""The interface between a right-hand side and whoever integrates it: status, layout, C signature.
+"""The interface between a right-hand side and its integrator: status, layout, C signature.
 
     status = rates(t, y, dy, inputs, n, rate, locked, geometry, par, context, work)
 
 with pointers to contiguous data: `y` and `dy` the state [q (N), dq/dt (N), p_cap (N), p_rod (N),
 hidden] and its derivative; `inputs` (n, 3 + 4 N) sampled at `rate`: p_s, temperature, u, q, q', q''
 of locked joints, time since the record began; `locked` (N,) bytes; `geometry` (N, 10), columns
-below; `par` what the terms pack; `context` and `work` what the right-hand side needs besides. M q''
-= torques, and in each chamber (V/b) dp/dt = flow in - A ds/dt (cap), + A ds/dt (rod). A locked
+below; `par` the terms' packed values; `context` and `work` further data of the right-hand side. M
+q'' = torques, and in each chamber (V/b) dp/dt = flow in - A ds/dt (cap), + A ds/dt (rod). A locked
 joint follows its measured motion. An electric joint has its drive's torque, s = q, G = 1, and
 pressures that stay zero.
 """

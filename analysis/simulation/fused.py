@@ -1,10 +1,9 @@
-"""A right-hand side for one set of terms: source made of the terms' kernels, compiled once.
+"""A right-hand side for one set of terms, generated from the terms' kernels and compiled once.
 
-The source holds no loop and no array: every term's kernel is evaluated at its place
-(`analysis.terms.specialise`) and the statements stand one after another, with those of
-`analysis.simulation.interpreted` around them. Operations and their order are the same as there, so
-both give the same numbers to the last bit. What is compiled is kept on disk
-(`analysis.simulation.compiled_sources`).
+The source has no loop and no array: every term's kernel is specialised for its joint
+(`analysis.terms.specialise`), and the statements follow one another between those of
+`analysis.simulation.interpreted`. Operations and their order are the same as there, so both results
+agree to the last bit. Compiled code is cached on disk (`analysis.simulation.compiled_sources`).
 """
 
 from __future__ import annotations
@@ -81,14 +80,14 @@ def _remembered(
     terms: tuple[Term, ...], lengths: tuple[int, ...], hidden: tuple[int, ...],
     electric: tuple[bool, ...],
 ) -> list[GeneratedSource]:  # fmt: skip
-    """Return the list of the sources made of a set of terms, for `source_of` to fill."""
+    """Return the cached list of sources of a set of terms, which `source_of` extends."""
     return []
 
 
 def source_of(
     terms: Sequence[Used], packed: Sequence[Array], hidden: Sequence[int], electric: Sequence[bool]
 ) -> str:
-    """Return the source of the terms' right-hand side (see `_generated`), made once per process."""
+    """Return the source of the terms' right-hand side (see `_generated`), cached per process."""
     known = _remembered(
         tuple(used.term for used in terms), tuple(map(len, packed)), tuple(hidden), tuple(electric)
     )
@@ -103,10 +102,10 @@ def source_of(
 def _generated(
     terms: Sequence[Used], packed: Sequence[Array], hidden: Sequence[int], electric: Sequence[bool]
 ) -> GeneratedSource:
-    """Return the source of the terms' right-hand side, of one joint for each of `electric`.
+    """Return the source of the terms' right-hand side, with one joint for each of `electric`.
 
-    `packed` is what each term packs, `hidden` its number of hidden states. Raises
-    `analysis.terms.specialise.NotSpecialisable` where a kernel is more than can be written out.
+    `packed` are the packed values of each term, `hidden` its number of hidden states. Raises
+    `analysis.terms.specialise.NotSpecialisable` where a kernel cannot be specialised.
     """
     N = len(electric)
     helpers, body = Helpers(), _Lines()
@@ -170,7 +169,7 @@ class _Lines:
 
 
 def _observe(body: _Lines, electric: Sequence[bool], sine_cosine: str) -> None:
-    """Write what all terms see: inputs at t, the joints' geometry, chambers, volumes."""
+    """Write what all terms read: inputs at t, the joints' geometry, chambers, volumes."""
     N = len(electric)
     width = 3 + 4 * N
     body.add(

@@ -75,9 +75,9 @@ def _error(h, y, trial, k, rtol, atol):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _interpolate(t, h, y, trial, k, rate, r, ys, filled):  # type: ignore[no-untyped-def]
-    """Fill the samples that lie in the step just taken; return how many are filled now.
+    """Fill the samples that lie in the step just taken; return how many are filled so far.
 
-    `r` (4, size) is room for the interpolation's coefficients.
+    `r` (4, size) is workspace for the interpolation's coefficients.
     """
     if not (filled < len(ys) and filled / rate <= t + h + 1e-12):
         return filled

@@ -1,8 +1,8 @@
 """The right-hand side of any model, term by term: each term's kernel is called by its address.
 
-Compiled once for every model, so that adding a term compiles that term alone. It serves wherever a
-model is simulated too seldom to be worth a right-hand side of its own (`analysis.simulation.fused`)
-and it is what that one is tested against: both do the same operations in the same order.
+Compiled once for every model, so that adding a term compiles that term alone. It is used for models
+that are simulated too seldom to compile a right-hand side for them (`analysis.simulation.fused`),
+and as the reference in that one's tests: both do the same operations in the same order.
 """
 
 from __future__ import annotations
@@ -113,7 +113,8 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
         half = 0.5 * geometry[i, STROKE]
         x[V_CAP, i] = geometry[i, DEAD_CAP] + (half + x[S, i]) * geometry[i, AREA_CAP]
         x[V_ROD, i] = geometry[i, DEAD_ROD] + (half - x[S, i]) * geometry[i, AREA_ROD]
-        # Half a stroke past its end no cylinder is; the chamber volumes are still positive there.
+        # No real cylinder goes half a stroke past its end; chamber volumes are still positive
+        # there.
         if not (abs(x[S, i]) < 2.0 * half) or x[V_CAP, i] <= 0.0 or x[V_ROD, i] <= 0.0:
             inside = False
     return inside
@@ -239,9 +240,9 @@ def context(
     packed: Sequence[NDArray[np.float64]],
     hidden: Sequence[int],
 ) -> NDArray[np.int64]:
-    """Return what the right-hand side must know of a model's terms.
+    """Return the integers that describe a model's terms to the right-hand side.
 
-    `packed` is what each packs, `hidden` its number of states.
+    `packed` are the packed values of each term, `hidden` its number of states.
     """
     ends, hidden_ends = np.cumsum([0, *map(len, packed)]), np.cumsum([0, *hidden])
     prepares = [int(used.term.prepares) for used in terms]
@@ -251,5 +252,5 @@ def context(
 
 
 def work_size(joints: int) -> int:
-    """Return how many numbers the right-hand side needs to work in."""
+    """Return how many numbers of workspace the right-hand side needs."""
     return 4 + 17 * joints + joints * joints

@@ -47,13 +47,13 @@ class Estimate:
 
     @property
     def identified(self) -> bool:
-        """Whether the records determine it."""
+        """Whether the records determine the parameter."""
         return math.isfinite(self.value)
 
 
 @dataclass(frozen=True)
 class Model:
-    """A rig, the terms that describe it, their parameters and where those came from.
+    """A rig, the terms that describe it, their parameters and their provenance.
 
     `covariance` (k, k) belongs to `parameters` in their order; NaN where unknown.
     """
@@ -83,7 +83,7 @@ def nominal_model(rig: Rig, terms: Sequence[Used]) -> Model:
 
 
 def model_of(rig: Rig, terms: Sequence[Used], values: Mapping[str, float]) -> Model:
-    """Return the model of parameter values alone, without intervals; others are left out."""
+    """Return a model from parameter values without intervals; parameters not given are left out."""
     parameters = {
         c.parameter: Estimate(values[c.parameter], c.unit, math.nan, (math.nan, math.nan))
         for used in terms
@@ -107,12 +107,12 @@ def as_loaded(model: Model, loaded: bool | None) -> Model:
 
 
 def finite(value: float) -> float | None:
-    """Return the number, or None for what JSON cannot hold."""
+    """Return the number, or None if it is not finite (JSON has no such number)."""
     return float(value) if math.isfinite(value) else None
 
 
 def estimate_json(estimate: Estimate) -> dict[str, Any]:
-    """Return one parameter as the contract's JSON, `note` added where there is one."""
+    """Return one parameter as JSON data, with `note` if there is one."""
     out: dict[str, Any] = {
         "value": finite(estimate.value),
         "unit": estimate.unit,
@@ -153,7 +153,7 @@ def save_model(model: Model, path: str | Path) -> None:
 
 
 def load_model(path: str | Path) -> Model:
-    """Read a model file; raises InputError saying what is wrong with it."""
+    """Read a model file; raises InputError naming the fault."""
     path = Path(path)
     try:
         data = json.loads(read_text(path, "a model file", limit=_MOST_BYTES))
@@ -206,7 +206,7 @@ def _from_json(data: Mapping[str, Any]) -> Model:
 
 
 def refuse_other_rig(model: Model, rig: Rig, source: str) -> None:
-    """Raise InputError where records of `rig` do not belong to the model's rig."""
+    """Raise InputError if records of `rig` do not belong to the model's rig."""
     reason = rig_difference(model.rig, rig)
     if reason:
         raise InputError(
@@ -215,7 +215,7 @@ def refuse_other_rig(model: Model, rig: Rig, source: str) -> None:
 
 
 def terms_like(path: Path, rigs: Mapping[str, Rig]) -> tuple[Used, ...]:
-    """Return the terms of a model file; raises InputError where a rig, by source, is another."""
+    """Return the terms of a model file; raises InputError if one of `rigs` (by source) differs."""
     model = load_model(path)
     for source, rig in rigs.items():
         refuse_other_rig(model, rig, source or "the run")
@@ -223,9 +223,9 @@ def terms_like(path: Path, rigs: Mapping[str, Rig]) -> tuple[Used, ...]:
 
 
 def rig_difference(rig: Rig, other: Rig) -> str:
-    """Say what differs between two rigs as far as physics is concerned ('' if nothing).
+    """Return the physical difference between two rigs in words ('' if there is none).
 
-    Tolerances say how well a rig is known, not what it is.
+    Tolerances are ignored: they state how well a rig is known.
     """
     if rig.name != other.name:
         return f"name {rig.name!r} and {other.name!r}"

@@ -1,4 +1,4 @@
-"""Models within the intervals of an identified model, and whether it can serve as the twin.
+"""Models drawn within the intervals of an identified model, and checks of it as the twin.
 
 A draw moves all parameters at once by one equivalent standard error in every principal direction
 of their relative covariance, forwards or backwards by a sign. Over `count` draws the signs of the
@@ -37,7 +37,7 @@ def equivalent_errors(model: Model) -> Array:
 
 
 def model_draws(model: Model, count: int, rng: np.random.Generator) -> list[Model]:
-    """Return `count` (a power of two) models about `model`; none where nothing is uncertain.
+    """Return `count` (a power of two) models around `model`; none if nothing is uncertain.
 
     Correlations are those of the model's covariance; unknown ones count as zero.
     """
@@ -70,7 +70,7 @@ def _moved(model: Model, values: Sequence[float] | Array) -> Model:
 
 
 def unusable(model: Model, rig: Rig) -> str:
-    """Say why a model cannot be the twin of a rig ('' where it can): one clause for a sentence."""
+    """Return why a model cannot be the twin of a rig, as a clause ('' if it can)."""
     difference = rig_difference(model.rig, rig)
     if difference:
         return f"it was identified on another rig: {difference}"
@@ -98,7 +98,7 @@ def unusable(model: Model, rig: Rig) -> str:
 
 
 def _flow_parameters(model: Model) -> list[str]:
-    """Name the baseline's b and flow gains: stroke and speed follow them one to one."""
+    """Name b and the flow gains, to which stroke and speed are proportional."""
     return [
         c.parameter
         for used in model.terms

@@ -8,7 +8,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """Tolerances of the integrator, windows of validation, making of synthetic records.
+    """Tolerances of the integrator, windows of validation, generation of synthetic records.
 
     The smallest step of the integrator is compiled into its loop (`integrator.MIN_STEP`).
     """
@@ -27,7 +27,9 @@ class SimulationSettings:
 
     # -- synthetic records ---------------------------------------------------------------------
     trim_rounds: int = 4  # secant steps that centre an open-loop stroke
-    lead: float = 2.0  # [s] simulated before the record starts, so that the start has faded
+    lead: float = (
+        2.0  # [s] simulated before the record starts, so that the initial transient has decayed
+    )
     end_share: float = 0.99  # of half the stroke: where a joint stands that is locked at its end
     # The integrator joins the spool's samples by straight lines, which takes (pi f / rate)^2 / 3
     # of a line's amplitude: 0.01 % of the gains at 1 kHz. The model runs so many times finer.
@@ -36,8 +38,8 @@ class SimulationSettings:
     # -- the twin ------------------------------------------------------------------------------
     # A rig file's guess of a valve's gain is seldom worse than half of it.
     widest_interval: float = 0.5  # half width of b and flow gains, relative, that a twin may have
-    # Models within the intervals, a power of two. What eight add to a range differs by less than
-    # half from what thirty-two add (seed bench identified from four repeats: within 40 %).
+    # Models within the intervals, a power of two. Eight widen a range by an amount that differs by
+    # less than half from that of thirty-two (seed bench identified from four repeats: within 40 %).
     twin_draws: int = 8
     twin_seed: int = 0  # of their signs
 

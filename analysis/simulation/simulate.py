@@ -1,4 +1,4 @@
-"""Run the identified model: driven by a spool, locked joints held, failures said aloud."""
+"""Simulate the identified model: driven by a spool, locked joints held, failures reported."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class DrivingInput:
-    """What drives a simulation: samples (n,) or (n, N) at `rate`.
+    """Inputs of a simulation: samples (n,) or (n, N) at `rate`.
 
     `q qd qdd` are used for the joints that `locked` (N,) marks.
     """
@@ -57,7 +57,7 @@ class DrivingInput:
 
     @functools.cached_property
     def inputs(self) -> Array:
-        """Everything as the right-hand side reads it: (n, 3 + 4 N)."""
+        """Return all inputs in the right-hand side's layout, (n, 3 + 4 N)."""
         time = np.arange(len(self.u)) / self.rate
         parts = (self.p_s, self.temperature, self.u, self.q, self.qd, self.qdd, time)
         return np.ascontiguousarray(np.column_stack(parts))
@@ -67,8 +67,8 @@ class DrivingInput:
 class State:
     """State at one instant: q [rad], qd [rad/s], p_cap, p_rod [Pa], each (N,).
 
-    `hidden` (h,) are the terms' own states in the model's order (see `hidden_paths`); none of them
-    given means all at zero, as after a long rest.
+    `hidden` (h,) are the terms' hidden states in the model's order (see `hidden_paths`); if empty,
+    all are zero, as after a long rest.
     """
 
     q: Array
@@ -80,11 +80,11 @@ class State:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulated stretch: arrays (n, N), held at their last value after a failure.
+    """A simulated record: arrays (n, N), held at their last value after a failure.
 
-    `failure` says why and when the state ceased to exist ('' if it did not); `filled` samples are
-    real; `outside` counts samples with a chamber pressure outside [0, p_s], where the model's
-    orifices have no real root and the signed root was taken.
+    `failure` states why and when the simulation failed ('' if it did not); `filled` samples are
+    valid; `outside` counts samples with a chamber pressure outside [0, p_s], where the model's
+    orifices have no real root and the signed root was used.
     """
 
     rate: float
@@ -123,9 +123,10 @@ def drive_of(signals: Signals) -> DrivingInput:
 
 @dataclass(frozen=True)
 class Compiled:
-    """A model in the integrator's arrays: its right-hand side `rates` and what that is handed.
+    """A model in the integrator's arrays: its right-hand side `rates` and the arguments of that.
 
-    `hidden` states follow the 4 N of the joints; `fused` says whether `rates` is the set's own.
+    `hidden` states follow the 4 N of the joints; `fused` states whether `rates` was generated for
+    this set of terms.
     """
 
     rates: Any
@@ -142,22 +143,22 @@ class Compiled:
         return int(self.rates.address)
 
     def work(self) -> Array:
-        """Return room for one thread to evaluate the right-hand side in."""
+        """Return workspace for one thread to evaluate the right-hand side in."""
         return np.zeros(interpreted.work_size(len(self.geometry)))
 
 
 class Effort(enum.Enum):
-    """How much a model is to be simulated, which decides whether compiling it is worth while."""
+    """How often a model will be simulated, which decides whether it is compiled."""
 
     ONCE = "a few records"
     FIT = "hundreds of records"
 
 
 def compiled(model: Model, effort: Effort = Effort.ONCE) -> Compiled:
-    """Lay a model out for the integrator; raises InputError where a parameter is not identified.
+    """Return a model in the integrator's layout; raises InputError for unidentified parameters.
 
-    The set's own right-hand side is taken where the disk has it, and made for every rig's own terms
-    and for a fit; otherwise terms are called one by one. Both give the same numbers.
+    The generated right-hand side is used if it is on disk; it is generated for every rig's own
+    terms and for a fit. Otherwise terms are called one by one. The results are equal.
     """
     missing = [name for name, p in model.parameters.items() if not p.identified]
     if missing:
@@ -190,7 +191,7 @@ def _fused(
     try:
         source = fused.source_of(model.terms, packed, hidden, electric)
     except NotSpecialisable as reason:
-        log.info("the equations stay term by term: %s", reason)
+        log.info("the equations are evaluated term by term: %s", reason)
         return None
     compiled_source = compiled_sources.stored(source)
     own = {u.term.name for u in model.terms} <= {t.name for t in baseline_of(model.rig)}
@@ -231,10 +232,10 @@ def simulate(
     first: int = 0,
     samples: int | None = None,
 ) -> Simulation:
-    """Simulate `samples` samples of the drive from sample `first` on, beginning in `start`.
+    """Simulate `samples` samples of the drive from sample `first` on, starting from `start`.
 
-    Pass the result of `compiled` instead of a model to simulate many stretches. A state that
-    ceases to exist ends the run and is reported in `failure`, with the last state held.
+    Pass the result of `compiled` instead of a model for repeated simulations. A failure ends the
+    simulation and is reported in `failure`, with the last state held.
     """
     ready = compiled(model) if isinstance(model, Model) else model
     total = len(drive.u)
@@ -327,8 +328,8 @@ def state_at(signals: Signals, sample: int) -> State:
     )
 
 
-def put_right(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
-    """Return signals free of what terms say of sensors; other terms prepare in simulation."""
+def sensor_corrected(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
+    """Return signals corrected for the terms' sensor effects; other terms prepare in simulation."""
     for used in terms:
         if not used.term.prepares:
             signals = used.term.prepare(rig, signals, used.shape)
@@ -336,10 +337,10 @@ def put_right(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
 
 
 def hidden_paths(model: Model, signals: Signals) -> Array:
-    """Return the terms' own states (n, h) along measured signals, in the model's order.
+    """Return the terms' hidden states (n, h) along measured signals, in the model's order.
 
-    Every term sees the signals as those before it prepared them, as in simulation. `signals` are
-    free of what sensors distort.
+    Every term sees the signals as prepared by those before it, as in simulation. `signals` must be
+    corrected for sensor effects.
     """
     values, out = model.values, [np.zeros((len(signals.t), 0))]
     last = max((k for k, u in enumerate(model.terms) if u.term.hidden(model.rig)), default=-1)

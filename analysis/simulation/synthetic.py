@@ -1,7 +1,7 @@
-"""Records of the model itself with known truth and stated sensor noise, for studies of method.
+"""Simulated records of the model with known parameters and stated sensor noise, for studies.
 
-They serve to compare estimators and filters and to time the pipeline. They cannot show that the
-model is right: that is the simulated bench's part, whose physics is written separately.
+They compare estimators and filters and time the pipeline. They cannot test the model itself: the
+simulated bench does, with separately written physics.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def synthetic_run(
 def _centred(
     model: Model, spool: Array, locked: dict[int, float]
 ) -> tuple[DrivingInput, Simulation]:
-    """Simulate with the bias that keeps the moving joint's stroke level."""
+    """Simulate with the spool bias that keeps the moving joint's mean position constant."""
     rig = model.rig
     N, n, rate = len(rig.joints), len(spool), SIMULATION.oversampling * rig.sample_rate
     place = np.array(

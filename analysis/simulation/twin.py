@@ -1,4 +1,4 @@
-"""The twin: what the rig would do with given commands, before anything moves.
+"""The twin: a simulation of the rig under planned commands, before it moves.
 
 Its parameters are the rig's nominal values, or those of an identified model with its effects.
 """
@@ -47,7 +47,7 @@ def _held_response(frequency: float, damping: float, rate: float) -> Array:
 
 @njit(cache=True)
 def _followed(step, held):  # type: ignore[no-untyped-def]
-    """Return u (n,) at the samples of a held input (n,), from rest."""
+    """Return u (n,) at the samples of a held input (n,), starting from rest."""
     out = np.zeros_like(held)
     u, rate = 0.0, 0.0
     for k in range(1, len(held)):
@@ -61,7 +61,7 @@ def _followed(step, held):  # type: ignore[no-untyped-def]
 
 
 def holding_state(rig: Rig, model: Model, piston: Array) -> State:
-    """Return the state at rest at piston positions (N,): gravity held, chambers around p_s/2."""
+    """Return the state at rest at piston positions (N,): gravity held, pressures around p_s/2."""
     N = len(rig.joints)
     q = np.array([float(j.linkage.angle(p)) for j, p in zip(rig.joints, piston, strict=True)])
     theta, values = np.cumsum(q), model.values
@@ -90,9 +90,9 @@ def simulate_commands(
 
     `start` (N,) are the pistons' first positions [m], `locked` maps a 0-based joint to the piston
     position [m] that holds it. Returns `piston speed cap_pressure rod_pressure spool`, each (n, N)
-    in SI, and `valid` (n,), 0 from where the state ceased to exist and 1 before (the last state is
-    then held, which lies outside every limit). Raises InputError for a rig without nominal values
-    or arrays that do not fit it.
+    in SI, and `valid` (n,), 1 until the simulation failed and 0 afterwards (the last state is then
+    held, which lies outside every limit). Raises InputError for a rig without nominal values or
+    arrays that do not fit it.
     """
     N = len(rig.joints)
     commands = np.asarray(commands, dtype=np.float64)

@@ -1,8 +1,8 @@
-"""Validation: the model driven by the measured spool (electric: drive) against what was measured.
+"""Validation: the model driven by the measured spool (electric: drive), compared with the record.
 
 FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (Sakai and Maeshima, Table IV), from a free
 run of the whole record; windowed RMSE restarts the model from the data every 0.25 s, which shows
-the model's rates without the drift that a free run collects.
+the model's rates without the accumulated drift of a free run.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from analysis.simulation.simulate import (
     compiled,
     drive_of,
     hidden_paths,
-    put_right,
+    sensor_corrected,
     simulate,
     state_at,
 )
@@ -98,8 +98,8 @@ def validate_record(
     model = as_loaded(model, record.loaded)
     smoother = default_filtering(record).channels
     here = arrived(rig, record)
-    signals = put_right(rig, model.terms, condition(rig, record, smoother, moving))
-    # A sensor that the model says is wrong is put right before anything is compared with it.
+    signals = sensor_corrected(rig, model.terms, condition(rig, record, smoother, moving))
+    # Sensors are corrected by the model's sensor effects before anything is compared.
     channels = aligned_channels(rig, record)
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
     measured = _compared(rig, channels, signals)
@@ -174,8 +174,8 @@ def first_state(
 ) -> State:
     """Return the state at the first sample, from a cubic fitted to the first 40 ms of data.
 
-    `channels` defaults to the record's, aligned. The filter has no samples before the first; a
-    short one-sided fit is the better edge. The velocity is the fit's first derivative.
+    `channels` defaults to the record's, aligned. A zero-phase filter would need samples before the
+    first. The velocity is the cubic's derivative.
     """
     count = min(
         record.samples,
@@ -200,7 +200,7 @@ def first_state(
 
 
 def to_json(results: Sequence[RecordValidation]) -> dict[str, Any]:
-    """Return the validation as the contract's JSON; `failure` and `outside` added per record."""
+    """Return the validation as JSON data; `failure` and `outside` added per record."""
     return {
         "records": [
             {

@@ -1,4 +1,4 @@
-"""Terms by name: every module of this package that names classes in `TERMS` is found by itself."""
+"""Terms by name, discovered in every module of this package that lists classes in `TERMS`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rig.model.rig import ElectricRig, Rig
 
 PACKAGES: Final = ("analysis.terms", "analysis.effects")
 ELECTRIC: Final = ("inertia", "viscous_friction")
-INCLINED: Final = "inclined_gravity"  # gravity with the base's angle as one more unknown
+INCLINED: Final = "inclined_gravity"  # gravity with the base's angle as a further unknown
 BASELINE: Final = ("inertia", "viscous_friction", "gravity", "compressibility", "orifice")
 
 
@@ -32,7 +32,7 @@ def known() -> dict[str, type[Term]]:
 
 
 def make(name: str, where: str = "bench") -> Term:
-    """Return the term `name` at `where`; raises InputError for one that this version lacks."""
+    """Return the term `name` at `where`; raises InputError for an unknown one."""
     try:
         return known()[name](where)
     except KeyError:
@@ -54,7 +54,7 @@ def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
     """Return the baseline with effects added: `name` (at every joint) or `name@joint 1`.
 
     Raises InputError for an unknown name or place. With `base_inclination` the angle is found by
-    least squares: `inclined_gravity` takes gravity's place.
+    least squares: `inclined_gravity` replaces gravity.
     """
     terms = list(baseline_of(rig))
     for effect in effects:

@@ -1,8 +1,8 @@
-"""What a term is: columns of the regression and, in simulation, a part of the right-hand side.
+"""A term: columns of the regression and, in simulation, a part of the right-hand side.
 
-A model is a list of terms (DESIGN, "Identification is an algebra of rows"). Adding an effect is one
-file in this package (or one later listed in `analysis.terms.PACKAGES`) that holds a frozen
-dataclass derived from `Term` and names it in `TERMS`; nothing else changes.
+A model is a list of terms. Adding an effect is one file in this package (or one later listed in
+`analysis.terms.PACKAGES`) that holds a frozen dataclass derived from `Term` and names it in
+`TERMS`; nothing else changes.
 
 Sign convention of every row: sum of columns times coefficients = right-hand side, with
 right-hand sides G F (torque_i), + A_cap ds/dt (flow_cap_i), - A_rod ds/dt (flow_rod_i).
@@ -20,12 +20,12 @@ Simulation. Each term has a kernel, a plain function of fixed signature that num
            into the chamber [m^3/s], COMP_CAP, COMP_ROD compressibility V/b [m^3/Pa]
     M      (N, N) inertia in joint coordinates [kg m^2]
 
-A kernel is used in two ways that give the same numbers. A model that is simulated seldom calls each
-kernel by its address (`analysis.simulation.interpreted`). For one that is simulated often, source
-is generated from the kernels' source and compiled once (`analysis.simulation.fused`); for that, a
+A kernel is used in two ways with equal results. A model that is simulated seldom calls each kernel
+by its address (`analysis.simulation.interpreted`). For one that is simulated often, source is
+generated from the kernels' source and compiled once (`analysis.simulation.fused`); for that, a
 kernel keeps to loops over joints, `if`, assignments, functions of `math` and `numpy`, and functions
 marked `njit`. An index comes from a loop or is `int(par[k])`, where `par[k]` is a joint (0-based)
-and no parameter. What goes beyond this works term by term.
+and no parameter. Other kernels work term by term only.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ FAMILIES: Final = {"mechanical": ("torque",), "fluid": ("flow_cap", "flow_rod")}
 
 
 class Kernel:
-    """A term's kernel, compiled (or read from numba's cache) when its address is first asked."""
+    """A term's kernel, compiled (or read from numba's cache) when its address is first needed."""
 
     def __init__(self, function: Callable[..., None]) -> None:
         self.function = function
@@ -82,10 +82,10 @@ def kernel(function: Callable[..., None]) -> Kernel:
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A linear unknown of one family's rows and the parameter that it stands for.
+    """A linear unknown of one family's rows and the parameter that it represents.
 
     `family` is `mechanical` (torque rows) or `fluid` (chamber-flow rows). With `reciprocal` the
-    rows' coefficient is 1/parameter (1/b in the rows, b for people).
+    rows' coefficient is 1/parameter (1/b in the rows, b in results).
     """
 
     parameter: str
@@ -110,7 +110,7 @@ class ParameterReduction:
 
 @dataclass(frozen=True)
 class Term:
-    """One effect at one place; a subclass sets `name` and overrides what it needs.
+    """One effect at one place; a subclass sets `name` and overrides methods as needed.
 
     `where` is `bench`, `joint I` or `joint I cap|rod`.
     """
@@ -135,7 +135,7 @@ class Term:
         return self.coefficients(rig)
 
     def reduction(self, rig: Rig) -> ParameterReduction | None:
-        """Return how fewer parameters make the linear unknowns, where they do."""
+        """Return how the linear unknowns depend on fewer parameters, None if they do not."""
         return None
 
     @property
@@ -151,7 +151,7 @@ class Term:
         return ()
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Return the signals as all terms shall see them (default: unchanged)."""
+        """Return the signals as all terms should see them (default: unchanged)."""
         return signals
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -175,7 +175,7 @@ class Term:
     ) -> Array:
         """Return the hidden states (n, hidden(rig)) along measured signals, in the kernel's units.
 
-        They begin simulations in the midst of a motion.
+        They are the initial states of simulations that start during a motion.
         """
         return np.zeros((len(signals.t), self.hidden(rig)))
 
@@ -212,6 +212,6 @@ class Used:
 
 
 def inverted(rig: Rig, terms: Sequence[Used], values: Mapping[str, float]) -> dict[str, float]:
-    """Turn parameters into the rows' coefficients, or those into parameters: b and 1/b."""
+    """Convert parameters into the rows' coefficients, or those into parameters (b and 1/b)."""
     reciprocal = {c.parameter for u in terms for c in u.term.coefficients(rig) if c.reciprocal}
     return {name: 1.0 / v if name in reciprocal and v else v for name, v in values.items()}

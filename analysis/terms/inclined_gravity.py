@@ -34,8 +34,8 @@ class InclinedGravity(Term):
     """V = - sum_k W_k g cos(theta_k + alpha), in place of `gravity`.
 
     Link k pulls W_k g sin(theta_k + alpha) = g [W_k cos(alpha) sin(theta_k) + W_k sin(alpha)
-    cos(theta_k)]: linear in 2 N unknowns that share alpha. `reduction` gives the N + 1 parameters
-    (docs/n-joints.md; the common parameter of Sakai and Maeshima's last claim).
+    cos(theta_k)]: linear in 2 N unknowns that share alpha. `reduction` maps them to the N + 1
+    parameters (docs/n-joints.md; the common parameter of Sakai and Maeshima's last claim).
     """
 
     name: ClassVar[str] = "inclined_gravity"

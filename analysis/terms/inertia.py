@@ -53,7 +53,7 @@ class Inertia(Term):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the torque columns of every inertia parameter."""
         N = signals.joints
-        # Sums over joints run by hand: along an axis of two or three, numpy's take longer.
+        # Sums over joints as a loop: along an axis of two or three, numpy's sums take longer.
         rate, acceleration = _running(signals.qd.T), _running(signals.qdd.T)
         feels: dict[tuple[int, int], Array] = {(k, k): acceleration[k] for k in range(N)}
         for k in range(N):
@@ -82,7 +82,7 @@ def _running(parts: Iterable[Array]) -> list[Array]:
 
 
 def inertia_map(joints: int) -> Array:
-    """Return (parameters, N, N): how each inertia parameter enters the symmetric matrix R."""
+    """Return (parameters, N, N): coefficients of each inertia parameter in the symmetric R."""
     names = inertia_names(joints)
     weights = np.zeros((len(names), joints, joints))
     if joints == 2:

@@ -39,8 +39,8 @@ class Orifice(Term):
 
     cap: C_pp sqrt(p_s - p_cap) u [u>0] + C_pm sqrt(p_cap - p_t) u [u<0];
     rod: - C_mp sqrt(p_rod - p_t) u [u>0] - C_mm sqrt(p_s - p_rod) u [u<0].
-    The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; here
-    it is from first principles. Outside [p_t, p_s] the root has the drop's sign. Rows are masked
+    The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; here both
+    follow from first principles. Outside [p_t, p_s] the root has the drop's sign. Rows are masked
     where measured pressures lie there.
     """
 
@@ -92,13 +92,13 @@ def _gains(joints: int) -> tuple[Coefficient, ...]:
 
 
 def root_of_drop(drop: Array) -> Array:
-    """Return the roots [Pa^0.5] of the amounts of pressure drops [Pa], with the drops' signs."""
+    """Return the signed roots [Pa^0.5] of pressure drops [Pa]."""
     return np.copysign(np.sqrt(np.abs(drop)), drop)
 
 
 @njit(cache=True)
 def signed_root(drop):  # type: ignore[no-untyped-def]
-    """Return the root [Pa^0.5] of one drop's amount, with the drop's sign."""
+    """Return the signed root [Pa^0.5] of one pressure drop [Pa]."""
     return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
 
 

@@ -1,7 +1,7 @@
 """Sine and cosine of one angle as plain arithmetic, for the equations that are simulated.
 
-A call of the mathematical library costs more than the rest of a term's kernel, and keeps a loop
-from working on several samples at once; this is inlined and has no branch.
+A call of the mathematical library takes longer than the rest of a term's kernel and prevents
+vectorised loops; this is inlined and has no branch.
 """
 
 from __future__ import annotations

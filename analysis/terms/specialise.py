@@ -1,12 +1,11 @@
-"""Partial evaluation of a term's kernel: plain statements on scalars for one rig and one place.
+"""Partial evaluation of a term's kernel: plain statements on scalars for one rig and one joint.
 
 A kernel is written for any number of joints, on arrays (`analysis.terms.base`). Here its source is
-read and evaluated as far as it can be before any sample is known: the phase, the number of joints
-and the joint of the term are numbers, loops over joints are unrolled, and every array element
-becomes a variable. The operations on floating-point numbers and their order stay what the kernel
-says, so that results are the same to the last bit. A function that a kernel calls is copied beside
-it, with the elements that it reads as arguments where it takes a whole array, once for every set of
-integers that it is called with.
+evaluated as far as possible without samples: the phase, the number of joints and the joint of the
+term are numbers, loops over joints are unrolled, and every array element becomes a variable. The
+floating-point operations and their order stay those of the kernel, so that results agree to the
+last bit. A function that a kernel calls is copied with it, once for every set of integer arguments;
+array arguments are replaced by the elements that it reads.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ _BUILTINS: Final = ("abs", "max", "min", "float")
 
 
 class NotSpecialisable(Exception):
-    """A kernel uses what cannot be evaluated before the simulation; the message says what."""
+    """A kernel uses what cannot be evaluated before the simulation; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class ScalarArray:
 
 @dataclass
 class Helpers:
-    """The functions copied beside the kernels: text by name, each once."""
+    """The functions copied with the kernels: text by name, each once."""
 
     texts: dict[str, str] = field(default_factory=dict)
     names: dict[tuple[Any, ...], tuple[str, tuple[str, ...]]] = field(default_factory=dict)
@@ -105,9 +104,10 @@ class Helpers:
 
 @dataclass(frozen=True)
 class Specialised:
-    """Statements of a kernel at its place, the variables that they read, and the places.
+    """Statements of a specialised kernel, the variables that they read, and the fixed places.
 
-    `places` are the elements, by variable, that were read as integers and are fixed in the lines.
+    `places` are the elements, by variable, that were read as integers and are constants in the
+    lines.
     """
 
     lines: tuple[str, ...]
@@ -160,7 +160,7 @@ def _whole(node: ast.expr) -> int | None:
 
 
 class _Body(ast.NodeTransformer):
-    """The statements of one function, evaluated as far as known numbers go."""
+    """The statements of one function, evaluated as far as known numbers allow."""
 
     def __init__(
         self, function: Callable[..., Any], tree: ast.FunctionDef,
@@ -204,7 +204,7 @@ class _Body(ast.NodeTransformer):
         return out
 
     def _leaves(self, body: Sequence[ast.stmt]) -> bool:
-        """Whether a block ends what is inlined: a kernel, or one round of an unrolled loop."""
+        """Return whether a block ends the inlined part: a kernel, or a pass of an unrolled loop."""
         return self.inlined and isinstance(body[-1], ast.Return | ast.Continue)
 
     def _choice(
@@ -213,7 +213,7 @@ class _Body(ast.NodeTransformer):
         return ast.If(test, self.block(body) or [ast.Pass()], self.block(other))
 
     def _plain(self, statement: ast.stmt) -> list[ast.stmt]:
-        """Return a statement that is no `if`, evaluated: none, itself or a loop's rounds."""
+        """Return a statement that is no `if`, evaluated: none, itself or a loop's passes."""
         match statement:
             case ast.Pass() | ast.Expr(value=ast.Constant()):
                 out: list[ast.stmt] = []
@@ -278,7 +278,7 @@ class _Body(ast.NodeTransformer):
         return ast.Tuple([self.visit(part) for part in node.elts], node.ctx)
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        """Replace what is known by its number, and set the local variables apart."""
+        """Replace known variables by their numbers, and prefix local variables."""
         if isinstance(node.ctx, ast.Load) and node.id in self.known:
             return ast.Constant(self.known[node.id])
         if node.id in self.arrays:
@@ -317,7 +317,7 @@ class _Body(ast.NodeTransformer):
         raise NotSpecialisable(f"line {node.lineno}: {ast.unparse(node)} has no fixed place")
 
     def visit_Call(self, node: ast.Call) -> ast.expr:
-        """Evaluate `int(par[k])` and `len`, copy what else is called."""
+        """Evaluate `int(par[k])` and `len`, copy other functions."""
         if node.keywords:
             raise NotSpecialisable(f"line {node.lineno}: {ast.unparse(node)} names an argument")
         match node:
@@ -362,7 +362,7 @@ class _Body(ast.NodeTransformer):
         return ast.Call(ast.Name(name, ast.Load()), [*kept, *elements], [])
 
     def _place(self, element: ast.Subscript) -> int:
-        """Return the number of a place (a joint) that a kernel reads from `par`."""
+        """Return the joint's number that a kernel reads from `par`."""
         index = _whole(self.visit(element.slice))
         if isinstance(element.value, ast.Name) and index is not None:
             array = self.arrays.get(element.value.id)
@@ -374,7 +374,7 @@ class _Body(ast.NodeTransformer):
         raise NotSpecialisable(f"line {element.lineno}: int({ast.unparse(element)}) is no place")
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-        """Evaluate operations on known integers; those on floats stay as they stand."""
+        """Evaluate operations on known integers; keep those on floats."""
         left, right = self.visit(node.left), self.visit(node.right)
         a, b = _whole(left), _whole(right)
         if a is not None and b is not None and type(node.op) in _BINARY:
@@ -415,7 +415,7 @@ class _Body(ast.NodeTransformer):
         return left[0] if len(left) == 1 else ast.BoolOp(node.op, left)
 
     def visit_IfExp(self, node: ast.IfExp) -> ast.expr:
-        """Choose where the test is known."""
+        """Choose the branch where the test is known."""
         test = self.visit(node.test)
         known = _constant(test)
         if known is not None:

@@ -28,7 +28,6 @@ from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
-from analysis.trace.data.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import (
     Finding,
@@ -59,6 +58,7 @@ from analysis.trace.result import (
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence
 from rig.model.parse import InputError

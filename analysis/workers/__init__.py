@@ -1,1 +1,1 @@
-"""Where work is done: in this process, in processes of this machine, or on a Dask cluster."""
+"""Execution of work: in this process, in processes of this machine, or on a Dask cluster."""

@@ -1,8 +1,8 @@
-"""A Dask cluster as a pool: the work goes to where the data is, only results travel.
+"""A Dask cluster as a pool: work runs where the data is, only results are transferred.
 
-The scheduler and its workers are started by whoever owns the machines (docs/scale.md); this end
-only connects. A worker must have this package installed, in this version, and see the folders
-under the paths given.
+The scheduler and its workers are started by the machines' owner (docs/scale.md); this class only
+connects. A worker must have this package installed, in this version, and see the folders under the
+paths given.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ CONNECT_SECONDS = 10.0
 class DaskCluster:
     """A pool of the workers behind a Dask scheduler at ``tcp://HOST:PORT``.
 
-    Entering raises InputError where dask.distributed is not installed, where nothing answers at
-    the address, or where no worker is there. A cluster lost on the way raises ConnectionError.
+    Entering raises InputError where dask.distributed is not installed, where nothing answers at the
+    address, or where there is no worker. A cluster lost later raises ConnectionError.
     """
 
     workers = 0
@@ -81,9 +81,9 @@ class DaskCluster:
     def map(
         self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
     ) -> Iterator[U]:
-        """Yield function(item) in the items' order, each worked on where what it reads exists.
+        """Yield function(item) in the items' order, each run by a worker that sees its path.
 
-        Raises InputError for a path that no worker sees.
+        `reads` names the path that an item needs. Raises InputError for a path that no worker sees.
         """
         if self._client is None:
             raise ValueError("use the cluster in a `with` block")
@@ -100,14 +100,14 @@ class DaskCluster:
             ) from error
 
     def _holders_of(self, path: str) -> list[str]:
-        """Return the workers that see a path, asked for once: busy workers answer late."""
+        """Return the workers that see a path, queried once because busy workers answer late."""
         if path in self._holders:
             return self._holders[path]
         answers = self._client.run(_exists, path)
         holders = [worker for worker, exists in answers.items() if exists]
         if not holders:
             raise InputError(
-                f"{path}: no worker of the cluster sees it ({len(answers)} asked); give the path "
+                f"{path}: no worker of the cluster sees it (of {len(answers)}); give the path "
                 "as the workers see it"
             )
         self._holders[path] = holders

@@ -1,14 +1,14 @@
-"""One way to hand work out: here, to processes of this machine, or to a Dask cluster.
+"""A common interface to run work: in this process, in processes of this machine, on a cluster.
 
 A pool maps a plain function (importable by name, picklable, no state of its own) over items and
-yields the results in the items' order; what the function raises, `map` raises. Use it as a context
-manager: processes and connections end with it, whatever happens inside.
+yields the results in the items' order; exceptions of the function are raised by `map`. Use it as a
+context manager: processes and connections end with it in any case.
 
     with Processes(workers) as pool:
         for result in pool.map(one_study, seeds): ...
 
-Randomness comes with the items (a seed, a `SeedSequence` child), never from the process. Work is
-handed out only a little ahead of what was taken, so items may be an endless generator.
+Random seeds belong to the items (a seed, a `SeedSequence` child), never to the process. Items are
+submitted only a little ahead of the results taken, so they may be an endless generator.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ T = TypeVar("T")
 U = TypeVar("U")
 Reads = Callable[[T], str]
 
-AHEAD = 8  # items handed out per worker beyond the one waited for: one that lags stops no other
+AHEAD = (
+    8  # items submitted per worker beyond the one waited for, so that a slow item delays no other
+)
 # Every library that multiplies matrices reads one of these when it is loaded.
 ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
@@ -35,19 +37,19 @@ ONE_THREAD = dict.fromkeys(
 
 
 class Pool(Protocol):
-    """Something that maps functions over items; a context manager that ends what it started."""
+    """Maps functions over items; a context manager that ends what it started."""
 
     @property
     def workers(self) -> int:
-        """How many items are worked on at once."""
+        """Number of items worked on at once."""
 
     def map(
         self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
     ) -> Iterator[U]:
         """Yield function(item) in the items' order.
 
-        `reads` names the file or folder that an item needs; a pool across machines works on the
-        item where that exists, the others pay it no heed.
+        `reads` names the file or folder that an item needs; a pool across machines runs the item
+        where that exists, the others ignore it.
         """
 
     def __enter__(self) -> Self:
@@ -63,14 +65,14 @@ class Pool(Protocol):
 
 
 class Serial:
-    """No other process at all: for tests, small work, and `--debug`."""
+    """Runs in this process: for tests, small work, and `--debug`."""
 
     workers = 1
 
     def map(
         self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
     ) -> Iterator[U]:
-        """Yield function(item), each when it is asked for."""
+        """Yield function(item), each when requested."""
         return map(function, items)
 
     def __enter__(self) -> Self:
@@ -122,7 +124,7 @@ class Processes:
 def in_order(submit: Callable[[T], Any], items: Iterable[T], workers: int) -> Iterator[Any]:
     """Submit items a little ahead and yield their futures' results in order.
 
-    What is left is cancelled when the caller stops taking, or when one fails.
+    Remaining items are cancelled when the caller stops, or when one fails.
     """
     waiting: deque[Any] = deque()
     try:
@@ -139,7 +141,7 @@ def in_order(submit: Callable[[T], Any], items: Iterable[T], workers: int) -> It
 
 @contextmanager
 def environment(changes: Mapping[str, str] = ONE_THREAD) -> Iterator[None]:
-    """Change what the processes that are started inside inherit; by default one BLAS thread."""
+    """Change the environment that child processes inherit; by default one BLAS thread."""
     before = {key: os.environ.get(key) for key in changes}
     os.environ.update(changes)
     try:

@@ -1,4 +1,4 @@
-"""What every driver must do, on any wire, as checks that anybody can run (docs/conformance.md)."""
+"""Requirements of every driver, on any wire, as executable checks (docs/conformance.md)."""
 
 from drivers.conformance.catalogue import ConformanceCheck
 from drivers.conformance.random_calls import RandomCallBudget

@@ -1,4 +1,4 @@
-"""The model behind random calls: which law acts from which tick on, and what must be zero."""
+"""The model for random calls: which law acts from which tick on, and what must be zero."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PENDING: Final = -1  # a waveform's first tick is that of the next stream
 
 
 class DeviceModel:
-    """One sequence of calls on one fresh bench, and what may be seen after them."""
+    """One sequence of calls on one fresh bench, and the expected samples after them."""
 
     def __init__(self, subject: Subject) -> None:
         self._stack = ExitStack()
@@ -29,14 +29,14 @@ class DeviceModel:
         self._clear()
 
     def _clear(self) -> None:
-        """Drop a session; the waveforms stored in the device are unknown."""
+        """Drop a session; the waveforms stored in the device are then unknown."""
         self.streaming = False
         self.tripped = False
         self.waves: dict[int, Array] = {}  # as uploaded, for the next apply
         self.last: SampleBlock | None = None
         self.fresh = False  # the next block is the first of its stream
         self.phase_known = False
-        self.settling = 0  # blocks that may still show the law before the last zero
+        self.settling = 0  # blocks that may still contain the law before the last zero
         self.segments: list[tuple[int, Playing]] = [(0, self.trial.playing(self.trial.off()))]
 
     # -- calls ------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ class DeviceModel:
         self.driver.zero_outputs()
         self.segments = [(self._end(), self.trial.playing(self.trial.off()))]
         self.settling = 0 if self.trial.claims.virtual_time else SETTLING
-        self.waves.clear()  # whether the device keeps them is its own affair
+        self.waves.clear()  # the device may keep them or not
         self.phase_known = False
         self.trial.zero_at_device("after zero_outputs")
 
@@ -123,7 +123,7 @@ class DeviceModel:
         self.trial.zero_at_device("after close")
 
     def cut(self) -> None:
-        """End the link, then see that calls say so and zero is reached."""
+        """End the link, then check that calls report it and zero is reached."""
         assert self.trial.bench.cut is not None
         self.trial.bench.cut()
         if self.trial.bench.silence is not None:
@@ -135,14 +135,14 @@ class DeviceModel:
         self.connected = False
 
     def silence(self) -> None:
-        """Let the watchdog's time pass."""
+        """Wait longer than the watchdog's time."""
         assert self.trial.bench.silence is not None
         self.trial.bench.silence()
         self.trial.zero_at_device("after a silence longer than the watchdog")
         self.close()
 
     def spoiled(self, fault: str, name: str) -> None:
-        """Make one call while the wire spoils answers; after an error reach zero and close."""
+        """Make one call while the wire damages answers; after an error reach zero and close."""
         calls: dict[str, Callable[[], None]] = {
             "read": self.read,
             "start": self.start,
@@ -151,7 +151,7 @@ class DeviceModel:
             "apply": lambda: self.apply([(1.0, 0.5, 0.8)] * self.trial.joints, True),
             "upload": lambda: self.upload(0, 61),
         }
-        # Where the model expects an error anyway, the session may have ended with it.
+        # If the model expects an error anyway, the session may have ended with it.
         failed = self.tripped if name == "apply" else name == "read" and not self.streaming
         self.trial.spoil(fault)
         try:
@@ -173,7 +173,7 @@ class DeviceModel:
         finally:
             self._stack.close()
 
-    # -- what may be seen -------------------------------------------------------------------
+    # -- expected samples -------------------------------------------------------------------
 
     def _end(self) -> int:
         """Return the tick after the last sample read in this session."""

@@ -1,4 +1,4 @@
-"""The list of checks: each is a function of a `Trial` with a docstring, found under its name."""
+"""The list of checks: each is a function of a `Trial` with a docstring, listed by its name."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ SATURATION: Final = "a sensor at the end of its range"
 
 @dataclass(frozen=True)
 class ConformanceCheck:
-    """One thing that every driver must do.
+    """One requirement of every driver.
 
-    `needs` are the capabilities without which it is skipped; `moves` says whether it asks the
-    device for outputs other than zero.
+    `needs` are the capabilities without which it is skipped; `moves` states whether it requests
+    outputs other than zero.
     """
 
     name: str
@@ -63,7 +63,7 @@ def catalogue() -> tuple[ConformanceCheck, ...]:
 
 
 def lacking(check: ConformanceCheck, bench: DeviceUnderTest, claims: Capabilities) -> str | None:
-    """Return the first capability that a check needs and a bench has not, or None."""
+    """Return the first capability that a check needs and a bench lacks, or None."""
     has = {
         OUTPUTS: claims.outputs,
         TWO_JOINTS: len(bench.rig.joints) > 1,

@@ -1,4 +1,4 @@
-"""Checks over a wire that spoils answers: which errors appear, and that zero is reached."""
+"""Checks over a wire that damages answers: which errors appear, and that zero is reached."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The law that commands must follow, computed anew from the interface's formula."""
+"""The law that commands must follow, computed independently from the interface's formula."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Playing:
-    """What drives the outputs: one law and one waveform [V] per joint, begun at tick `origin`."""
+    """The law and waveform [V] of each joint, begun at tick `origin`."""
 
     laws: tuple[OutputLaw, ...]
     waves: tuple[Array, ...]
     origin: int = 0
 
     def volts(self, rig: Rig, ticks: NDArray[np.int64], data: Array) -> Array:
-        """Return the commands [V] that the law makes at `ticks`, shape (n, joints)."""
+        """Return the commands [V] of the law at `ticks`, shape (n, joints)."""
         columns = []
         for joint, (law, wave) in enumerate(zip(self.laws, self.waves, strict=True)):
             command = law.gain * wave[(ticks - self.origin) % len(wave)] + law.bias

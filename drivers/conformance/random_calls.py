@@ -1,4 +1,4 @@
-"""Calls in any order, losses and faults among them: a state machine around `calls_model.Model`.
+"""Calls in random order, with losses and faults: a state machine around `calls_model`.
 
 Every block read must continue the one before and follow the law of each of its ticks; after zero,
 close and any error the device's outputs are zero. Hypothesis draws the calls and shortens a
@@ -20,7 +20,7 @@ _LAW = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RandomCallBudget:
-    """How many sequences of calls are tried, how long each may be, and whether to shorten."""
+    """Number and length of the sequences of calls, and whether to shorten them."""
 
     sequences: int = 60
     calls: int = 30
@@ -45,7 +45,7 @@ def _machine(subject: Subject, last: dict[str, list[str]]) -> Any:
     joints, lengths = st.integers(0, 8), st.sampled_from((61, 7, 1))
 
     class Calls(RuleBasedStateMachine):
-        """Draws calls; what they may show is the model's business."""
+        """Draws calls; the model checks their results."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -140,7 +140,7 @@ def _machine(subject: Subject, last: dict[str, list[str]]) -> Any:
 def try_random_calls(subject: Subject, effort: RandomCallBudget) -> None:
     """Try random sequences of calls on fresh benches.
 
-    Raises NotConforming with the calls that led there, Skipped without hypothesis.
+    Raises NotConforming with the calls that led to it, Skipped without hypothesis.
     """
     try:
         from hypothesis import HealthCheck, Phase, settings  # noqa: PLC0415

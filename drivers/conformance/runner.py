@@ -1,4 +1,4 @@
-"""Running the checks: named results with a reason in one line each."""
+"""Execution of the checks: named results with a reason in one line each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MODULES: Final = (session_checks, output_checks, fault_checks)
 
 
 class CheckVerdict(StrEnum):
-    """How one check ended."""
+    """The result of one check."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -31,7 +31,7 @@ class CheckVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class Result:
-    """One check's verdict; `reason` says in one line why it failed or was skipped."""
+    """One check's verdict; `reason` states in one line why it failed or was skipped."""
 
     check: str
     verdict: CheckVerdict
@@ -40,7 +40,7 @@ class Result:
 
 @dataclass(frozen=True)
 class ConformanceReport:
-    """What a subject did in every check that was run."""
+    """The results of every check run on a subject."""
 
     subject: str
     results: tuple[Result, ...]
@@ -71,7 +71,7 @@ def all_checks() -> tuple[ConformanceCheck, ...]:
 def run_check(
     check: ConformanceCheck, subject: Subject, effort: RandomCallBudget | None = None
 ) -> Result:
-    """Run one check on a fresh bench of the subject; never raises for what the driver does."""
+    """Run one check on a fresh bench of the subject; never raises for the driver's errors."""
     try:
         if check is RANDOM_CALLS:
             try_random_calls(subject, effort or RandomCallBudget())
@@ -96,7 +96,7 @@ def _run_on(check: ConformanceCheck, trial: Trial) -> None:
     try:
         check.body(trial)
     except BaseException:
-        # The first failure is the one to tell; a driver that fails may fail to close as well.
+        # Report the first failure; a driver that fails may also fail to close.
         try:
             trial.end()
         except NotConforming as error:
@@ -119,9 +119,9 @@ def run(
 ) -> ConformanceReport:
     """Run the checks on a subject and return their results.
 
-    `only` names checks to run instead of all; `outputs` False leaves out whatever asks for
-    outputs other than zero; `until_failure` ends at the first failure. Raises ValueError for a
-    name that no check has.
+    `only` names checks to run instead of all; `outputs` False omits checks that request outputs
+    other than zero; `until_failure` ends at the first failure. Raises ValueError for a name that no
+    check has.
     """
     known = {check.name: check for check in all_checks()}
     for name in only:

@@ -46,7 +46,7 @@ def other_rig_refused(trial: Trial) -> None:
         try:
             driver = trial.driver(rig)
         except InputError:
-            continue  # refused before a device was asked: the wire cannot carry that rig
+            continue  # refused before a device was contacted: the wire cannot serve that rig
         trial.refused(f"a rig with {what}", driver.connect)
         driver.close()
 

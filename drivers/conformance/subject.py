@@ -1,8 +1,8 @@
-"""A driver under test: how to get a fresh device, and what driver and device claim to be able to.
+"""A driver under test: how to make a fresh device, and the capabilities claimed for both.
 
-Glossary: a *subject* is a driver together with a device to try it on; a *bench* is one fresh
-device with what a test may do to it; a *probe* reads the device's outputs by another way than the
-driver under test; a *fault* is a name for what the wire can be made to do to answers.
+Glossary: a *subject* is a driver together with a device to try it on; a *bench* is one fresh device
+with a test's means of acting on it; a *probe* reads the device's outputs independently of the
+driver under test; a *fault* names a disturbance of answers by the wire.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from rig.model.rig import Rig
 Probe = Callable[[], Sequence[float]]
 Act = Callable[[], None]
 
-_PART = 0.1  # of the smallest command limit, asked for where outputs are allowed
+_PART = 0.1  # of the smallest command limit, requested where outputs are allowed
 
-HEALTHY = "pass"  # the fault that is none
+HEALTHY = "pass"  # no fault
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What driver and device claim; a check that needs what is not claimed is skipped, and said.
+    """Claims about driver and device; a check that needs an unclaimed one is skipped, with notice.
 
     `outputs`: laws drive outputs (False: the device only plays samples). `host_timed`: the driver
     evaluates the laws at the host's rate; its blocks may lag, and `stop` ends the laws.
-    `virtual_time`: the device's clock stands still while nobody reads. `latches_trips`: after a
-    loss of the host the device keeps its outputs at zero until `reset`. `refuses_other_rigs`: the
-    device can tell which rig it is.
+    `virtual_time`: the device's clock stands still without reads. `latches_trips`: after a loss of
+    the host the device keeps its outputs at zero until `reset`. `refuses_other_rigs`: the device
+    can tell which rig it is.
     """
 
     outputs: bool = True
@@ -43,14 +43,14 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class DeviceUnderTest:
-    """One fresh device, its outputs at zero and not tripped, and what can be done to it.
+    """One fresh device, its outputs at zero and not tripped, and actions on it.
 
     `driver` makes an unconnected driver for a rig. `outputs` returns every output [V] after at
-    least one further sample of the device's clock. `cut` ends the link as the death of the
-    host's process does. `silence` lets more time pass than the watchdog allows, without a word
-    of the host. `spoil` makes the wire do one of `faults` from then on, or be healthy again
-    (`HEALTHY`). `lost` names the faults after which no answer arrives any more. `saturate` puts a
-    sensor at an end of its range and returns the column. What a bench cannot do is None or empty.
+    least one further sample of the device's clock. `cut` ends the link as the death of the host's
+    process does. `silence` waits longer than the watchdog allows, without a message of the host.
+    `spoil` makes the wire apply one of `faults` from then on, or none (`HEALTHY`). `lost` names the
+    faults after which no answer arrives. `saturate` puts a sensor at an end of its range and
+    returns the column. Actions that a bench lacks are None or empty.
     """
 
     rig: Rig
@@ -68,7 +68,7 @@ class DeviceUnderTest:
 class Subject:
     """A driver under test; `make` opens a fresh bench and ends it afterwards.
 
-    `volts` is the largest output [V] that the checks ask for; it must lie below every joint's
+    `volts` is the largest output [V] that the checks request; it must lie below every joint's
     `limits.command` and well above the steps of the output converters.
     """
 
@@ -79,11 +79,11 @@ class Subject:
 
 
 def live_subject(rig: Rig) -> Subject:
-    """Return the device that the rig's wire reaches as a subject.
+    """Return the device at the rig's wire as a subject.
 
-    What it is (virtual time, host-timed) is asked of it. Raises InputError for settings that its
-    driver cannot read, DeviceError where it does not answer or has tripped: checks clear no trip
-    of a machine.
+    Its properties (virtual time, host-timed) are read from it. Raises InputError for settings that
+    its driver cannot read, DeviceError where it does not answer or has tripped: checks clear no
+    trip of a machine.
     """
     driver = make_driver(rig.wire, rig)
     try:

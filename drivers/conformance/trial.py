@@ -1,4 +1,4 @@
-"""What a check works with: drivers of a fresh bench, laws to ask for, and what must hold."""
+"""The tools of a check: drivers of a fresh bench, laws, and requirements."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from drivers.conformance.subject import HEALTHY, DeviceUnderTest, Subject
 from drivers.conformance.watched import NotConforming, Watched, follows, require, rows_of
 from rig.model.rig import Rig
 
-PATIENCE = 40  # tries at what needs the device to have noticed the end of a link
+PATIENCE = 40  # tries of a call that needs the device to have detected the end of a link
 PAUSE = 0.05  # [s] between them
-SETTLING = 3  # blocks after zeroing that may still show the law before, if time is real
+SETTLING = 3  # blocks after zeroing that may still contain the previous law, in real time
 
 
 class Trial:
@@ -39,7 +39,7 @@ class Trial:
         return made
 
     def connected(self, driver: Watched | None = None) -> Watched:
-        """Return a connected driver; waits while the device still serves the session before."""
+        """Return a connected driver; waits while the device still serves the previous session."""
         device = self.driver() if driver is None else driver
         patiently(device.connect)
         return device
@@ -53,7 +53,7 @@ class Trial:
         return driver
 
     def spoil(self, fault: str) -> None:
-        """Make the wire do `fault` from now on."""
+        """Make the wire apply `fault` from now on."""
         assert self.bench.spoil is not None
         self.bench.spoil(fault)
 
@@ -90,7 +90,7 @@ class Trial:
         return Playing(tuple(laws), each, origin)
 
     def wave(self, samples: int = 97, seed: int = 1) -> Array:
-        """Return a waveform [V] no two places of which look alike."""
+        """Return a waveform [V] in which no two places are alike."""
         return np.random.default_rng(seed).uniform(-self.volts, self.volts, samples)
 
     # -- requirements -----------------------------------------------------------------------
@@ -111,7 +111,7 @@ class Trial:
         require(not outputs.any(), f"{when} the device puts out {in_volts(outputs)}")
 
     def zero_in_stream(self, driver: Watched, when: str, *, soon: bool = False) -> None:
-        """Require a block of zero commands; `soon` lets older blocks come before it."""
+        """Require a block of zero commands; with `soon` older blocks may precede it."""
         block = driver.read_block()
         older = block.backlog + (0 if self.claims.virtual_time else SETTLING)
         for _ in range(older if soon else 0):
@@ -136,7 +136,7 @@ class Trial:
         self.zero_at_device(f"{when} and after zero_outputs")
 
     def until_law(self, driver: Watched, playing: Playing, first: int, count: int) -> None:
-        """Read until `count` blocks from tick `first` on follow the law; earlier ones may not."""
+        """Read until `count` blocks from tick `first` on follow the law; earlier ones need not."""
         before: SampleBlock | None = None
         seen = 0
         for _ in range(count + 50):
@@ -154,7 +154,7 @@ class Trial:
 
 
 def patiently(call: Callable[[], object]) -> None:
-    """Make a call that a device refuses until it has noticed the end of the link before."""
+    """Repeat a call that a device refuses until it has detected the end of the previous link."""
     for left in reversed(range(PATIENCE)):
         try:
             call()
@@ -167,7 +167,7 @@ def patiently(call: Callable[[], object]) -> None:
 
 
 def lost(call: Callable[[], object], tries: int = 3) -> DeviceLost | None:
-    """Return the DeviceLost that a call raises within `tries`, None where it raises none."""
+    """Return the DeviceLost that a call raises within `tries`, None if it raises none."""
     for _ in range(tries):
         try:
             call()
@@ -179,6 +179,6 @@ def lost(call: Callable[[], object], tries: int = 3) -> DeviceLost | None:
 
 
 def quietly(call: Callable[[], object]) -> None:
-    """Make a call that may fail with a DeviceError."""
+    """Make a call and ignore a DeviceError."""
     with suppress(DeviceError):
         call()

@@ -1,4 +1,4 @@
-"""A driver whose every call is watched, and blocks that must continue each other."""
+"""A wrapper that checks every call of a driver, and the continuity of its blocks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Result = TypeVar("Result")
 
 
 class NotConforming(AssertionError):
-    """A driver did what none may do, or not what each must; the message says which."""
+    """A driver violated a requirement; the message says which."""
 
 
 class Skipped(Exception):
-    """A check found out while running that it cannot be made here; the message says why."""
+    """A check that cannot be made here; the message says why."""
 
 
 def require(holds: object, message: str) -> None:
@@ -30,9 +30,9 @@ def require(holds: object, message: str) -> None:
 
 
 class Watched:
-    """A driver whose calls may raise nothing but DeviceError and whose blocks have the right form.
+    """A driver whose calls may raise only DeviceError and whose blocks must have the right form.
 
-    It offers the calls of `drivers.base.Driver`, keeps their names in `log` and the last `info`.
+    It has the calls of `drivers.base.Driver`, keeps their names in `log` and the last `info`.
     """
 
     def __init__(self, driver: Driver, rig: Rig) -> None:
@@ -55,12 +55,12 @@ class Watched:
             ) from error
 
     def connect(self) -> DeviceInfo:
-        """Connect; returns what the device says of itself."""
+        """Connect; return the device's info."""
         self.info = self._call("connect", self.bare.connect)
         return self.info
 
     def close(self) -> None:
-        """Close; not even a DeviceError may leave it."""
+        """Close; not even a DeviceError may be raised."""
         try:
             self._call("close", self.bare.close)
         except DeviceError as error:
@@ -75,7 +75,7 @@ class Watched:
         self._call(f"upload to joint {joint + 1}", lambda: self.bare.upload(joint, wave))
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
-        """Apply laws; the tick returned must be a whole number that is not negative."""
+        """Apply laws; the tick returned must be an integer, 0 or more."""
         name = "apply with restart" if restart else "apply"
         tick = self._call(name, lambda: self.bare.apply(laws, restart=restart))
         whole = isinstance(tick, int | np.integer) and tick >= 0
@@ -119,7 +119,7 @@ class Watched:
         return block
 
     def read(self, count: int) -> list[SampleBlock]:
-        """Read `count` blocks, in order or counted missing."""
+        """Read `count` blocks, in order or with the missing ones counted."""
         blocks = [self.read_block() for _ in range(count)]
         for before, after in pairwise(blocks):
             follows(before, after)

@@ -1,10 +1,8 @@
 """The device behind the wire: sample clock, output laws, blocks, watchdog, control.
 
-It knows registers' meaning, not Modbus: `hil_sim.device.register_map` gives addresses to its
-methods.
-
-Virtual time: the plant advances by one block when the host reads and nothing is queued; nothing
-runs while nobody asks. Real time: the sample clock follows the wall clock, whoever asks.
+It is independent of Modbus: `hil_sim.device.register_map` maps addresses to its methods. Virtual
+time: the plant advances by one block when the host reads and nothing is queued, and pauses
+otherwise. Real time: the sample clock follows the wall clock.
 """
 
 from __future__ import annotations
@@ -33,18 +31,18 @@ logger = logging.getLogger(__name__)
 Codes = NDArray[np.int64]
 
 QUEUE_SECONDS = 4.0
-SETTLE_SECONDS = 0.2  # virtual time that passes with zero outputs after the host is gone
+SETTLE_SECONDS = 0.2  # virtual time with zero outputs after the host has disconnected
 VIRTUAL_SILENCE = 10.0  # virtual time stands still between requests
 POLL_SECONDS = 0.05
 WATCHDOG_RANGE_MS = (round(1e3 * WATCHDOG_RANGE[0]), round(1e3 * WATCHDOG_RANGE[1]))
 _U32 = 0xFFFF_FFFF
-# As numbers: every block has them, and an enumeration adds slowly.
+# Integers, because every block needs them and an enumeration is slow.
 _STREAMING, _TRIPPED = int(Status.STREAMING), int(Status.TRIPPED)
 _ARMED, _CONTROLLED = int(Status.ARMED), int(Status.CONTROLLED)
 
 
 class PlantInterface(Protocol):
-    """What the device needs of a plant; it is deterministic and owns all physical state."""
+    """The plant as the device uses it; deterministic, with all physical state."""
 
     @property
     def tick(self) -> int:
@@ -57,9 +55,9 @@ class PlantInterface(Protocol):
 class Device:
     """One bench: a plant with converters, a clock, laws, a queue and a watchdog.
 
-    `client` arguments are any hashable that stands for one connection. Methods that a client
-    calls raise `Refused` where the device does not obey. `faults` break the device while it runs;
-    `on_restart` is called when it restarts, for a server to end what was connected.
+    `client` arguments are any hashable that identifies a connection. Methods called by a client
+    raise `Refused` where the device refuses. `faults` break the device while it runs; `on_restart`
+    is called when it restarts, for a server to end what was connected.
     """
 
     def __init__(
@@ -84,8 +82,8 @@ class Device:
         self._plant: PlantInterface = plant if self._prefetch is None else self._prefetch
         self._clock = clock
         self._last_request = self._last_poll = self._origin = clock()
-        self._drift = 0.0  # by which share the sample clock runs fast
-        self._zero_tick = 0  # of the plant, at which this device counts 0
+        self._drift = 0.0  # relative error of the sample clock, positive if fast
+        self._zero_tick = 0  # of the plant, at the device's tick 0
         self._first_tick = plant.tick
         self._boots_until = -math.inf  # [s] of the clock
         self._broken = False
@@ -106,16 +104,16 @@ class Device:
         self.watchdog_ms = int(np.clip(round(rig.wire.watchdog * 1e3), *WATCHDOG_RANGE_MS))
         self._controller: object | None = None
 
-    # -- what a client may ask --------------------------------------------------------------
+    # -- requests of a client --------------------------------------------------------------
 
     @property
     def tick(self) -> int:
-        """Samples measured so far, as this device counts them."""
+        """Samples measured so far, by the device's counter."""
         return self._plant.tick - self._zero_tick
 
     @property
     def boots(self) -> bool:
-        """Whether it restarts and answers nothing."""
+        """Whether it restarts and does not answer."""
         return self._clock() < self._boots_until
 
     @property
@@ -129,7 +127,7 @@ class Device:
         )
 
     def take_control(self, client: object) -> None:
-        """Give `client` control, which is also a sign of life; refused while another has it."""
+        """Give `client` control, also as a heartbeat; refused while another client has it."""
         if self._controller is None:
             self._controller = client
         elif self._controller is not client:
@@ -137,7 +135,7 @@ class Device:
         self._last_request = self._clock()
 
     def beat(self, client: object, heartbeat: int) -> None:
-        """Feed the watchdog, if the heartbeat changed: a host repeating itself is not alive."""
+        """Reset the watchdog if the heartbeat changed, since a repeating host may hang."""
         before = self._last_request
         self.take_control(client)
         if heartbeat == self.heartbeat:
@@ -145,7 +143,7 @@ class Device:
         self.heartbeat = heartbeat
 
     def set_watchdog(self, milliseconds: int) -> None:
-        """Set the silence after which the outputs are zeroed."""
+        """Set the time without heartbeat after which the outputs are zeroed."""
         low, high = WATCHDOG_RANGE_MS
         if not low <= milliseconds <= high:
             raise Refused(Refusal.OUT_OF_RANGE)
@@ -158,7 +156,7 @@ class Device:
         self.outputs[:] = 0
 
     def apply(self, *, restart: bool) -> None:
-        """Let the staged laws act from the next sample on."""
+        """Apply the staged laws from the next sample on."""
         if self.cause != TripCause.NONE and self.laws.would_arm():
             raise Refused(Refusal.TRIPPED)
         self.catch_up()
@@ -184,12 +182,12 @@ class Device:
         self.cause = TripCause.NONE
 
     def acknowledge(self, sequence: int) -> None:
-        """Release the block that the host says it has."""
+        """Release the block that the host has received."""
         self.acknowledged = sequence
         self.queue.acknowledge(sequence)
 
     def read_block(self, client: object) -> bytes:
-        """Return the oldest block with its header, all zeros but the header if there is none."""
+        """Return the oldest block with its header, only a header with zeros if there is none."""
         if client is not self._controller:
             raise Refused(Refusal.NOT_IN_CONTROL)
         self.measure_ahead()
@@ -203,23 +201,23 @@ class Device:
         return reg.pack_header(header) + block.samples
 
     def measure_ahead(self) -> None:
-        """Measure what the host may read now: up to the present, or one block in virtual time."""
+        """Measure all that the host may read: up to the present, or one block in virtual time."""
         self.catch_up()
         if not self.realtime and self.streaming and not len(self.queue):
             self._run(self.layout.samples)
 
     def prefetch(self) -> None:
-        """Compute between requests what the host will most likely read next.
+        """Compute in idle time what the host will most likely read next.
 
-        Nothing of it shows before it is read, and a change of laws makes it void.
+        It has no effect until it is read, and is discarded at a change of laws.
         """
         if self._prefetch is not None and self.streaming and not self._broken:
             self._prefetch.prefetch(self.layout.samples, self.laws.active)
 
-    # -- what happens by itself -------------------------------------------------------------
+    # -- actions without a request -------------------------------------------------------------
 
     def disconnected(self, client: object) -> None:
-        """Note that a connection ended; without its controller the device makes itself safe."""
+        """Handle the end of a connection; without its controller the device zeroes its outputs."""
         if client is not self._controller:
             return
         self._controller = None
@@ -238,13 +236,13 @@ class Device:
         return min(max(due, 0.0), POLL_SECONDS)
 
     def poll(self) -> None:
-        """Do what is due by the clock; to be called again after `idle_seconds`."""
+        """Do everything due by the clock; to be called again after `idle_seconds`."""
         now = self._clock()
         stall, self._last_poll = now - self._last_poll, now
         if stall > 2 * POLL_SECONDS:
-            # While the device itself stood still the host does not count as silent.
+            # While the device itself was paused the host does not count as silent.
             self._last_request += stall
-        with suppress(Refused):  # a fault: tripped and logged where it happened
+        with suppress(Refused):  # a fault, already tripped and logged
             self.catch_up()
             if self._controller is not None and now - self._last_request > self._silence_allowed():
                 self._controller = None
@@ -253,7 +251,7 @@ class Device:
                     self._settle()
 
     def trip(self, cause: TripCause) -> None:
-        """Zero the outputs and latch why; the first cause stays until reset."""
+        """Zero the outputs and latch the cause; the first cause stays until reset."""
         self.laws.zero()
         self.outputs[:] = 0
         if self.cause == TripCause.NONE:
@@ -266,18 +264,18 @@ class Device:
         if not self.realtime or self._broken:
             return
         rate = self._rate
-        # A millionth of a sample early, so that rounding does not put off one that is due now.
+        # A millionth of a sample early, so that rounding does not delay a sample that is due.
         elapsed = int((self._clock() - self._origin) * rate + 1e-6)
         due = elapsed - (self._plant.tick - self._first_tick)
         most = int(QUEUE_SECONDS * rate)
         if due > most:
-            # The machine slept: the device's clock pauses rather than racing through hours.
+            # The computer was suspended: the device's clock pauses instead of catching up hours.
             self._origin += (due - most) / rate
             due = most
         self._run(due)
 
     def restart(self, boot: float) -> None:
-        """Lose all state as at power-on, and answer nothing for `boot` [s]."""
+        """Lose all state as at power-on, and do not answer for `boot` [s]."""
         logger.warning("restarts at tick %d", self.tick)
         self._power_up()
         self._zero_tick = self._plant.tick
@@ -286,11 +284,11 @@ class Device:
 
     @property
     def _rate(self) -> float:
-        """The samples that the device really takes a second."""
+        """The actual sample rate of the device [1/s]."""
         return self.rig.sample_rate * (1.0 + self._drift)
 
     def _drift_by(self, share: float) -> None:
-        # From here on; what was sampled before stays as it is.
+        # From now on; earlier samples are unchanged.
         self._origin = self._clock()
         self._first_tick = self._plant.tick
         self._drift = share
@@ -337,7 +335,7 @@ class Device:
         try:
             return self._plant.advance(count, laws)
         except Exception as error:
-            # Whatever went wrong in there: a bench that cannot be computed is a bench in fault.
+            # Any error in the plant counts as a fault of the bench.
             self._broken = True
             self.trip(TripCause.FAULT)
             logger.exception("the plant failed at tick %d", self.tick)

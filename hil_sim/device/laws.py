@@ -1,7 +1,7 @@
-"""Output laws and waveforms of the device: staged register by register, acting only together.
+"""Output laws and waveforms of the device: staged by register, applied together.
 
-Glossary: *staged* values were written and do nothing yet; *active* ones drive the outputs;
-`apply` copies staged to active for all joints at one tick.
+Glossary: *staged* values are written but without effect; *active* ones drive the outputs; `apply`
+copies staged to active for all joints at one tick.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ POSITION_GAIN_MAX = 1e5  # [V/m]
 
 
 class Refused(Exception):
-    """A request the device does not carry out; `reason` is what its register then says."""
+    """A request that the device refuses; `reason` is the value of its error register."""
 
     def __init__(self, reason: Refusal, joint: int = 0) -> None:
         super().__init__(reg.REFUSAL_TEXT[reason])
@@ -62,7 +62,7 @@ class LawTable:
 
     def __init__(self, rig: Rig) -> None:
         self._ranges = [joint.valve.command_range for joint in rig.joints]
-        # What one joint's five values may be at most, in the order of LAW_FIELDS.
+        # Largest values of one joint, in the order of LAW_FIELDS.
         reach = max(abs(edge) for edge in rig.sensors.piston.range)
         self._bounds = np.array([[GAIN_MAX, v, POSITION_GAIN_MAX, reach, v] for v in self._ranges])
         self._staged = np.zeros((len(rig.joints), len(reg.LAW_FIELDS)), dtype=">f4")
@@ -77,15 +77,15 @@ class LawTable:
 
     @property
     def armed(self) -> bool:
-        """Whether some active law may put out a voltage."""
+        """Whether an active law may put out a voltage."""
         return any(law.limit > 0.0 for law in self.active)
 
     def staged_bytes(self) -> bytes:
-        """Return the staged laws as their registers read back."""
+        """Return the staged laws as their registers are read."""
         return self._staged.tobytes()
 
     def stage(self, first: int, words: Words) -> None:
-        """Write registers of the law area from word `first`; raises Refused, staging nothing."""
+        """Write registers of the law area from word `first`; raises Refused without any change."""
         if first % 2 or len(words) % 2 or first + len(words) > 2 * self._staged.size:
             raise Refused(Refusal.NO_SUCH_REGISTER)
         values = self._staged.copy()
@@ -98,7 +98,7 @@ class LawTable:
         self._staged = values
 
     def begin_upload(self, joint: int, length: int) -> None:
-        """Open an upload for joint `joint` (1-based); an unfinished one is forgotten."""
+        """Open an upload for joint `joint` (1-based); an unfinished one is discarded."""
         self._upload = None
         if not 1 <= joint <= self.joints:
             raise Refused(Refusal.OUT_OF_RANGE, joint)
@@ -127,7 +127,7 @@ class LawTable:
         self._waves[index] = decode_output(upload.codes, self._ranges[index], reg.WAVE_BITS)
 
     def apply(self, tick: int, *, restart: bool) -> None:
-        """Let all staged laws and finished uploads act from sample `tick` on."""
+        """Activate all staged laws and finished uploads from sample `tick` on."""
         laws = []
         for wave, row, old in zip(self._waves, self._staged.tolist(), self.active, strict=True):
             values = dict(zip(reg.LAW_FIELDS, row, strict=True))
@@ -135,7 +135,7 @@ class LawTable:
         self.active = tuple(laws)
 
     def would_arm(self) -> bool:
-        """Whether applying what is staged may put out a voltage."""
+        """Whether the staged laws, once applied, may put out a voltage."""
         return bool((self._staged[:, -1] > 0.0).any())
 
     def restart(self, tick: int) -> None:

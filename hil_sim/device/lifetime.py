@@ -1,4 +1,4 @@
-"""How long a simulated bench lives: what every server of it, on whatever wire, has in common."""
+"""The lifetime of a simulated bench, common to its servers on all wires."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Final
 
 logger = logging.getLogger(__name__)
 
-PARENT_SECONDS: Final = 0.25  # between two looks at the parent
+PARENT_SECONDS: Final = 0.25  # between two checks of the parent
 
 
 class EndpointError(Exception):
-    """The bench cannot be offered there; the message names the place and what to do."""
+    """The bench cannot be offered at an endpoint; the message names the place and a remedy."""
 
 
 class ParentProcess:
@@ -28,8 +28,8 @@ class ParentProcess:
         self._child = os.getppid() == pid
 
     def has_ended(self) -> bool:
-        """Whether the process is gone."""
-        # A child's view of its parent is safe from a process number used again.
+        """Whether the process has ended."""
+        # A child's parent id is safe from a reused process number.
         return os.getppid() != self._pid if self._child else not _exists(self._pid)
 
 
@@ -58,7 +58,7 @@ def run_until(ended: Sequence[object], parent: int | None, step: Callable[[], No
 
 @contextmanager
 def termination_signals() -> Iterator[list[int]]:
-    """Collect SIGTERM and SIGINT in the list given, instead of dying of them."""
+    """Collect SIGTERM and SIGINT in the list returned, instead of ending."""
     signals: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:

@@ -1,7 +1,7 @@
 """The device's side of a wire of messages: messages in, messages out; no line, no clock.
 
 Glossary: a request is *late* when a newer one of its session was carried out: it is dropped. The
-newest one is *remembered* with its answer, which is given again when the request comes again.
+newest one is *remembered* with its answer, which is sent again when the request is repeated.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rig.model.wire.serial_messages import ANSWER, FOR_ANYBODY, WINDOW, Message
 logger = logging.getLogger(__name__)
 
 _U32 = 0xFFFF_FFFF
-_LATE = 0x8000  # numbers that far ahead are behind
+_LATE = 0x8000  # numbers further ahead than this count as older
 
 
 @dataclass(eq=False)
@@ -31,12 +31,12 @@ class _Host:
     """One session: the device's client."""
 
     session: int
-    number: int  # of the newest request carried out
+    number: int  # of the newest request executed
     answer: WireFrame | None = None
 
 
 class MessageSession:
-    """Carries out on one device what arrives; returns what is to be sent."""
+    """Executes messages on one device; returns the messages to send."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -62,7 +62,7 @@ class MessageSession:
         return None if self._host is None else self._host.session
 
     def receive(self, frame: WireFrame) -> WireFrame | None:
-        """Carry out a message; returns its answer, None for one that is not answered."""
+        """Execute a message; return its answer, None if it has none."""
         if self._device.boots:
             return None
         if frame.type == Message.ALIVE_NOTE:
@@ -93,14 +93,14 @@ class MessageSession:
         return None if self._device.boots else answer
 
     def push(self) -> WireFrame | None:
-        """Return the next block that may be sent, None if none may."""
+        """Return the next block that may be sent, else None."""
         device, host = self._device, self._host
         oldest = device.queue.queued(0)
         if host is None or oldest is None or not device.streaming:
             return None
         place = (self._next - oldest.sequence) & 0xFFFF
         if place > len(device.queue):
-            place = 0  # what would have been next was dropped from a full queue
+            place = 0  # the next block was dropped from a full queue
         block = device.queue.queued(place)
         if block is None or place >= WINDOW:
             return None

@@ -22,13 +22,13 @@ _MAX_WRITE_BESIDE_READ = 121
 
 
 class DeviceSession(Protocol):
-    """What a request needs to know of the connection it came by."""
+    """The registers that a request's connection belongs to."""
 
     registers: DeviceRegisters
 
 
 class ResponsePdu(ModbusPDU):
-    """An answer that was bytes from the start."""
+    """An answer made of bytes."""
 
     def __init__(self, function_code: int, data: bytes) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ class ResponsePdu(ModbusPDU):
         self._data = data
 
     def encode(self) -> bytes:
-        """Return what follows the function code."""
+        """Return the bytes after the function code."""
         return self._data
 
 
@@ -47,18 +47,18 @@ class Request(ModbusPDU):
     data = b""
 
     def decode(self, data: bytes) -> None:
-        """Keep what follows the function code."""
+        """Store the bytes after the function code."""
         self.data = data
 
     def __str__(self) -> str:
-        return type(self).__name__  # the library formats every request for a log it may not write
+        return type(self).__name__  # the library formats every request even without a log
 
     def answer(self) -> bytes:
-        """Carry the request out; returns what follows the function code of the answer."""
+        """Execute the request; return the bytes after the answer's function code."""
         raise NotImplementedError
 
     def answered(self) -> ModbusPDU:
-        """Return the answer, or why there is none in the terms of Modbus."""
+        """Return the answer, or Modbus's exception response."""
         try:
             return ResponsePdu(self.function_code, self.answer())
         except Refused as refused:
@@ -103,7 +103,7 @@ class WriteMany(Request):
     function_code = 16
 
     def answer(self) -> bytes:
-        """Write one span, echo where and how many."""
+        """Write one span; echo its address and length."""
         address, count, size = struct.unpack_from(">HHB", self.data)
         if size != 2 * count:
             raise ValueError("byte count")

@@ -1,7 +1,6 @@
 """The device's end of a pseudo terminal.
 
-The other end, ``/dev/pts/N``, is opened by any program like a serial port; its baud rate means
-nothing.
+The other end, ``/dev/pts/N``, can be opened like a serial port; its baud rate has no effect.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from contextlib import suppress
 from hil_sim.device.lifetime import EndpointError
 
 _CHUNK = 65_536
-_UNPLUGGED_SECONDS = 0.01  # between two looks for a host while there is none
-_MOST_UNSENT = 1 << 16  # answers that wait for a host that does not read; no more is taken then
+_UNPLUGGED_SECONDS = 0.01  # between two checks for a host
+_MOST_UNSENT = 1 << 16  # buffered for a host that does not read; then no requests are read
 
 
 class PtyLine:
-    """The device's end of a new pty; raises EndpointError where there are none."""
+    """The device's end of a new pty; raises EndpointError if there are no ptys."""
 
     def __init__(self) -> None:
         try:
@@ -38,11 +37,11 @@ class PtyLine:
 
     @property
     def free(self) -> bool:
-        """Whether a host listens and everything sent so far is on its way."""
+        """Whether a host listens and everything has been sent."""
         return self.connected and not self._unsent
 
     def receive(self, patience: float) -> bytes | None:
-        """Return what has arrived within `patience` [s]; None when the host has gone."""
+        """Return the bytes that arrive within `patience` [s]; None when the host has closed."""
         events = select.POLLOUT if self._unsent else 0
         if len(self._unsent) < _MOST_UNSENT:
             events |= select.POLLIN
@@ -67,7 +66,7 @@ class PtyLine:
         return b""
 
     def send(self, data: bytes) -> None:
-        """Send, or keep for later what the host has no room for."""
+        """Send, or buffer what cannot be sent now."""
         self._unsent += data
         try:
             if self._unsent:
@@ -80,7 +79,7 @@ class PtyLine:
             self._unsent = b""
 
     def close(self) -> None:
-        """Close the terminal: a program that has it open sees the device's end."""
+        """Close the terminal; a program that has it open detects this."""
         os.close(self.fd)
 
     def _read(self) -> bytes | None:

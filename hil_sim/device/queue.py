@@ -24,7 +24,7 @@ class QueuedBlock:
 
 
 class BlockQueue:
-    """First in, first out; when full the oldest block goes, and the numbers show the gap."""
+    """A FIFO; when full, the oldest block is dropped and the numbers show the gap."""
 
     def __init__(self, layout: BlockLayout, capacity: int) -> None:
         self._layout = layout
@@ -43,11 +43,11 @@ class BlockQueue:
 
     @property
     def room(self) -> int:
-        """Samples still missing to finish the block being filled."""
+        """Number of samples that the block being filled still needs."""
         return self._layout.samples - self._filled
 
     def clear(self) -> None:
-        """Empty the queue and number anew from 0."""
+        """Empty the queue and restart the numbers at 0."""
         self._blocks.clear()
         self._parts.clear()
         self._filled = 0
@@ -56,7 +56,7 @@ class BlockQueue:
         self.dropped = 0
 
     def lose_next(self, blocks: int) -> None:
-        """Lose the next `blocks` blocks as if they were overwritten before anybody read them."""
+        """Lose the next `blocks` blocks as if they were overwritten before they were read."""
         self._to_lose = blocks
 
     def add(self, tick: int, measured: Codes, commands: Codes) -> None:
@@ -84,7 +84,7 @@ class BlockQueue:
         self.next_sequence = (self.next_sequence + 1) & 0xFFFF
 
     def acknowledge(self, sequence: int) -> None:
-        """Drop the oldest block if it is the one last offered and carries this number."""
+        """Drop the oldest block if it is the one last offered and has this number."""
         if self._blocks and self._offered_sequence == sequence == self._blocks[0].sequence:
             self._blocks.popleft()
             self._offered_sequence = None
@@ -97,11 +97,11 @@ class BlockQueue:
                 self._blocks.popleft()
 
     def queued(self, index: int) -> QueuedBlock | None:
-        """Return the block at place `index` of those waiting, the oldest at 0, if there is one."""
+        """Return the waiting block at `index`, 0 being the oldest, None if there is none."""
         return self._blocks[index] if index < len(self._blocks) else None
 
     def offer(self) -> QueuedBlock | None:
-        """Return the oldest block, which stays until acknowledged."""
+        """Return the oldest block, which is kept until acknowledged."""
         if not self._blocks:
             return None
         self._offered_sequence = self._blocks[0].sequence

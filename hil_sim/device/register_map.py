@@ -16,7 +16,7 @@ _U32 = 0xFFFF_FFFF
 
 
 class DeviceRegisters:
-    """Reads and writes of registers, carried out on one device."""
+    """Reads and writes of registers, executed on one device."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -24,7 +24,7 @@ class DeviceRegisters:
         self._refusal = Refused(Refusal.NONE)
 
     def read(self, client: object, address: int, count: int) -> bytes:
-        """Return the bytes of `count` registers; raises Refused for a span that is none."""
+        """Return the bytes of `count` registers; raises Refused for an invalid span."""
         device = self._device
         if address == reg.BLOCK.address and count == device.layout.words:
             return device.read_block(client)
@@ -40,7 +40,7 @@ class DeviceRegisters:
         raise Refused(Refusal.NO_SUCH_REGISTER)
 
     def write(self, client: object, address: int, data: bytes) -> None:
-        """Write the registers in `data` from `address` on; raises Refused, changing nothing."""
+        """Write the registers in `data` from `address` on; raises Refused without any change."""
         words = np.frombuffer(data, ">u2").astype(np.uint16)
         try:
             self._write(client, address, words)
@@ -121,7 +121,7 @@ class DeviceRegisters:
 
     def _control(self) -> bytes:
         device = self._device
-        # The registers that command something read as 0; stream reads as its state.
+        # Command registers read as 0; stream reads as its state.
         return struct.pack(
             ">7H",
             device.acknowledged,

@@ -1,4 +1,4 @@
-"""The simulated bench behind Modbus RTU: a `Device` at the far end of a pseudo-terminal.
+"""The simulated bench on Modbus RTU: a `Device` behind a pseudo-terminal.
 
 Frames are device address, function, data, CRC-16 (Modbus over Serial Line, section 2.5.1). A frame
 that is damaged or for another address gets no answer, as on a real line.
@@ -29,33 +29,33 @@ _FIXED: Final = {3: 8, 4: 8, 6: 8}  # whole length of requests without a byte co
 _COUNTED: Final = {
     16: (6, 9),
     23: (10, 13),
-}  # where the byte count stands, length without its bytes
+}  # position of the byte count, length without its bytes
 _BY_FUNCTION: Final = {request.function_code: request for request in REQUESTS}
 
 
 class _LineSession:
-    """What a serial line is to the device: one host for ever, whose end nothing announces."""
+    """The device's client on a serial line: one permanent host, whose end is not detectable."""
 
     def __init__(self, device: Device) -> None:
         self.registers = DeviceRegisters(device)
 
 
 class RtuLine:
-    """A serial line whose registers are one device's; `endpoint` is its other end."""
+    """A serial line with one device's registers; `endpoint` is its other end."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
         self._session = _LineSession(device)
         self._master, slave = pty.openpty()
         tty.setraw(slave)
-        self._slave = slave  # held open: a host that closes its end must not end ours
+        self._slave = slave  # held open, so that a host that closes its end does not end the line
         os.set_blocking(self._master, False)
         self.endpoint = f"modbus-rtu://{os.ttyname(slave)}"
         self._received = b""
         self._last_byte = 0.0
 
     def attach(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Answer what arrives, on this event loop."""
+        """Answer requests on this event loop."""
         self._loop = loop
         loop.add_reader(self._master, self._arrived)
 
@@ -85,7 +85,7 @@ class RtuLine:
     def _answer(self, frame: bytes) -> None:
         if self._device.boots:
             return
-        if not sound(frame):
+        if not checksum_matches(frame):
             logger.debug("a damaged frame of %d bytes is left unanswered", len(frame))
             self._received = b""
             return
@@ -107,9 +107,9 @@ class RtuLine:
 
 
 def frame_length(data: bytes) -> int | None:
-    """Return the whole length [bytes] of the request that begins `data`, None if not known yet.
+    """Return the length [bytes] of the request that begins `data`, None if not known yet.
 
-    A function that no request has is taken as the shortest frame.
+    An unknown function is taken as the shortest frame.
     """
     if len(data) < 2:
         return None
@@ -124,8 +124,8 @@ def checksum(data: bytes) -> bytes:
     return FramerRTU.compute_CRC(data).to_bytes(2, "big")
 
 
-def sound(frame: bytes) -> bool:
-    """Return whether a frame's checksum is right."""
+def checksum_matches(frame: bytes) -> bool:
+    """Return whether a frame's checksum is correct."""
     return frame[-2:] == checksum(frame[:-2])
 
 

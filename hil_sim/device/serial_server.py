@@ -1,7 +1,6 @@
-"""The simulated bench on a serial line: a `Device` behind a pty, until told to end.
+"""The simulated bench on a serial line: a `Device` behind a pty, until a signal.
 
-When the last program closes the port, the device notices as one that watches DTR would: its
-host is lost.
+When the last program closes the port, the device counts its host as lost, as if by DTR.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def serve_port(
 ) -> None:
     """Serve a device on a pty until `ended` is not empty, or process `parent` has ended.
 
-    Whoever else has the device takes `lock`, which is held here but while waiting for bytes.
+    `lock` is held except while waiting for bytes, for other users of the device.
     """
     lock = lock or nullcontext()
     session = SerialSession(device)

@@ -8,19 +8,19 @@ from rig.model.wire.frames import FrameDecoder, encode_frame
 
 
 class SerialSession:
-    """A `MessageSession` behind the frames of a serial line."""
+    """A `MessageSession` with frames of a serial line."""
 
     def __init__(self, device: Device) -> None:
         self._session = MessageSession(device)
         self._decoder = FrameDecoder()
 
     def receive(self, data: bytes) -> bytes:
-        """Carry out what `data` completes; returns the answers."""
+        """Execute the messages that `data` completes; return the answers."""
         answers = map(self._session.receive, self._decoder.feed(data))
         return b"".join(encode_frame(answer) for answer in answers if answer is not None)
 
     def push(self) -> bytes:
-        """Return the frame of the next block that may be sent, nothing if none may."""
+        """Return the frame of the next block if it may be sent, else nothing."""
         block = self._session.push()
         return b"" if block is None else encode_frame(block)
 

@@ -1,4 +1,4 @@
-"""The simulated bench as a server: a `Device` behind a wire, until told to end."""
+"""The simulated bench as a server: a `Device` behind a wire, until a signal."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ CAN: Final = "can"
 SLCAN: Final = "can-slcan"
 VALVES: Final = "canopen-408"  # always in real time: the host is the sample clock
 WIRES: Final = (TCP, RTU, SERIAL, CAN, SLCAN, VALVES)
-BITRATE: Final = 1_000_000  # of the simulated bus, where nothing else is said
+BITRATE: Final = 1_000_000  # of the simulated bus by default
 
 
 class _Connection(ServerRequestHandler):
-    """One connection, which answers requests as they arrive, in order, several at once or not.
+    """One connection, which answers requests in order as they arrive, possibly several at once.
 
-    The library hands every request to another turn of the event loop, by a write to a pipe of its
-    own: more work than the answer, and a second request of the same segment would be lost by it.
+    The library would handle every request in another iteration of the event loop, which takes
+    longer than the answer, and would lose a second request of the same segment.
     """
 
     def __init__(self, server: BenchServer, device: Device, registers: DeviceRegisters) -> None:
@@ -72,7 +72,7 @@ class _Connection(ServerRequestHandler):
         self.registers = registers
 
     def data_received(self, data: bytes) -> None:
-        """Answer every whole request that has arrived; keep what is not whole yet."""
+        """Answer every complete request; keep an incomplete one."""
         waiting = self.recv_buffer + data
         used = 1
         while waiting and used:
@@ -82,7 +82,7 @@ class _Connection(ServerRequestHandler):
         self._device.prefetch()
 
     def _answer_first(self, data: bytes) -> int:
-        """Answer the request that begins `data`; returns its bytes, 0 while it is not whole."""
+        """Answer the request that begins `data`; return its length, 0 while it is incomplete."""
         try:
             used, request = self.framer.handleFrame(data, 0, 0)
         except ModbusIOException as error:
@@ -107,7 +107,7 @@ class _Connection(ServerRequestHandler):
         return used
 
     def _connection(self, connected: bool) -> None:
-        """Pass the end of the connection on; a device that boots takes none."""
+        """Pass the end of the connection on; a booting device accepts none."""
         if not connected:
             self._device.disconnected(self)
         elif self._device.boots:
@@ -115,10 +115,10 @@ class _Connection(ServerRequestHandler):
 
 
 class BenchServer(ModbusTcpServer):
-    """A Modbus TCP server whose registers are one device's."""
+    """A Modbus TCP server with one device's registers."""
 
     def __init__(self, device: Device, host: str, port: int) -> None:
-        # The library wants a store; none of its registers is ever read.
+        # The library requires a store, which is not used.
         store = SimDevice(0, simdata=SimData(0, values=0, datatype=DataType.REGISTERS))
         super().__init__(store, address=(host, port), custom_pdu=REQUESTS)
         self._address = (host, port)
@@ -127,7 +127,7 @@ class BenchServer(ModbusTcpServer):
         self._registers = DeviceRegisters(device)
 
     async def listen(self) -> bool:
-        """Open the socket; raises EndpointError with the reason, where the library only says no."""
+        """Open the socket; raises EndpointError with the reason, which the library omits."""
         host, port = self._address
         self.is_closing = False
         self.is_listener = True
@@ -152,7 +152,7 @@ class BenchServer(ModbusTcpServer):
 
     @property
     def endpoint(self) -> str:
-        """Where it really listens: ``modbus-tcp://127.0.0.1:40213``."""
+        """The actual endpoint: ``modbus-tcp://127.0.0.1:40213``."""
         host, port = self.transport.sockets[0].getsockname()[:2]  # type: ignore[attr-defined]
         return f"modbus-tcp://{host}:{port}"
 
@@ -226,7 +226,7 @@ def serve(
             faults=faults,
         )  # fmt: skip
         return
-    # The library's messages are about frames; what matters to people is raised or logged here.
+    # The library logs frames only; errors of use are raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
     async def on_wire(stop: asyncio.Event, device: Device) -> None:
@@ -240,7 +240,7 @@ def serve(
 
 
 def warm_up(rig: Rig, spare: PlantInterface) -> None:
-    """Run one block on a plant that is not served, so that whatever compiles has compiled."""
+    """Run one block on a spare plant, to compile everything in advance."""
     table = LawTable(rig)
     spare.advance(reg.block_layout(len(rig.channels), len(rig.joints)).samples, table.active)
 
@@ -265,7 +265,7 @@ async def _serve(
 
 
 async def _end_with(parent: int, stop: asyncio.Event) -> None:
-    """Set `stop` when process `parent` is gone."""
+    """Set `stop` when process `parent` has ended."""
     owner = ParentProcess(parent)
     while not stop.is_set():
         if owner.has_ended():

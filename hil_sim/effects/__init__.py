@@ -1,4 +1,4 @@
-"""The effects that a simulated bench may hide: one class each, found in the modules named here."""
+"""The effects that a simulated bench may have: one class each, in the modules named here."""
 
 from __future__ import annotations
 

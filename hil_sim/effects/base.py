@@ -1,8 +1,8 @@
-"""What every effect of the simulated bench is: frozen data, a place, and what it does to the plant.
+"""Base of the effects of the simulated bench: frozen data, a place, and changes of the plant.
 
-An effect is one class of a module of this package, found by itself (`hil_sim.effects.CLASSES`).
-`where` is ``joint I``, ``bench`` or ``joint I cap|rod``; effects of measurement name a channel.
-Quantities are SI.
+An effect is one class of a module of this package, discovered automatically
+(`hil_sim.effects.CLASSES`). `where` is ``joint I``, ``bench`` or ``joint I cap|rod``; effects of
+measurement name a channel. Quantities are SI.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def in_unit(si: str) -> BeforeValidator:
 
 
 def read_with_unit(value: Any, si: str) -> float:
-    """Read a file's value in the SI unit `si`; raises UnitError where the unit is missing."""
+    """Read a file's value in the SI unit `si`; raises UnitError without a unit."""
     if not isinstance(value, str):
         raise UnitError(f"{value!r} has no unit; write one beside the number, like '1 {si}'")
     return parse_quantity(value, si)
@@ -53,7 +53,7 @@ def with_units(read: Callable[[str], str]) -> Callable[[Any, ValidationInfo], An
 
 @dataclass(frozen=True)
 class Tables:
-    """The plant's tables while they are being made; the arrays are filled in place."""
+    """The plant's tables under construction; the arrays are filled in place."""
 
     rig: Rig
     joints: Table
@@ -67,12 +67,12 @@ _FORMS = {"bench": "bench", "joint": "joint I", "chamber": "joint I cap|rod"}
 
 
 class PlantEffect(BaseModel):
-    """One effect: where it can be, how it is drawn at random, what it does to the tables.
+    """One effect: possible places, random ranges, changes of the tables.
 
     `places` are the forms of place where it can be. `drawn_at` is where a random scenario puts it:
     ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); `sizes` are the ranges
-    [SI] of its keys, drawn evenly in their logarithm; keys in `signed` are drawn either way.
-    `forms` are the values of its key `form`: other physics of the same cause, the first by default.
+    [SI] of its keys, drawn log-uniformly; keys in `signed` have a random sign. `forms` are the
+    values of its key `form`: different physics of the same cause, the first by default.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -91,7 +91,7 @@ class PlantEffect(BaseModel):
 
     @property
     def place(self) -> str:
-        """Where it is, as text."""
+        """Its place, as text."""
         return str(getattr(self, "where", None) or getattr(self, "channel", ""))
 
     @property
@@ -102,7 +102,7 @@ class PlantEffect(BaseModel):
 
     @property
     def chamber(self) -> str | None:
-        """``cap``, ``rod`` or None for both or neither."""
+        """``cap``, ``rod``, or None for both or neither."""
         match = _WHERE.match(self.place)
         return match["chamber"] if match else None
 

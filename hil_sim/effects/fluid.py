@@ -16,7 +16,7 @@ ACCUMULATOR = 5e-3  # volume of oil as soft as the accumulator [m^3]
 
 
 class InternalLeakage(PlantEffect):
-    """Past the piston, cap to rod; in a bore worn about its middle, only there."""
+    """Leakage past the piston, cap to rod; in a bore worn around its middle, only there."""
 
     drawn_at = "joint"
     sizes: ClassVar = {"conductance": (5e-13, 3e-12)}
@@ -33,7 +33,7 @@ class InternalLeakage(PlantEffect):
 
 
 class ExternalLeakage(PlantEffect):
-    """From one chamber, or both, to tank."""
+    """Leakage from one chamber, or both, to tank."""
 
     drawn_at = "chamber"
     sizes: ClassVar = {"conductance": (5e-13, 3e-12)}
@@ -50,7 +50,7 @@ class ExternalLeakage(PlantEffect):
 
 
 class SupplySag(PlantEffect):
-    """A worse supply: less pump flow, a softer relief valve, a line that drops pressure."""
+    """A weak supply: less pump flow, a larger override of the relief valve, a line drop."""
 
     drawn_at = "bench"
     sizes: ClassVar = {"line_drop": (0.3e6, 1e6)}
@@ -59,7 +59,7 @@ class SupplySag(PlantEffect):
     forms = ("turbulent", "laminar", "accumulator")
     name: Literal["supply_sag"]
     where: str = "bench"
-    flow: Flow | None = Field(default=None, gt=0, description="what the pump still gives")
+    flow: Flow | None = Field(default=None, gt=0, description="flow that the pump delivers")
     override: Pressure | None = Field(default=None, gt=0, description="relief, cracking to full")
     line_drop: Pressure | None = Field(
         default=None, gt=0, description="between pump and valves at the rig's pump flow"
@@ -86,7 +86,8 @@ class SupplySag(PlantEffect):
             if self.form == "laminar":
                 t.bench["line_laminar"] = rated / self.line_drop
             elif self.form == "accumulator":
-                # Its gas yields: the manifold's pressure follows the line's within about 50 ms.
+                # Compliance of its gas: the manifold's pressure follows the line's within about 50
+                # ms.
                 t.bench["manifold_volume"] = ACCUMULATOR
 
 
@@ -132,7 +133,7 @@ class EntrainedAir(PlantEffect):
 
 
 class DeadVolume(PlantEffect):
-    """Oil between valve and chamber that the rig file does not know."""
+    """Oil between valve and chamber in addition to the rig file's volume."""
 
     drawn_at = "chamber"
     sizes: ClassVar = {"volume": (20e-6, 100e-6)}
@@ -148,7 +149,7 @@ class DeadVolume(PlantEffect):
 
 
 class ReturnLine(PlantEffect):
-    """A return line that holds back: no pressure at rest, this much at the rig's pump flow.
+    """A return line with a drop: none at rest, `drop` at the rig's pump flow.
 
     ``turbulent`` with the flow's square, ``laminar`` in proportion, ``filter`` half of each.
     """

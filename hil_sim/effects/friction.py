@@ -1,4 +1,4 @@
-"""Friction of the cylinders' seals: dry, levels by cause in one of four forms; viscous, by way."""
+"""Friction of the cylinders' seals: dry, in one of four forms; viscous, by direction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Drag = Annotated[float, in_unit("N*s/m")]
 Force = Annotated[float, in_unit("N")]
 ForcePerPressure = Annotated[float, in_unit("N/Pa")]
 PerLength = Annotated[float, in_unit("m^-1")]
-# The bristle's relaxation is kept below this rate [1/s] for the fixed step's sake.
+# Bound of the bristle's relaxation rate [1/s], for stability with the fixed step.
 BRISTLE_LIMIT = 8e3
 
 
@@ -42,7 +42,7 @@ class _Friction(PlantEffect):
         row["bristle_stiffness"] += force / self.presliding
         row["bristle_limit"] = BRISTLE_LIMIT
         if self.form == "bristle":
-            # Enough micro-damping that presliding does not ring, little against Fv G^-2.
+            # Enough micro-damping to prevent oscillation in presliding, little against Fv G^-2.
             row["bristle_damping"] += 2e-3 * force / self.presliding
 
 
@@ -105,7 +105,7 @@ class AsymmetricFriction(_Friction):
 
 
 class PressureDependentFriction(_Friction):
-    """Dry friction that grows with what the seals hold: coefficient (p_cap + p_rod)."""
+    """Dry friction proportional to the seals' pressures: coefficient (p_cap + p_rod)."""
 
     drawn_at = "joint"
     sizes: ClassVar = {"coefficient": (6e-6, 3e-5)}
@@ -120,10 +120,10 @@ class PressureDependentFriction(_Friction):
 
 
 class AsymmetricViscousFriction(PlantEffect):
-    """Viscous friction beyond the joint's that differs with direction.
+    """Viscous friction in addition to the joint's that differs with direction.
 
-    ``seal`` drags at the piston, ``bearing`` at the joint (by the same slopes at mid-stroke),
-    ``thinning`` at the piston with a film that thins as it is sheared: c v / (1 + |v| / 0.5 m/s).
+    ``seal`` acts at the piston, ``bearing`` at the joint (by the same slopes at mid-stroke),
+    ``thinning`` at the piston with a film that thins with shear: c v / (1 + |v| / 0.5 m/s).
     """
 
     drawn_at = "joint"

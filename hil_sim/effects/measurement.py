@@ -1,4 +1,4 @@
-"""Effects of measurement: a channel that is late or lags, a wrong gain, an offset, cross-talk."""
+"""Effects of measurement: delay or lag of a channel, wrong gain, offset, cross-talk."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class _Sensor(PlantEffect):
 
 
 class ChannelDelay(_Sensor):
-    """The channel lags the world by this much more."""
+    """The channel is delayed by `time` in addition to the rig file's delay."""
 
     drawn_at = "pressure"
     sizes: ClassVar = {"time": (1e-3, 6e-3)}
@@ -75,7 +75,7 @@ class SensorOffset(_Sensor):
 
 
 class SensorLag(_Sensor):
-    """The channel follows the world behind a filter of this time constant.
+    """The channel passes a low-pass filter of this time constant.
 
     ``pole`` is one, ``poles`` are two equal ones of half of it each.
     """
@@ -95,10 +95,10 @@ class SensorLag(_Sensor):
 
 
 class SensorCrosstalk(_Sensor):
-    """The channel reads a share of another beside its own, in the ratio of their units.
+    """The channel reads a share of another in addition to its own, in the ratio of their units.
 
-    ``wire`` sees the other as it is, ``coupling`` what passes a capacitor: its quick part alone,
-    behind a slow filter of a second.
+    ``wire`` reads the other as it is, ``coupling`` through a capacitor: high-passed with a time
+    constant of a second.
     """
 
     drawn_at = "pressure"

@@ -89,9 +89,9 @@ class SpoolLag(PlantEffect):
 
 
 class SpoolHysteresis(PlantEffect):
-    """The metered opening follows the LVDT behind play of this width, half of it either way.
+    """The metered opening follows the LVDT with play of this width, half of it either way.
 
-    ``backlash`` is the play itself; ``friction`` a dry contact whose push grows with the travel
+    ``backlash`` is the play itself; ``friction`` a dry contact whose force grows with the travel
     since the last reversal, over a third of the width (no corner).
     """
 

@@ -1,9 +1,9 @@
-"""What every fault of the simulated bench is: frozen data, when it acts, and what it then does.
+"""Base of the faults of the simulated bench: frozen data, times, and actions.
 
-A fault breaks the bench while it runs, at `at` seconds of the device's time, and mends at `until`
-(never, where none is given). It is one class of a module of this package. Ways to act: on the
-plant's tables (`begin` changes them, what it returns mends them), on the converter codes of a
-block (`distort`), on the device (`hil_sim.faults.device`), on frames (`hil_sim.faults.wire`).
+A fault begins at `at` seconds of the device's time and ends at `until` (never, if not given). It is
+one class of a module of this package. It acts on the plant's tables (`begin` changes them and
+returns a function that restores them), on the converter codes of a block (`distort`), on the device
+(`hil_sim.faults.device`), or on frames (`hil_sim.faults.wire`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Mend = Callable[[], None]
 
 
 class Fault(BaseModel):
-    """One fault: its name, and when it acts [s of the device's time]."""
+    """One fault: its name, and its times [s of the device's time]."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -45,25 +45,25 @@ class Fault(BaseModel):
 
     @property
     def place(self) -> str:
-        """Where it is, as text."""
+        """Its place, as text."""
         return str(getattr(self, "where", None) or getattr(self, "channel", None) or "bench")
 
     def begin(self, tables: Tables) -> Mend | None:
-        """Change the plant's tables; returns what mends them, None where nothing was changed."""
+        """Change the plant's tables; return a function that restores them, None if unchanged."""
         return None
 
     def distort(
         self, codes: Codes, last: Codes, seconds: NDArray[np.float64], rig: Rig,
         rng: np.random.Generator,
     ) -> None:  # fmt: skip
-        """Change codes (n, channels) in place; `last` (channels,) stood before the fault began.
+        """Change codes (n, channels) in place; `last` (channels,) are those before the fault began.
 
-        `seconds` (n,) have passed since then at each row.
+        `seconds` (n,) is the time since then at each row.
         """
 
 
 def changed(row: Any, field: str, value: float) -> Mend:
-    """Set a field of a table's row; returns what restores it."""
+    """Set a field of a table's row; return a function that restores it."""
     before = row[field].copy()
 
     def mend() -> None:

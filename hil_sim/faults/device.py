@@ -1,4 +1,4 @@
-"""Faults of the device's electronics: a restart, a clock that is wrong, a queue that runs over."""
+"""Faults of the device's electronics: a restart, a clock error, a queue overrun."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from rig.model.quantity import Ratio, Time
 
 
 class DeviceFault(Fault):
-    """A fault that the device itself carries out (`hil_sim.device.device`), at a block's end."""
+    """A fault that the device itself executes (`hil_sim.device.device`), at a block's end."""
 
     @property
     def place(self) -> str:
-        """Where it is."""
+        """Its place, as text."""
         return "device"
 
 
 class Reboots(DeviceFault):
-    """The device restarts: outputs zero, laws, waveforms and trips forgotten, counters at zero.
+    """The device restarts: outputs zero; laws, waveforms and trips lost; counters at zero.
 
-    It answers nothing for `boot` and ends its connections.
+    It does not answer for `boot` and ends its connections.
     """
 
     name: Literal["reboots"]
@@ -30,14 +30,14 @@ class Reboots(DeviceFault):
 
 
 class ClockDrift(DeviceFault):
-    """The device's sample clock runs fast by `rate` (slow if negative), in real time only."""
+    """The device's sample clock is fast by `rate` (slow if negative), in real time only."""
 
     name: Literal["clock_drift"]
     rate: Ratio = Field(default=1e-3, gt=-0.5, lt=1)
 
 
 class ClockJump(DeviceFault):
-    """The device's sample counter jumps by `step`, though no sample is missing."""
+    """The device's sample counter jumps by `step`, without a missing sample."""
 
     name: Literal["clock_jump"]
     step: Time = 0.1

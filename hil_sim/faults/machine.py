@@ -1,4 +1,4 @@
-"""Faults of the machine: a stuck spool, a burst hose, a pump that stops, a joint that gives way."""
+"""Faults of the machine: a stuck spool, a burst hose, a pump that stops, a joint that yields."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class JointFault(Fault):
 
 
 class ValveStuck(JointFault):
-    """The spool stays where it is, whatever the output."""
+    """The spool stays at its position, whatever the output."""
 
     name: Literal["valve_stuck"]
 
     def begin(self, tables: Tables) -> Mend:
-        """Let the spool move at no speed."""
+        """Set the spool's speed limit to zero."""
         return changed(tables.joints[self.joint : self.joint + 1], "spool_rate", 0.0)
 
 
@@ -60,7 +60,7 @@ class JointUnlocks(JointFault):
 
 
 class PumpOff(Fault):
-    """The pump stops, or gives only `flow`."""
+    """The pump stops, or delivers only `flow`."""
 
     name: Literal["pump_off"]
     flow: Flow = Field(default=0.0, ge=0)

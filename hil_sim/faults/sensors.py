@@ -1,4 +1,4 @@
-"""Faults of sensors and wiring, put into the converter codes that leave the bench."""
+"""Faults of sensors and wiring, applied to the converter codes of the bench."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class SensorStuck(ChannelFault):
 
 
 class SensorDrift(ChannelFault):
-    """The channel walks away by `rate` of its range a second."""
+    """The channel drifts by `rate` of its range a second."""
 
     name: Literal["sensor_drift"]
     rate: Ratio = Field(description="of the sensor's range per second, either way")
@@ -58,7 +58,7 @@ class SensorDrift(ChannelFault):
 
 
 class SensorNoise(ChannelFault):
-    """The channel is noisy: a normal deviation of `deviation` of its range."""
+    """The channel is noisy, with a standard deviation of `deviation` of its range."""
 
     name: Literal["sensor_noise"]
     deviation: Ratio = Field(gt=0)
@@ -86,7 +86,7 @@ class BrokenWire(ChannelFault):
 
 
 class SwappedChannels(Fault):
-    """Two channels of one kind are plugged in the wrong way round."""
+    """Two channels of one kind are connected the wrong way round."""
 
     name: Literal["swapped_channels"]
     channel: str

@@ -1,9 +1,8 @@
-"""Faults of the wire: what happens to the frames between host and device, whatever the wire is.
+"""Faults of the wire: changes of the frames between host and device, on any wire.
 
-A wire fault says what becomes of one frame: pieces of bytes, when each may go on, and whether the
-link ends. `hil_sim.link` carries it out on TCP, on pseudo-terminals and behind CAN adapters. `at`
-and `until` are seconds of the device's time; delays are of the wall's clock, as a host's patience
-is.
+A wire fault turns a frame into pieces of bytes, each with its time of release, and may end the
+link. `hil_sim.link` executes it on TCP, on pseudo-terminals and behind CAN adapters. `at` and
+`until` are seconds of the device's time; delays are by the wall clock, like a host's timeouts.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ TCP_SENDS_AGAIN: Final = 0.2  # [s]: the least time of Linux after which TCP doe
 
 
 class Release(Enum):
-    """What a piece waits for before it goes on."""
+    """The event that a piece waits for."""
 
     TIME = auto()  # its own wait
     NEXT_FRAME = auto()  # the next frame of its way, which it then follows
@@ -36,7 +35,7 @@ class Release(Enum):
 
 
 class End(Enum):
-    """Which part of the link a piece ends."""
+    """The part of the link that a piece ends."""
 
     NONE = auto()
     WAY = auto()
@@ -44,7 +43,7 @@ class End(Enum):
 
 
 class Carrier(Enum):
-    """What lies beneath the frames and deals with damaged ones."""
+    """The layer below the frames, which handles damaged ones."""
 
     LINE = auto()  # nothing: the damaged bytes arrive
     TCP = auto()  # its checksum and its sending again
@@ -53,7 +52,7 @@ class Carrier(Enum):
 
 @dataclass(frozen=True)
 class Piece:
-    """Bytes that go on together, `wait` [s] after their release; `end` acts when they have gone."""
+    """Bytes sent together, `wait` [s] after their release; `end` acts when they have been sent."""
 
     data: bytes
     wait: float = 0.0
@@ -62,7 +61,7 @@ class Piece:
 
 
 class WireFault(Fault):
-    """A fault that strikes frames: each with `probability`, at most `most` of them on each way."""
+    """A fault of frames: each with `probability`, at most `most` of them in each direction."""
 
     way: Literal["to host", "to device", "both"] = TO_HOST
     probability: Ratio = Field(default=1.0, gt=0, le=1)
@@ -70,23 +69,23 @@ class WireFault(Fault):
 
     @property
     def place(self) -> str:
-        """Which way the frames go that it strikes."""
+        """The direction of the frames that it affects."""
         return self.way
 
     def strikes(self, way: str) -> bool:
-        """Return whether it acts on the frames of a way."""
+        """Return whether it acts on the frames of a direction."""
         return self.way in (way, BOTH)
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Return what becomes of a frame."""
+        """Return the pieces that a frame becomes."""
         raise NotImplementedError
 
     def on(
         self, carrier: Carrier, frame: bytes, rng: np.random.Generator, error: bytes = b""
     ) -> Sequence[Piece]:
-        """Return what becomes of a frame by what lies beneath it.
+        """Return the pieces that a frame becomes on a carrier.
 
-        `error` is what a CAN adapter hands on for an error frame, nothing where it hands none on.
+        `error` is the text of a CAN adapter for an error frame, empty if it reports none.
         """
         del carrier, error
         return self.spoil(frame, rng)
@@ -98,23 +97,23 @@ class FrameLost(WireFault):
     name: Literal["frame_lost"]
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Let nothing go on."""
+        """Send nothing."""
         return ()
 
 
 class FrameLate(WireFault):
-    """The frame arrives `delay` late, and what follows it not before it."""
+    """The frame and all that follow it arrive `delay` late."""
 
     name: Literal["frame_late"]
     delay: Time = Field(default=0.05, gt=0)
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Hold the frame for a time."""
+        """Delay the frame."""
         return (Piece(frame, self.delay),)
 
 
 class LateAnswer(WireFault):
-    """The answer arrives after the host has asked again, before the answer to that request."""
+    """The answer arrives after the host has repeated its request, before the answer to that."""
 
     name: Literal["late_answer"]
 
@@ -129,17 +128,17 @@ class FrameDuplicated(WireFault):
     name: Literal["frame_duplicated"]
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Send the frame two times."""
+        """Send the frame twice."""
         return Piece(frame), Piece(frame)
 
 
 class FramesReordered(WireFault):
-    """The frame arrives behind the one after it."""
+    """The frame arrives after the next one."""
 
     name: Literal["frames_reordered"]
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Hold the frame until the next one has gone."""
+        """Hold the frame until the next one has been sent."""
         return (Piece(frame, release=Release.NEXT_FRAME),)
 
 
@@ -167,7 +166,7 @@ class FramesMerged(WireFault):
 
 
 class BitsFlipped(WireFault):
-    """Some `bits` of the frame, drawn at random, are turned.
+    """Some `bits` of the frame, drawn at random, are inverted.
 
     TCP's own checksum drops such a frame and sends it again; on a CAN bus the controllers drop it
     by its CRC and answer with an error frame. `past_checksum` lets it pass, as behind a gateway or
@@ -193,7 +192,7 @@ class BitsFlipped(WireFault):
         return (Piece(error),) if error else ()
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Turn bits, each in another place."""
+        """Invert bits, each in another place."""
         turned = bytearray(frame)
         count = min(self.bits, 8 * len(frame))
         for bit in rng.choice(8 * len(frame), size=count, replace=False):
@@ -202,7 +201,7 @@ class BitsFlipped(WireFault):
 
 
 class Stall(WireFault):
-    """Nothing passes for `time`, then everything that was held."""
+    """Nothing passes for `time`, then all held frames."""
 
     name: Literal["stall"]
     way: Literal["to host", "to device", "both"] = BOTH
@@ -215,29 +214,29 @@ class Stall(WireFault):
 
 
 class SlowConsumer(WireFault):
-    """The receiver takes no more than `rate` of bytes a second."""
+    """The receiver accepts no more than `rate` bytes a second."""
 
     name: Literal["slow_consumer"]
     rate: Annotated[float, in_unit("s^-1")] = Field(default=10_000.0, gt=0)
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Let the frame take its time."""
+        """Delay the frame by its length over the rate."""
         return (Piece(frame, len(frame) / self.rate),)
 
 
 class LinkHalfClosed(WireFault):
-    """One way of the link ends; the other one goes on."""
+    """One direction of the link ends; the other one continues."""
 
     name: Literal["link_half_closed"]
     most: int | None = Field(default=1, ge=1)
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """End the way instead of carrying the frame."""
+        """End the direction instead of sending the frame."""
         return (Piece(b"", end=End.WAY),)
 
 
 class LinkClosed(WireFault):
-    """The link ends in both ways, in the middle of a frame: a cable pulled out."""
+    """The link ends in both directions, in the middle of a frame, like a cable pulled out."""
 
     name: Literal["link_closed"]
     most: int | None = Field(default=1, ge=1)

@@ -1,1 +1,1 @@
-"""The wire between host and simulated device as a place of its own, where frames are spoiled."""
+"""The link between host and simulated device, with faults of frames."""

@@ -1,8 +1,8 @@
-"""Where a frame ends in a stream of bytes, for each kind of wire.
+"""The end of a frame in a stream of bytes, for each kind of wire.
 
-A cutter returns the length of the first whole frame of a buffer, 0 while it is not complete. On a
-CAN bus reached through an adapter, the adapter's text for a frame stands for the frame; the rest of
-its text is no traffic of the bus.
+A cutter returns the length of the first complete frame of a buffer, 0 while it is incomplete. On a
+CAN bus behind an adapter, the adapter's text for a frame counts as the frame; other texts are not
+traffic of the bus.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ _RTU_EXCEPTION: Final = 0x80
 
 
 def every_frame(frame: bytes) -> bool:
-    """Say that a frame is one of the wire, whatever it holds."""
+    """Return True: every frame is one of the wire."""
     del frame
     return True
 
 
 def no_error(frame: bytes) -> bytes:
-    """Return what arrives instead of a frame that a controller has dropped: nothing."""
+    """Return what replaces a frame that a controller has dropped: nothing."""
     del frame
     return b""
 
 
 @dataclass(frozen=True)
 class Framing:
-    """How the frames of each way are told apart, and what deals with damaged ones.
+    """How the frames of each direction are separated, and the layer that handles damaged ones.
 
-    `on_wire` tells a frame of the wire from an adapter's own talk, which no fault strikes;
-    `carrier` is None where the link's own kind says what lies beneath; `error_of` returns what the
-    host's adapter says of a frame that its controller has dropped.
+    `on_wire` separates frames of the wire from an adapter's own messages, which no fault affects;
+    `carrier` is None if it follows from the kind of link; `error_of` returns the host adapter's
+    text for a frame that its controller has dropped.
     """
 
     to_device: Cutter
@@ -82,13 +82,13 @@ def socketcand_text(data: bytes) -> int:
 
 
 def socketcand_frame(text: bytes) -> bool:
-    """Say whether a text of socketcand is a frame of the bus."""
+    """Return whether a text of socketcand is a frame of the bus."""
     return text.split()[:2] in ([b"<", b"frame"], [b"<", b"send"])
 
 
 def socketcand_error(text: bytes) -> bytes:
     """Return socketcand's text of an error frame, as candump shows one: class ``bus error``."""
-    return b"< error 00000088 %s >" % text.split()[3]  # at the time of the frame it is in place of
+    return b"< error 00000088 %s >" % text.split()[3]  # at the time of the frame that it replaces
 
 
 def slcan_text(data: bytes) -> int:
@@ -98,7 +98,7 @@ def slcan_text(data: bytes) -> int:
 
 
 def slcan_frame(text: bytes) -> bool:
-    """Say whether a text of an slcan adapter is a frame of the bus."""
+    """Return whether a text of an slcan adapter is a frame of the bus."""
     return text[:1] in (b"t", b"T", b"d", b"D", b"b", b"B")
 
 

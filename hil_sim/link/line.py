@@ -1,4 +1,4 @@
-"""A faulty link on a serial line: a pseudo-terminal before the device's own."""
+"""A faulty link on a serial line: a pseudo-terminal in front of the device's own."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from hil_sim.link.frames import Framing
 from hil_sim.link.link import FaultyLink
 
 _CHUNK: Final = 65_536
-_UNPLUGGED_SECONDS: Final = 0.01  # between two looks for a host while there is none
+_UNPLUGGED_SECONDS: Final = 0.01  # between two checks for a host
 
 
 class LineLink(FaultyLink):
-    """A pty whose name outlives a pulled plug: a link in a folder, as udev makes them by id.
+    """A pty with a permanent name: a symbolic link in a folder, like udev's links by id.
 
     A host that opens it opens the device's line at `target`, ``serial:///dev/pts/3``, and closes it
-    by closing. On a line one way that ends is silent, both that end unplug the host's side.
+    by closing. One direction that ends is silent; if both end, the host's side is unplugged.
     """
 
     def __init__(
@@ -50,11 +50,11 @@ class LineLink(FaultyLink):
 
     @property
     def endpoint(self) -> str:
-        """Where the host reaches the device through this link."""
+        """The host's endpoint of this link."""
         return self._endpoint
 
     def use(self, faults: Sequence[WireFault]) -> None:
-        """Do other things to frames from now on; a way that had ended is mended."""
+        """Replace the faults from now on; an ended direction is restored."""
         super().use(faults)
         self._to_device.mend()
         self._to_host.mend()
@@ -128,7 +128,7 @@ class LineLink(FaultyLink):
     def _unplug(self) -> None:
         self._close_device()
         old = self._line
-        self._plug_in()  # first, so that the name leads somewhere at every moment
+        self._plug_in()  # first, so that the name is always valid
         old.close()
 
     def _hang_up(self) -> None:

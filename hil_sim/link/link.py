@@ -1,7 +1,7 @@
-"""A link that stands between a host and a device and does to their frames what its faults say.
+"""A link between a host and a device that applies faults to their frames.
 
-One thread carries both ways. What it needs of a kind of wire is a class with its sockets or
-terminals (`hil_sim.link.tcp`, `hil_sim.link.line`; `hil_sim.link.wires` lists them).
+One thread serves both directions. Each kind of wire has a class with its sockets or terminals
+(`hil_sim.link.tcp`, `hil_sim.link.line`; `hil_sim.link.wires` lists them).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hil_sim.link.way import FaultInjector, Way
 
 logger = logging.getLogger(__name__)
 
-LONGEST_WAIT: Final = 0.05  # [s] of one wait for bytes: what another thread asks for waits so long
+LONGEST_WAIT: Final = 0.05  # [s] of one wait for bytes: longest delay of another thread's request
 _END_SECONDS: Final = 5.0
 
 
@@ -55,11 +55,11 @@ class FaultyLink(ABC):
     @property
     @abstractmethod
     def endpoint(self) -> str:
-        """Where the host reaches the device through this link."""
+        """The host's endpoint of this link."""
 
     @abstractmethod
     def _step(self) -> None:
-        """Carry what there is to carry, waiting for it at most `LONGEST_WAIT`."""
+        """Transfer pending bytes, waiting at most `LONGEST_WAIT` for them."""
 
     @abstractmethod
     def _hang_up(self) -> None:
@@ -67,16 +67,16 @@ class FaultyLink(ABC):
 
     @abstractmethod
     def _end(self) -> None:
-        """Give back what the link holds of the system."""
+        """Release the link's resources."""
 
     @property
     def injected(self) -> Counter[str]:
-        """How many frames each fault has struck."""
+        """The number of frames changed by each fault."""
         first, second = self._injectors
         return first.counts + second.counts
 
     def use(self, faults: Sequence[WireFault]) -> None:
-        """Do other things to frames from now on; without any the link is healthy."""
+        """Replace the faults from now on; without any the link is healthy."""
         for injector in self._injectors:
             injector.use(faults)
 
@@ -102,7 +102,7 @@ class FaultyLink(ABC):
         self._thread.start()
 
     def _ways(self) -> tuple[Way, Way]:
-        """Return the ways of a new connection: to the device, to the host."""
+        """Return the directions of a new connection: to the device, to the host."""
         to_device, to_host = self._injectors
         framing = self._framing
         on_wire = framing.on_wire

@@ -1,4 +1,4 @@
-"""A device served in a thread of this process, behind a link whose faults can be changed."""
+"""A device served in a thread of this process, behind a link with changeable faults."""
 
 from __future__ import annotations
 
@@ -26,16 +26,15 @@ SERVED: Final = (
     SERIAL,
     CAN,
     SLCAN,
-)  # wires that a device and a faulty link stand on here
-_SECONDS: Final = 60.0  # nothing here takes that long; a hang ends in an error
+)  # wires with both a device and a faulty link here
+_SECONDS: Final = 60.0  # [s] longer than any call here; a hang ends in an error
 
 
 class ServedDevice:
-    """A device behind a wire, for benches that look into the device while a host drives it.
+    """A device behind a wire, for tests that inspect the device while a host drives it.
 
-    `link` is what the host reaches it by (`link.endpoint`); `inside` makes a call while the
-    device rests. A context manager that ends both. Raises EndpointError for a wire other than
-    those of `SERVED`.
+    `link.endpoint` is the host's endpoint; `inside` makes a call while the device rests. A context
+    manager that ends both. Raises EndpointError for a wire other than those of `SERVED`.
     """
 
     def __init__(
@@ -61,11 +60,11 @@ class ServedDevice:
 
     @property
     def deserted(self) -> bool:
-        """Whether no program has the bus open: a node of a bus notices by its watchdog only."""
+        """Whether no program has the bus open; a node detects this by its watchdog only."""
         return self._adapter is not None and not self._adapter.attended
 
     def inside(self, call: Callable[[], Answer]) -> Answer:
-        """Make a call in between what the device does for its host."""
+        """Make a call between the device's actions for its host."""
         loop = self._loop
         if loop is None:
             with self._lock:

@@ -1,4 +1,4 @@
-"""A faulty link over TCP: any number of connections, each carried on to the device."""
+"""A faulty link over TCP: any number of connections, each forwarded to the device."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ _CHUNK: Final = 65_536
 _ADDRESS: Final = re.compile(
     r"[^/]+:\d+"
 )  # in modbus-tcp://HOST:PORT, can://socketcand/HOST:PORT/can0
-_SEND_SECONDS: Final = 1.0  # that an end which does not read may take before its link ends
+_SEND_SECONDS: Final = 1.0  # [bytes] buffered for an end that does not read, before its link ends
 
 
 @dataclass(eq=False)
 class _Side:
-    """One end of a connection: its socket, what it sends away, and what is sent to it."""
+    """One end of a connection: its socket, its outgoing and its incoming bytes."""
 
     end: socket.socket
     sends: Way
     receives: Way
     other: _Side = field(init=False)
-    finished: bool = False  # it has said that nothing more comes
+    finished: bool = False  # it has closed its sending direction
 
 
 class TcpLink(FaultyLink):
-    """Listens on loopback, connects to the device at `target` for each host that comes."""
+    """Listens on loopback and connects to the device at `target` for each host."""
 
     beneath: ClassVar[Carrier] = Carrier.TCP
 
@@ -69,7 +69,7 @@ class TcpLink(FaultyLink):
 
     @property
     def endpoint(self) -> str:
-        """Where the host reaches the device through this link."""
+        """The host's endpoint of this link."""
         return self._endpoint
 
     def _step(self) -> None:
@@ -115,7 +115,7 @@ class TcpLink(FaultyLink):
             side.receives.other_way(now)
 
     def _send(self, side: _Side) -> None:
-        """Send on what `side` sent away and is due."""
+        """Forward the bytes of `side` that are due."""
         if side.end not in self._sides:
             return
         sink = side.other.end
@@ -130,7 +130,7 @@ class TcpLink(FaultyLink):
         except OSError:
             self._forget(side)
             return
-        # The end of one side is the end of the connection; half of it is a fault's doing.
+        # The end of one side ends the connection; a half-closed one is caused by a fault.
         if side.finished and side.sends.next_time() == math.inf:
             self._forget(side)
 

@@ -1,7 +1,7 @@
-"""One way of a link: frames in, spoiled pieces out, each at its time. No sockets, no clock.
+"""One direction of a link: frames in, changed pieces out, each at its time. No sockets, no clock.
 
-A *way* is one direction of one connection. Its fault injector exists as long as the link, so that a
-new connection does not meet the same faults again.
+A *way* is one direction of one connection. Its fault injector exists as long as the link, so that
+the faults of a new connection differ.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from hil_sim.link.frames import Cutter, every_frame, no_error
 logger = logging.getLogger(__name__)
 
 STREAM: Final = 4  # of a bench's seed; 0 to 3 are the plant's, drawn scenarios' and its faults'
-QUIET: Final = 0.02  # [s] after which bytes that are no whole frame go on as they are
-MOST_WAITING: Final = 8192  # bytes that a way holds before it takes no more
+QUIET: Final = 0.02  # [s] after which an incomplete frame is forwarded unchanged
+MOST_WAITING: Final = 8192  # bytes that a way buffers at most
 
 
 class FaultInjector:
-    """Draws, by a seed, which frames of one way are changed by which fault."""
+    """Draws, by a seed, the frames of one way that each fault changes."""
 
     def __init__(
         self,
@@ -44,14 +44,14 @@ class FaultInjector:
         self.use(faults)
 
     def use(self, faults: Sequence[WireFault]) -> None:
-        """Inject other faults from the next frame on; the count of each begins anew."""
+        """Inject other faults from the next frame on; their counts restart."""
         self._injected = Counter()
         self._faults = tuple(fault for fault in faults if fault.strikes(self.way))
 
     def inject(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
-        """Return what becomes of a frame at `seconds` of the device's time; one fault a frame.
+        """Return the pieces of a frame at `seconds` of the device's time; one fault per frame.
 
-        `error` is what the wire's adapter says instead of a frame that its controller has dropped.
+        `error` is the adapter's text for a frame that its controller has dropped.
         """
         for number, fault in enumerate(self._faults):
             until = math.inf if fault.until is None else fault.until
@@ -69,14 +69,14 @@ class FaultInjector:
 
 @dataclass(frozen=True)
 class _Due:
-    """A piece with the time [s of the wall clock] from which on it may go."""
+    """A piece with its earliest time of sending [s of the wall clock]."""
 
     at: float
     piece: Piece
 
 
 class Way:
-    """The frames of one direction of one connection, in order but where a fault says otherwise."""
+    """The frames of one direction of one connection, in order unless a fault changes it."""
 
     def __init__(
         self,
@@ -85,24 +85,24 @@ class Way:
         on_wire: Callable[[bytes], bool] = every_frame,
         error_of: Callable[[bytes], bytes] = no_error,
     ) -> None:
-        """Carry what `cut` cuts; faults change only what `on_wire` says is a frame of the wire."""
+        """Forward the frames that `cut` separates; faults affect only those with `on_wire` true."""
         self._injector, self._cut = injector, cut
         self._on_wire, self._error_of = on_wire, error_of
         self._buffer = b""
         self._last = 0.0
         self._ready: deque[_Due] = deque()
-        self._after_next: list[Piece] = []  # for the next frame to go first
-        self._held: list[_Due] = []  # to go in one piece with the next frame, or at their time
+        self._after_next: list[Piece] = []  # waiting for the next frame to be sent first
+        self._held: list[_Due] = []  # to be sent in one piece with the next frame, or at their time
         self._for_other_way: list[Piece] = []  # for the other way's next frame
         self.ended = False
 
     @property
     def full(self) -> bool:
-        """Whether so much waits that no more should be taken in."""
+        """Whether so much is buffered that no more should be read."""
         return sum(len(due.piece.data) for due in self._ready) > MOST_WAITING
 
     def take(self, data: bytes, now: float, seconds: float) -> int:
-        """Take bytes in; returns how many whole frames they completed."""
+        """Take bytes; return how many complete frames they contain."""
         self._buffer += data
         self._last = now
         frames = 0
@@ -112,16 +112,16 @@ class Way:
         return frames
 
     def other_way(self, now: float) -> None:
-        """Note a frame of the other way: late answers go on."""
+        """Note a frame of the other direction, which releases late answers."""
         late, self._for_other_way = self._for_other_way, []
         self._queue(late, now)
 
     def mend(self) -> None:
-        """Let a way that a fault has ended carry again."""
+        """Restore a way that a fault has ended."""
         self.ended = False
 
     def due(self, now: float) -> list[Piece]:
-        """Return the pieces that go now."""
+        """Return the pieces to be sent now."""
         quiet = bool(self._buffer) and now - self._last > QUIET
         while self._held and (quiet or self._held[0].at <= now):  # older than the buffer
             self._queue([replace(self._held.pop(0).piece, wait=0.0)], now)
@@ -134,7 +134,7 @@ class Way:
         return chunks
 
     def next_time(self) -> float:
-        """Return the earliest time [s] at which `due` may have something, inf if none is known."""
+        """Return the earliest time [s] of the next piece, inf if none is known."""
         times = [due.at for due in (*list(self._ready)[:1], *self._held[:1])]
         return min([*times, *([self._last + QUIET] if self._buffer else [])], default=math.inf)
 

@@ -1,4 +1,4 @@
-"""Which link stands on which kind of wire; a new kind is one line here."""
+"""The link of each kind of wire; a new kind is one line here."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hil_sim.link.tcp import TcpLink
 
 @dataclass(frozen=True)
 class WireKind:
-    """What carries a kind of wire, and how its frames are told apart."""
+    """The link class of a kind of wire, and its framing."""
 
     carrier: type[TcpLink] | type[LineLink]
     framing: Framing
@@ -59,8 +59,8 @@ def faulty_link(
 ) -> FaultyLink:
     """Return a link to the device at endpoint `target`; `seconds` is the device's time.
 
-    `port` is where it listens, on wires that have ports (0: any free one). Raises EndpointError
-    for a kind of wire that no link stands on, or a place that is taken.
+    `port` is its own port, on wires that have ports (0: any free one). Raises EndpointError for a
+    kind of wire without a link, or an occupied place.
     """
     kind = "can-slcan" if target.startswith(_SLCAN_ENDPOINT) else target.partition("://")[0]
     if kind not in WIRES:

@@ -1,4 +1,4 @@
-"""A plant that breaks while it runs: the faults of its scenario begin and end at their times."""
+"""A plant with faults of its scenario that begin and end at their times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STREAM: Final = 3  # of a bench's seed; 0 and 1 are the plant's, 2 is that of dr
 
 @dataclass
 class _Timed:
-    """A fault with its first and last tick, and what it has changed while it acts."""
+    """A fault with its first and last tick, and how to restore its changes while it acts."""
 
     fault: Fault
     first: int
@@ -29,7 +29,7 @@ class _Timed:
 
 
 class FaultyPlant:
-    """A `Plant` with the faults of a scenario; without any it is that plant."""
+    """A `Plant` with the faults of a scenario, equal to `Plant` without any."""
 
     def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
         self.plant = Plant(rig, scenario, seed)
@@ -64,11 +64,11 @@ class FaultyPlant:
         return np.concatenate(measured), np.concatenate(outputs)
 
     def mark(self) -> object | None:
-        """Return what `rewind` needs to come back to now; None with faults, which do not undo."""
+        """Return the state for `rewind`; None with faults, which cannot be undone."""
         return None if self._faults else self.plant.mark()
 
     def rewind(self, mark: object) -> None:
-        """Be as at the mark."""
+        """Restore the state of a mark."""
         self.plant.rewind(mark)
 
     def _until_next(self) -> int:

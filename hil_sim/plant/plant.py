@@ -1,6 +1,6 @@
 """The simulated bench: hydraulics, arm, valves and converters, one tick at a time.
 
-Deterministic for (rig, scenario, seed); how the ticks are divided into calls changes nothing.
+Deterministic for (rig, scenario, seed); it does not depend on the division of ticks into calls.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from rig.model.wire.codes import Array, Codes
 # Longest integration step [s]. plant_bench.accuracy gives 3e-7 of the pressures' range with it
 # (1e-7 at 1/6 ms, 8e-7 at 1/4 ms); the stiffest edge, wide open at an end stop, allows 1/4 ms.
 STEP = 2e-4
-DRAWN: Final = 256  # ticks of noise drawn at once, and kept for going back
+DRAWN: Final = 256  # ticks of noise drawn at once, and kept for `rewind`
 
 
 @dataclass(frozen=True)
 class Law:
-    """What one joint's output follows from the tick it is given on; all zeros closes the valve.
+    """The output law of one joint; all zeros closes the valve.
 
     v = clip(gain wave[(tick - start) mod period] + bias + position_gain (setpoint - s), +-limit)
     [V], s the piston as measured at that tick [m]; an empty wave adds nothing.
@@ -48,7 +48,7 @@ class Law:
 
 
 class Plant:
-    """A bench that owns its state; sample k is taken at time k / rig.sample_rate.
+    """A bench with its state; sample k is taken at time k / rig.sample_rate.
 
     Raises InputError for a rig without all parameters or a scenario that does not fit it.
     """
@@ -58,7 +58,7 @@ class Plant:
         self._rig = rig
         machine = load_machine(rig, scenario.parameters)
         self._truth = dict(machine.parameters)
-        # Streams of one seed: 0 sensor noise, 1 oil temperature; 2 is kept for drawn scenarios.
+        # Streams of one seed: 0 sensor noise, 1 oil temperature; 2 is reserved for drawn scenarios.
         self._noise = np.random.default_rng([seed, 0])
         self._tables = build(rig, machine, scenario, _periods(np.random.default_rng([seed, 1])))
         self._period = 1.0 / rig.sample_rate
@@ -70,7 +70,7 @@ class Plant:
         ring = ring_length(self._tables.channels, self._period)
         self._values, self._slopes = np.zeros((ring, self._width)), np.zeros((ring, self._width))
         self._fill_history()
-        # Compile (or load) the tick loop now: the first block asked for should not wait for it.
+        # Compile (or load) the tick loop now, so that the first block need not wait for it.
         self.advance(0, [Law()] * len(rig.joints))
 
     def advance(self, ticks: int, laws: Sequence[Law]) -> tuple[Codes, Codes]:
@@ -112,11 +112,11 @@ class Plant:
         return measured, outputs
 
     def mark(self) -> object:
-        """Return what `rewind` needs to come back to now."""
+        """Return the state for `rewind`."""
         return self.tick, [array.copy() for array in self._changing]
 
     def rewind(self, mark: Any) -> None:
-        """Be as at the mark, as if nothing had been computed since; the same noise comes again."""
+        """Restore the state of a mark, with the same noise from there on."""
         tick, before = mark
         self._used -= self.tick - tick
         self.tick = tick
@@ -125,13 +125,13 @@ class Plant:
 
     @property
     def _changing(self) -> tuple[NDArray[Any], ...]:
-        """What a tick changes in place; among the channels it is what their filters hold."""
+        """The arrays that a tick changes in place; of the channels the states of their filters."""
         return self._state, self._spool, self._values, self._slopes, self._tables.channels
 
     def _noise_of(self, ticks: int) -> Array:
         """Return the noise of the next `ticks` ticks, (ticks, channels).
 
-        What was drawn last is kept for as long as `rewind` may want it again.
+        The newest noise is kept as long as `rewind` may need it again.
         """
         first, last = self._used, self._used + ticks
         if last > len(self._draws):
@@ -150,12 +150,12 @@ class Plant:
     def truth(self) -> dict[str, float]:
         """Return the true parameters [SI] by the names of rig.model.parameters.
 
-        They are the machine's with the scenario's overrides; effects (a payload) are not in them.
+        They are the machine's with the scenario's overrides, without effects such as a payload.
         """
         return dict(self._truth)
 
     def snapshot(self) -> dict[str, Array]:
-        """Return the true state now [SI], for tests and figures; it never crosses the wire.
+        """Return the present true state [SI], for tests and figures; not available over a wire.
 
         Per joint, (N,): angle, rate, piston, speed, cap_pressure, rod_pressure, spool, opening,
         bristle; of the bench, (): supply_pressure, port_pressure, tank_pressure, oil_temperature.

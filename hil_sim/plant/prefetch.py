@@ -1,8 +1,8 @@
-"""A plant that is computed ahead between requests, and set back where the laws changed.
+"""A plant that is computed ahead between requests, and rewound if the laws change.
 
-In virtual time the next block is all but certain: the laws stay as they are. So it is computed
-while the host works on the block before it. It is used only if it is what would be
-computed then; otherwise the plant is set back, and nothing shows that it ever went ahead.
+In virtual time the next block almost always has the same laws, so that it is computed while the
+host works on the previous one. If the laws change, the plant is rewound before it runs, so that
+results do not depend on this.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Codes = NDArray[np.int64]
 
 @runtime_checkable
 class Rewindable(Protocol):
-    """A plant that can be set back to where it was."""
+    """A plant with a state that can be restored."""
 
     @property
     def tick(self) -> int:
@@ -29,14 +29,14 @@ class Rewindable(Protocol):
         """Run `ticks` samples; return AD codes (ticks, channels), DA codes (ticks, joints)."""
 
     def mark(self) -> object | None:
-        """Return what `rewind` needs to come back to now; None where it cannot."""
+        """Return the state for `rewind`; None if it cannot be restored."""
 
     def rewind(self, mark: object) -> None:
-        """Be as at the mark, as if nothing had been computed since."""
+        """Restore the state of a mark."""
 
 
 class Prefetch:
-    """A plant with the block that will be asked for next, as far as anybody knows."""
+    """A plant with the block that is probably requested next."""
 
     def __init__(self, plant: Rewindable) -> None:
         self._plant = plant
@@ -46,16 +46,16 @@ class Prefetch:
 
     @property
     def tick(self) -> int:
-        """Samples measured so far; those computed ahead are not."""
+        """Samples measured so far, without those computed ahead."""
         return self._plant.tick - (0 if self._block is None else len(self._block[0]))
 
     def prefetch(self, ticks: int, laws: Sequence[Any]) -> None:
-        """Compute the next `ticks` samples under `laws`, unless that is done or impossible."""
+        """Compute the next `ticks` samples under `laws`, unless done already or impossible."""
         if self._block is not None or (mark := self._plant.mark()) is None:
             return
         try:
             ahead = self._plant.advance(ticks, laws)
-        except Exception:  # raised again when the samples are asked for
+        except Exception:  # raised again when the samples are requested
             self._plant.rewind(mark)
             return
         self._mark, self._laws, self._block = mark, tuple(laws), ahead

@@ -1,9 +1,8 @@
-"""What the bench's converters see: one row per channel for the compiled tick loop.
+"""Inputs of the bench's converters: one row per channel for the compiled tick loop.
 
 Channel k of `rig.channels` is converted k skews after the tick (the multiplexer runs ahead of the
-tick: along the tangent of the true signal), and shows the world as it was `delay` before that
-(cubic Hermite through earlier ticks). Then gain, offset, noise, and the converter code
-(`rig.model.wire.codes`).
+tick: along the tangent of the true signal), and shows the signal `delay` before that (cubic Hermite
+through earlier ticks). Then gain, offset, noise, and the converter code (`rig.model.wire.codes`).
 """
 
 from __future__ import annotations

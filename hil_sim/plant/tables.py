@@ -1,4 +1,4 @@
-"""From rig, machine and scenario to the flat tables of the compiled plant."""
+"""The compiled plant's tables from rig, machine and scenario."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def build(
 ) -> Tables:
     """Return the plant's tables; `periods` holds the oil temperature's periods and phases.
 
-    Raises InputError for effects at places the rig has not and for impossible parameters.
+    Raises InputError for effects at places that the rig lacks and for impossible parameters.
     """
     check_fits(scenario, rig)
     _refuse_impossible(machine.parameters)

@@ -1,1 +1,1 @@
-"""What is true of a simulated bench: its machine file, and the effects that a scenario hides."""
+"""The hidden properties of a simulated bench: its machine file, and the effects of a scenario."""

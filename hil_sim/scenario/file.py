@@ -1,4 +1,4 @@
-"""What is wrong with the bench today: a scenario file of effects, none of which the analysis sees.
+"""Scenario files: effects and faults of a simulated bench, unknown to the analysis.
 
     effects:
       - {name: coulomb_friction, where: joint 2, force: 80 N}
@@ -9,8 +9,8 @@
       - {name: frame_lost, probability: 0.01, at: 5 s, until: 20 s}
     noise: 0.5                   # of what the rig's sensors state
 
-`Scenario()` is a bench with nothing wrong. Names are those of CONTRACT, "Effects"; their forms
-here are the simulator's own (LuGre, rounded edges, lagging supply), finer than a regressor.
+`Scenario()` is a bench without effects and faults. Names are those of CONTRACT, "Effects"; their
+forms here are the simulator's own (LuGre, rounded edges, lagging supply), finer than a regressor.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Scenario(BaseModel):
 
     @property
     def wire_faults(self) -> tuple[WireFault, ...]:
-        """The faults that strike frames between host and device."""
+        """The faults of frames between host and device."""
         return tuple(fault for fault in self.faults if isinstance(fault, WireFault))
 
     @property
@@ -64,7 +64,7 @@ class Scenario(BaseModel):
         seen = set()
         for effect in value:
             if (effect.name, effect.place) in seen:
-                raise ValueError(f"{effect.name} at {effect.place} stands here a second time")
+                raise ValueError(f"{effect.name} at {effect.place} occurs twice")
             seen.add((effect.name, effect.place))
         return value
 
@@ -76,13 +76,13 @@ def _unit_of(name: str) -> str:
 
 
 def shipped_scenarios() -> tuple[str, ...]:
-    """Name the scenarios that come with the simulator."""
+    """Return the names of the shipped scenarios."""
     folder = resources.files("hil_sim") / "scenarios"
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
 
 
 def load_shipped(name: str) -> Scenario:
-    """Return a scenario that comes with the simulator."""
+    """Return a shipped scenario."""
     source = f"{name}.yaml"
     path = resources.files("hil_sim") / "scenarios" / source
     return parse_scenario(path.read_text(encoding="utf-8"), source)

@@ -1,8 +1,8 @@
 """Scenarios drawn by a seed: the hidden effects of a bench.
 
-A draw is none, one or two effects of the simulator's list, or one that is made of its parts in a
-way no short formula describes (a spring that hardens steeply, seals as soft as a backlash).
-Places are even, sizes even in their logarithm over what such a bench may show.
+A draw is none, one or two effects of the simulator's list, or one with parts that no short formula
+describes (a spring that hardens steeply, seals as soft as a backlash). Places are drawn uniformly,
+sizes log-uniformly over realistic ranges.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hil_sim.scenario.file import Scenario, check_fits
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
-RANDOM: Final = "random"  # what a command line says instead of a file
+RANDOM: Final = "random"  # the word on a command line instead of a file
 STREAM: Final = 2  # of a bench's seed; 0 and 1 are the plant's own
 NONE, ONE, TWO, NO_FORMULA = "none", "one", "two", "strange"
 SHARES: Final[Mapping[str, float]] = {NONE: 0.2, ONE: 0.4, TWO: 0.25, NO_FORMULA: 0.15}
@@ -34,7 +34,7 @@ NO_FORMULA_EFFECTS: Final[tuple[tuple[type[PlantEffect], Mapping[str, Size]], ..
 
 
 def draw(rig: Rig, seed: int) -> Scenario:
-    """Return the scenario that a bench of this seed hides; the same seed hides the same."""
+    """Return the scenario hidden by a bench of this seed; equal seeds return equal scenarios."""
     rng = np.random.default_rng([seed, STREAM])
     kind = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     effects: list[dict[str, Any]] = []

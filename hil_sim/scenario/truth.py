@@ -1,7 +1,7 @@
-"""What the simulated bench really is: its true parameters and the constants only a plant has.
+"""The true parameters of the simulated bench, and constants that only the plant needs.
 
 A shipped machine file `machines/<rig name>.yaml` holds them; a rig without one is built from its
-own `nominal` values. Nothing of this crosses the wire.
+own `nominal` values. None of this is sent over a wire.
 """
 
 from __future__ import annotations

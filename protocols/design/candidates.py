@@ -1,12 +1,11 @@
-"""Every lock-and-excite step that a rig of N joints allows within reason.
+"""The candidate lock-and-excite steps of a rig of N joints.
 
-One joint is excited. Joints below it (towards the base) only turn the whole arm: they stand at
-mid-stroke with closed valves, where gravity is as the linkage's middle has it. Joints beyond it
-set the inertia that the excited one feels: each stands at either end stop, held there by a push,
-or at mid-stroke by a closed valve.
+One joint is excited. Joints below it (towards the base) only rotate the whole arm: they are locked
+at mid-stroke with closed valves. Joints beyond it determine the inertia at the excited one: each is
+held by a push at either end stop, or at mid-stroke by a closed valve.
 
-Lower bound. A joint that moves alone feels one inertia, M_kk at the pose of the joints beyond it;
-a chain of N links has N (N + 1) / 2 inertia parameters. So no fewer than N (N + 1) / 2 such steps
+Lower bound. A joint that moves alone has one inertia, M_kk at the pose of the joints beyond it; a
+chain of N links has N (N + 1) / 2 inertia parameters. So no fewer than N (N + 1) / 2 such steps
 determine them all: 1, 3, 6, 10 steps for 1, 2, 3, 4 joints.
 """
 
@@ -36,7 +35,7 @@ def candidates(rig: Rig) -> tuple[Step, ...]:
 
 
 def _places(count: int) -> Iterator[tuple[str, ...]]:
-    """Yield where `count` joints stand, end stops first."""
+    """Yield the positions of `count` joints, end stops first."""
     for places in itertools.product((END_MIN, END_MAX, CLOSED), repeat=count):
         at_ends = sum(place != CLOSED for place in places)
         if count <= DESIGN.all_poses or at_ends <= DESIGN.displaced:
@@ -59,7 +58,7 @@ def _step(excited: int, beyond: tuple[tuple[int, str], ...], name: str) -> Step:
 
 
 def multisine(amplitude: float, seed: int, tilt: float = 0.4) -> Multisine:
-    """Return the shipped multisine: odd lines, 0.5 to 9.5 Hz, quarter of them left empty."""
+    """Return the shipped multisine: odd lines, 0.5 to 9.5 Hz, a quarter of them left empty."""
     return Multisine(
         kind="multisine", base_frequency=0.1, f_min=0.5, f_max=9.5, amplitude=amplitude,
         amplitude_is="rms", odd=True, detection_fraction=0.25, tilt=tilt, seed=seed,
@@ -74,7 +73,7 @@ def played(step: Step, amplitude: float, tilt: float, seed: int) -> Step:
 
 
 def described(step: Step) -> str:
-    """Say a step in words: "excite joint 1; joint 2 at end_min, joint 3 closed"."""
+    """Return a step in words: "excite joint 1; joint 2 at end_min, joint 3 closed"."""
     moving = ", ".join(f"joint {part.joint}" for part in step.excite)
     locks = sorted(step.lock, key=lambda lock: lock.joint)
     still = ", ".join(f"joint {lock.joint} {_at(lock)}" for lock in locks)

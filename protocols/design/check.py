@@ -1,10 +1,10 @@
 """Proves a plan against the rig's limits on a twin, before anything moves.
 
-The twin simulates commands; it is passed in, so that protocols and analysis stay apart. Further
-twins, with parameters within their intervals, widen each predicted range (`widened`), and limits
-are judged on the edge of what they span. Centring is idealised: the bias is sought on the twin
-until the piston no longer drifts, and its motion is then judged as if centred to within the offset
-that the protocol allows.
+The twin simulates commands; it is an argument, so that protocols and analysis stay independent.
+Further twins, with parameters within their intervals, widen each predicted range (`widened`), and
+limits are judged at the ends of these ranges. Centring is idealised: the bias is adjusted on the
+twin until the piston no longer drifts, and its motion is then judged as if centred to within the
+offset that the protocol allows.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Twin(Protocol):
     """Simulates commands (n, joints) [V] from pistons at `start` (joints,) [m].
 
     `locked` maps 0-based joints to the piston [m] they are held at. Returns `piston`, `speed`,
-    `cap_pressure`, `rod_pressure`, each (n, joints), and may return `valid` (n,), 0 from where
-    the state ceased to exist.
+    `cap_pressure`, `rod_pressure`, each (n, joints), and may return `valid` (n,), 0 after the
+    simulation failed.
     """
 
     def __call__(
@@ -65,8 +65,8 @@ def check(
 
     `draws` are twins within the uncertainty of `twin`; `progress` receives the
     share of the steps that is done, after each.
-    Raises InputError where the twin cannot follow the commands at all; whether limits are kept
-    is in the report.
+    Raises InputError where the twin cannot follow the commands at all; the report states whether
+    limits are kept.
     """
     seen: dict[Hashable, StepCheck] = {}
     steps = []
@@ -81,13 +81,13 @@ def check(
 
 
 def _content(step: StepPlan) -> Hashable:
-    """Return what the prediction of a step depends on."""
+    """Return the data that the prediction of a step depends on."""
     waves = tuple((e.joint, e.wave.samples.tobytes(), e.settings) for e in step.excite)
     return waves, step.locks, step.period, step.record
 
 
 def _timeline(plan: Plan) -> tuple[Moment, ...]:
-    """Return when each step begins if every condition comes at once."""
+    """Return the start of each step if every condition holds at once."""
     moments: list[Moment] = []
 
     def lay(parts: Sequence[PlannedStep], begins: float) -> None:
@@ -106,7 +106,7 @@ def check_step(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ())
     central = judge_motion(step, rig, centring.biases, centring.moved)
     others = []
     for draw in draws:
-        # The bench centres whatever it is; from the estimate's biases that takes one or two trials.
+        # The bench centres any machine, from the estimate's biases in one or two trials.
         other = _centred(step, rig, draw, centring)
         others.append(judge_motion(step, rig, other.biases, other.moved))
     return widened(central, others)
@@ -125,9 +125,9 @@ def judge_motion(
 
 @dataclass(frozen=True)
 class _Centred:
-    """Biases [V] that keep the pistons centred, and what was simulated with `tried` from `start`.
+    """Biases [V] that keep the pistons centred, and the simulation with `tried` from `start`.
 
-    `moved` is the last period's motion; `start` (joints,) are the pistons [m] it began from.
+    `moved` is the last period's motion; `start` (joints,) are the pistons [m] at its beginning.
     """
 
     biases: dict[int, float]
@@ -139,7 +139,7 @@ class _Centred:
 def centred(
     step: StepPlan, rig: Rig, twin: Twin
 ) -> tuple[dict[int, float], Mapping[str, Array]]:  # fmt: skip
-    """Seek biases that keep the pistons centred; returns them and the last period's motion.
+    """Find biases that keep the pistons centred; return them and the last period's motion.
 
     Raises InputError where the twin cannot follow, NotCentred where another amplitude may help.
     """
@@ -148,7 +148,7 @@ def centred(
 
 
 def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None) -> _Centred:
-    """Seek biases as `centred` does; begins with those of `near` where that is stated."""
+    """Find biases as `centred` does, starting with those of `near` if given."""
     rate, joints = rig.sample_rate, len(rig.joints)
     locked = {part.joint: part.piston for part in step.locks}
     biases = {part.joint: 0.0 for part in step.excite}
@@ -173,7 +173,7 @@ def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None)
     which = ", ".join(str(part.joint + 1) for part in step.excite)
     raise NotCentred(
         f"{step.name}: on the twin joint {which} cannot be centred: after {DESIGN.bias_tries} "
-        "biases it still drifts, or its state ceases to exist (end of the linkage, vacuum); "
+        "biases it still drifts, or its simulation fails (end of the linkage, vacuum); "
         "lower the amplitude, or allow more drift",
         step,
     )
@@ -183,7 +183,7 @@ def _improve(
     part: ExcitePlan, step: StepPlan, rate: float, commands: Array, moved: Mapping[str, Array],
     biases: dict[int, float], start: Array,
 ) -> bool:  # fmt: skip
-    """Correct bias and start of one joint from a simulation; says whether it was centred."""
+    """Correct bias and start of one joint from a simulation; return whether it was centred."""
     j = part.joint
     own = moved["piston"][:, j]
     exists = np.isfinite(own) & (moved.get("valid", np.ones(len(own))) > 0.0)
@@ -221,7 +221,7 @@ def _joint_lines(
 ) -> list[MotionPrediction]:
     j, limits = part.joint, rig.joints[part.joint].limits
     piston = moved["piston"][:, j]
-    # As if centred, and then off by what centring allows.
+    # As if centred, and then off by the allowed offset.
     piston = piston - np.mean(piston) + part.centre
     offset = part.settings.centring.offset
     low, high = float(piston.min()) - offset, float(piston.max()) + offset

@@ -1,4 +1,4 @@
-"""What a protocol is expected to do on a rig, laid out like a test sheet."""
+"""The expected behaviour of a protocol on a rig, as a test sheet."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ NOMINAL: Final = "nominal values"
 
 @dataclass(frozen=True)
 class MotionPrediction:
-    """One line of the report, like a test sheet: quantity, predicted range, allowed range, unit.
+    """One line of the report: quantity, predicted range, allowed range, unit.
 
     `joint` is 1-based, None for the bench. Only a `binding` line can refuse the plan; the others
-    say where the records will be poorer (a sagging supply, cavitation). `spread` is the part of the
-    range, below and above, that the uncertainty of the twin's parameters adds; `low` and `high`
+    state where records will be worse (a sagging supply, cavitation). `spread` is the part of the
+    range, below and above, due to the uncertainty of the twin's parameters; `low` and `high`
     include it.
     """
 
@@ -37,7 +37,7 @@ class MotionPrediction:
 
     @property
     def margin(self) -> float:
-        """Distance of the prediction to the nearest limit, in `unit`; negative if passed."""
+        """Distance of the prediction from the nearest limit, in `unit`; negative if exceeded."""
         return min(self.low - self.allowed_low, self.allowed_high - self.high)
 
     @property
@@ -63,8 +63,8 @@ class StepCheck:
 def widened(central: StepCheck, others: Sequence[StepCheck]) -> StepCheck:
     """Widen each predicted range by two standard deviations of its ends over further twins.
 
-    A standard deviation is the root mean square difference from the central prediction. A range
-    that lies within a fixed end (no flow below zero) keeps it, for there no twin differs.
+    A standard deviation is the root mean square difference from the central prediction. A fixed end
+    of a range (no flow below zero) is kept, because no twin differs there.
     """
     if not others:
         return central
@@ -85,7 +85,7 @@ def widened(central: StepCheck, others: Sequence[StepCheck]) -> StepCheck:
 
 @dataclass(frozen=True)
 class Moment:
-    """A step in the run's course: when it begins, its expected and its longest time [s]."""
+    """A step in the run's schedule: its start, its expected and its longest time [s]."""
 
     name: str
     title: str
@@ -96,7 +96,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a protocol is expected to do on a rig; `twin` says whose parameters were simulated."""
+    """The expected behaviour of a protocol on a rig; `twin` names the parameters simulated."""
 
     protocol: str
     rig: str
@@ -124,11 +124,11 @@ class CheckReport:
         )  # fmt: skip
 
     def with_remedies(self, scales: Mapping[str, float | None]) -> Self:
-        """Return the report with the factor by which each refused step's amplitudes would pass."""
+        """Return the report with the factor of amplitudes by which each refused step would pass."""
         return replace(self, scales=dict(scales))
 
     def _begins(self, step: str) -> str:
-        """Say when a step begins, for the reader of a refusal."""
+        """Return the start of a step as text for a refusal."""
         moments = [moment for moment in self.timeline if moment.name == step]
         return f", about {moments[0].begins:.0f} s into the run" if moments else ""
 
@@ -137,7 +137,7 @@ class CheckReport:
 
     @property
     def refused(self) -> tuple[str, ...]:
-        """One line per limit that would be passed."""
+        """One line per limit that would be exceeded."""
         return tuple(
             _text(check.step, line, self.twin) + self._begins(check.step) + self._remedy(check.step)
             for check in self.steps
@@ -147,7 +147,7 @@ class CheckReport:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One line per expectation that is no limit but will be missed."""
+        """One line per expectation that is not a limit but will not be met."""
         return tuple(
             _text(check.step, line, self.twin)
             for check in self.steps
@@ -161,13 +161,13 @@ class CheckReport:
         return not self.refused
 
     def require(self) -> None:
-        """Raise InputError naming the first limit that would be passed."""
+        """Raise InputError naming the first limit that would be exceeded."""
         if self.refused:
             more = f" (and {len(self.refused) - 1} more)" if len(self.refused) > 1 else ""
             raise InputError(f"protocol {self.protocol!r} refused: {self.refused[0]}{more}")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data, SI, for JSON."""
+        """Return the report as plain data in SI."""
         return {
             "protocol": self.protocol,
             "rig": self.rig,
@@ -222,7 +222,7 @@ def _line(data: Mapping[str, Any]) -> MotionPrediction:
 
 
 def remedy_text(scale: float | None) -> str:
-    """Say with which factor of its amplitudes a refused step passes; None: with none found."""
+    """Return the factor of amplitudes by which a refused step passes, in words; None: not found."""
     if scale is None:
         return "no smaller amplitude was found to pass"
     return f"{scale:g} times this amplitude would pass"

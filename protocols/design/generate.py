@@ -1,9 +1,9 @@
-"""Generates the lock-and-excite steps of a rig, with the proof that they determine everything.
+"""Generates the lock-and-excite steps of a rig, with the proof that they determine all parameters.
 
 Every candidate (`protocols.design.candidates`) is sized on the twin until it keeps all limits
-(`protocols.design.sizing`); its motion there gives the rows that its record would give, and the
-smallest set is chosen by them (`protocols.design.selection`). Rows and verdicts come from a
-predictor that is passed in, so that protocols and analysis stay apart.
+(`protocols.design.sizing`); the rows of its record follow from its motion there, and the smallest
+set is chosen by them (`protocols.design.selection`). Rows and verdicts come from a predictor, an
+argument, so that protocols and analysis stay independent.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Predictor:
-    """The twin, and what the analysis makes of its motion.
+    """The twin, and the analysis of its motion.
 
-    `rows(rig, moved, locked)` gives the triangle of each family's rows, `locked` being 1-based;
-    `judge(rig, rows of each step)` says what they determine together.
+    `rows(rig, moved, locked)` returns the triangle of each family's rows, `locked` being 1-based;
+    `judge(rig, rows of each step)` returns what they determine together.
     """
 
     twin: Twin
@@ -75,7 +75,7 @@ def generate(rig: Rig, predictor: Predictor, name: str) -> GeneratedProtocol:
 
 
 def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
-    """Say what the steps of a protocol determine on the twin, and what would help if not all.
+    """Return what the steps of a protocol determine on the twin, and what would help if not all.
 
     Raises InputError for a protocol that does not fit the rig or that the twin cannot follow.
     """
@@ -97,7 +97,7 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
 
 
 def _pool(rig: Rig, predictor: Predictor) -> list[SizedStep]:
-    """Return every candidate that the rig bears, as large as it bears it."""
+    """Return every candidate that the rig allows, with its largest allowed amplitude."""
     pool = []
     for seed, step in enumerate(candidates(rig), start=1):
         step_sized = sized(step, seed, rig, predictor.twin)
@@ -109,7 +109,7 @@ def _pool(rig: Rig, predictor: Predictor) -> list[SizedStep]:
 
 
 def _why(before: Verdicts, after: Verdicts) -> str:
-    """Say what a step added: parameters now determined, combinations, or conditioning."""
+    """Return the contribution of a step: parameters, combinations, or conditioning."""
     learned: list[str] = []
     words = []
     for family, verdict in after.items():
@@ -122,11 +122,11 @@ def _why(before: Verdicts, after: Verdicts) -> str:
         elif old.complete and verdict.condition < DESIGN.worth * old.condition:
             words.append(f"{family} condition {old.condition:.3g} to {verdict.condition:.3g}")
     words = [f"determines {' '.join(learned)}"] * bool(learned) + words
-    return "; ".join(words) or "more of what is known already"
+    return "; ".join(words) or "no new parameter or combination"
 
 
 def _help(done: Sequence[SizedStep], rig: Rig, predictor: Predictor) -> tuple[str, ...]:
-    """Return the steps, in words, that would make the rest identifiable."""
+    """Return the steps, in words, that would make the other parameters identifiable."""
     pool = _pool(rig, predictor)
     more = extended(done, pool, predictor.judge_of(rig))[len(done) :]
     return tuple(described(candidate.step) for candidate in more)

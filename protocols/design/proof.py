@@ -1,4 +1,4 @@
-"""What a set of steps is proven to determine, and why each step is in it; plain data."""
+"""The parameters that a set of steps is proven to determine, and why each step is included."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from protocols.engine.centring import Array
 
 
 class ProofPart(Protocol):
-    """A combination of parameters that can be distinguished from the rest."""
+    """A combination of parameters that can be distinguished from the others."""
 
     @property
     def text(self) -> str:
-        """As people write it."""
+        """The combination as text."""
 
 
 class Verdict(Protocol):
-    """What rows determine (`analysis.regression.base_parameters.Determinacy` is one)."""
+    """What rows determine, as `analysis.regression.base_parameters.Determinacy`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -34,15 +34,15 @@ class Verdict(Protocol):
 
     @property
     def known(self) -> tuple[str, ...]:
-        """Parameters determined alone."""
+        """Parameters determined individually."""
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Parameters that are not."""
+        """Parameters not determined individually."""
 
     @property
     def base(self) -> Sequence[ProofPart]:
-        """Combinations of those that are determined."""
+        """Combinations of lost parameters that are determined."""
 
     @property
     def complete(self) -> bool:
@@ -55,7 +55,7 @@ Triangles = Mapping[str, Array]  # family -> triangle of a step's rows
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a step is in the set: in words what it does, and the verdicts once it is added."""
+    """Why a step is in the set: its contribution in words, and the verdicts once it is added."""
 
     step: str
     description: str
@@ -67,7 +67,7 @@ class Reason:
 class Proof:
     """What the steps of a protocol determine on the twin of a rig.
 
-    `help` are further steps, in words, that would determine what is lost.
+    `help` are further steps, in words, that would determine the lost parameters.
     """
 
     protocol: str

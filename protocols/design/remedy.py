@@ -1,4 +1,4 @@
-"""What would pass instead of a step that was refused."""
+"""A smaller amplitude with which a refused step would pass."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from protocols.steps.plans import StepPlan
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-PERCENT = 100  # factors are tried in hundredths, so that the one that is written is the one tried
+PERCENT = 100  # factors are tried in hundredths, so that the factor written is the one tried
 
 
 def resized(step: StepPlan, factor: float) -> StepPlan:
@@ -31,8 +31,7 @@ def resized(step: StepPlan, factor: float) -> StepPlan:
 def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ()) -> float | None:
     """Return the largest factor found by which a step's amplitudes keep every limit; None if none.
 
-    Sought by bisection in hundredths below 1: the factor returned was proved on the twin itself,
-    and on the edge of what its `draws` span.
+    Found by bisection in hundredths below 1; the factor was proved on the twin and its `draws`.
     """
     passes, fails = 0, PERCENT
     while fails - passes > 1:

@@ -1,10 +1,10 @@
-"""Which of many steps to take: the fewest that determine all, then the best conditioned.
+"""Selection of steps: the fewest that determine all parameters, then the best conditioned.
 
-Greedily the step is taken that adds most to log det of the information, with unit columns and a
-floor, so that a direction seen for the first time counts more than any seen better; until every
-parameter is determined. Further ones come only while the worse condition number is above what is
-wanted and falls by a tenth or more. Then every step that can go without harm goes, and single
-steps are exchanged while that betters the worse condition number (Fedorov's exchange).
+Greedily, the step is added that increases log det of the information most, with unit columns and a
+floor, so that a new direction counts more than a better determined one, until every parameter is
+determined. Further steps are added only while the worse condition number is above the wanted one
+and falls by a tenth or more. Then unnecessary steps are removed, and single steps are exchanged
+while that improves the worse condition number (Fedorov's exchange).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ Judge = Callable[[Sequence[Triangles]], Verdicts]
 
 @dataclass(frozen=True, eq=False)
 class SizedStep:
-    """A step with an amplitude that the rig bears, and the rows that it gives."""
+    """A step with an amplitude that the rig allows, and the rows of its record."""
 
     step: Step
     rows: Triangles
 
 
 def smallest(pool: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
-    """Return the fewest steps found in the pool that determine all it can, in the pool's order."""
+    """Return the fewest steps found that determine all that the pool can, in the pool's order."""
     chosen = _exchanged(_pruned(extended([], pool, judge), judge), pool, judge)
     return sorted(chosen, key=pool.index)
 
@@ -40,7 +40,7 @@ def smallest(pool: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
 def extended(
     start: Sequence[SizedStep], pool: Sequence[SizedStep], judge: Judge
 ) -> list[SizedStep]:
-    """Return `start` and what is added to it from the pool until all is determined."""
+    """Return `start` with steps added from the pool until all is determined."""
     chosen = list(start)
     scales = _scales([*start, *pool])
     for _ in pool:
@@ -56,7 +56,7 @@ def extended(
                 key=lambda candidate: gain[id(candidate)] - DESIGN.closed_price * _cost(candidate),
             )
             if gain[id(best)] < 1.0:
-                break  # no step shows anything new
+                break  # no step adds a direction
         else:
             if worst(now) <= DESIGN.condition:
                 break
@@ -68,7 +68,7 @@ def extended(
 
 
 def complete(verdicts: Verdicts) -> bool:
-    """Say whether every parameter of every family is determined."""
+    """Return whether every parameter of every family is determined."""
     return all(verdict.complete for verdict in verdicts.values())
 
 
@@ -82,7 +82,7 @@ def _verdicts(steps: Sequence[SizedStep], judge: Judge) -> Verdicts:
 
 
 def _pruned(chosen: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
-    """Drop every step without which as much is determined, and as well as wanted."""
+    """Remove every step without which as much is determined, and as well as wanted."""
     kept = list(chosen)
     now = _verdicts(kept, judge)
     allowed = max(DESIGN.condition, worst(now))
@@ -98,7 +98,7 @@ def _pruned(chosen: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
 def _exchanged(
     chosen: Sequence[SizedStep], pool: Sequence[SizedStep], judge: Judge
 ) -> list[SizedStep]:
-    """Exchange single steps for others while that betters the worse condition number."""
+    """Exchange single steps for others while that improves the worse condition number."""
     now = list(chosen)
     for _ in pool:
         trials = [
@@ -115,7 +115,7 @@ def _exchanged(
 
 
 def _badness(steps: Sequence[SizedStep], judge: Judge) -> float:
-    """Return the log of the worse condition number, a tenth more for each valve closed beyond."""
+    """Return the log of the worse condition number, plus a tenth for each valve closed beyond."""
     verdicts = _verdicts(steps, judge)
     if not complete(verdicts):
         return float("inf")
@@ -125,13 +125,13 @@ def _badness(steps: Sequence[SizedStep], judge: Judge) -> float:
 
 
 def _cost(step: SizedStep) -> int:
-    """Count the valves closed beyond the excited joint: a lock of oil gives, a stop does not."""
+    """Return the number of valves closed beyond the excited joint, whose oil yields under load."""
     excited = min(part.joint for part in step.step.excite)
     return sum(lock.at == CLOSED and lock.joint > excited for lock in step.step.lock)
 
 
 def _scales(steps: Sequence[SizedStep]) -> dict[str, Array]:
-    """Return the columns' norms over all candidates: a measure that no choice changes."""
+    """Return the columns' norms over all candidates, a scale independent of the choice."""
     return {
         family: np.maximum(
             np.linalg.norm(np.vstack([step.rows[family] for step in steps]), axis=0), 1e-300

@@ -12,11 +12,11 @@ from typing import Final
 
 @dataclass(frozen=True)
 class ProtocolDesignSettings:
-    """Numbers without unit are shares or counts."""
+    """Limits and counts of protocol design; numbers without unit are shares or counts."""
 
     # Candidates.
     all_poses: int = 3  # joints beyond the excited one, up to which every combination is tried
-    displaced: int = 2  # of more joints than that, at most so many stand at an end
+    displaced: int = 2  # of more joints than that, the most at an end stop
     end_tolerance: float = 2e-3  # [m] of a joint locked at its end
     closed_tolerance: float = 5e-3  # [m]: a closed valve is a spring of oil
     amplitude: float = 0.4  # [V] rms to begin with; every step is sized on the twin
@@ -35,17 +35,17 @@ class ProtocolDesignSettings:
     # Selection.
     condition: float = 30.0  # condition number that is enough; those of the paper are 10 to 27
     worth: float = 0.9  # of the condition number: a further step must bring it down to this
-    visible: float = 1e-3  # of a unit column: what shows less does not show
-    closed_price: float = 3.0  # in log det: a closed valve beyond the joint must show so much more
+    visible: float = 1e-3  # of a unit column: smaller ones count as zero
+    closed_price: float = 3.0  # in log det: a closed valve beyond the joint must add at least this
 
     # Proof on the twin.
     bias_tries: int = 6  # biases that are tried to centre a piston
-    seek_seconds: float = 3.0  # [s] simulated behind each bias but the last
+    seek_seconds: float = 3.0  # [s] simulated with each bias but the last
     ramp_seconds: float = 1.0  # [s] in which the waveform grows
     settle_seconds: float = 2.0  # [s] simulated before the period that is judged
     drift_share: float = 0.2  # of the drift that the protocol allows
-    wider: float = 1.05  # swing under the centring loop over the free one, from which it is said
-    sigmas: float = 2.0  # standard deviations from a prediction to the edge that is judged
+    wider: float = 1.05  # swing under the centring loop over the free one, reported above
+    sigmas: float = 2.0  # standard deviations from a prediction to the end of its range
 
 
 DESIGN: Final = ProtocolDesignSettings()

@@ -1,4 +1,4 @@
-"""Making a step as large as the rig bears, judged by its motion on the twin."""
+"""Scaling of a step to the largest amplitude within the rig's limits, by its motion on the twin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 
-# Share of a limit's range kept for what the bench does otherwise than the twin.
+# Share of a limit's range kept for differences between bench and twin.
 SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.1,
          "rod_pressure (cavitation, supply)": 0.1, "piston": 0.05}  # fmt: skip
 
@@ -27,7 +27,7 @@ SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.1,
 def motion_within(
     step: Step, rig: Rig, twin: Twin, spare: Mapping[str, float] = SPARE
 ) -> Mapping[str, Array] | None:
-    """Return one period of a step's motion on the twin, None where a limit would be passed.
+    """Return one period of a step's motion on the twin, None if it exceeds a limit.
 
     `spare` is the share of a quantity's range that must stay free.
     """
@@ -43,10 +43,10 @@ def motion_within(
 
 
 def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[str, Array]] | None:
-    """Return a candidate as large as the rig bears, with its motion; None where it bears nothing.
+    """Return a candidate with the largest amplitude in limits, and its motion; None without one.
 
     Where the arm resonates, a multisine of little tilt must stay small: a steeper one is tried
-    next, and the largest is taken.
+    next, and the largest is used.
     """
     by_amplitude: dict[float, tuple[Step, Mapping[str, Array]]] = {}
     for tilt in DESIGN.tilts:

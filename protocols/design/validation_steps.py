@@ -1,4 +1,4 @@
-"""New data to judge a model by, for a rig of any size: sines, which are never used for a fit."""
+"""Validation steps for a rig of any size: sines, which are never used for a fit."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from protocols.steps.parts import CLOSED, Excite, Lock
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-# A slow sine swings as wide as the gain says, and a bench's gain is some percent off the twin's.
+# A slow sine's travel is proportional to the gain, which differs from the twin's by some percent.
 ROOM = {**SPARE, "piston": 0.1}
 
 
 def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
-    """Return each joint alone, then all at once, at 1 and 3 Hz, as large as the rig bears.
+    """Return each joint alone, then all at once, at 1 and 3 Hz, as large as limits allow.
 
-    Raises InputError naming a step that the rig does not bear at any amplitude.
+    Raises InputError naming a step that exceeds a limit at any amplitude.
     """
     N = len(rig.joints)
     steps = []
@@ -32,7 +32,7 @@ def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
             steps.append(_sized(f"all_{frequency:g}hz", every, frequency, rig, twin))
     return Protocol(
         name=name,
-        description=f"Records to judge a model of {rig.name} by, 1 and 3 Hz sines",
+        description=f"Validation records for a model of {rig.name}, 1 and 3 Hz sines",
         joints=N,
         steps=tuple(steps),
     )

@@ -1,7 +1,7 @@
 """Keeping an open-loop piston centred: pure functions from samples to the next bias.
 
-A valve's gains differ by chamber and direction, so a symmetric command makes an asymmetric
-cylinder drift, by millimetres a second. About a working point the piston is an integrator,
+A valve's gains differ by chamber and direction, so that an asymmetric cylinder drifts under a
+symmetric command, by millimetres a second. About a working point the piston is an integrator,
 
     ds/dt = k (v - v0)          k [m/(s V)], v0 [V] the command that neither extends nor retracts,
 
@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Motion:
-    """How a piston moved lately.
+    """Recent motion of a piston.
 
-    `drift` [m/s] is its mean velocity, `mean` [m] the mean of the last period, `ends` [m] what
-    that mean has become when the last sample is past.
+    `drift` [m/s] is its mean velocity, `mean` [m] the mean of the last period, `ends` [m] that mean
+    extrapolated to the last sample.
     """
 
     drift: float
@@ -36,7 +36,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Follow:
-    """How a piston follows its command: gain k [m/(s V)], null v0 [V], drift d [m/s]."""
+    """Response of a piston to its command: gain k [m/(s V)], null v0 [V], drift d [m/s]."""
 
     gain: float
     null: float
@@ -49,9 +49,9 @@ _UNKNOWN = Follow(float("nan"), float("nan"), float("nan"))
 def follow(command: Array, piston: Array, rate: float) -> Follow:
     """Fit s = c + d t + k integral(v - mean v) to a stretch of samples; v0 = mean v - d / k.
 
-    Needs no derivative of a measured signal, no whole period and no particular law: what the
-    device put out is known. Short gaps (NaN) are bridged. Returns NaN where the command hardly
-    varies, or too few samples arrived, to tell.
+    Needs no derivative of a measured signal, no whole period and no particular law, because the
+    output is known. Short gaps (NaN) are bridged. Returns NaN where the command hardly varies or
+    too few samples arrived.
     """
     known = np.isfinite(command) & np.isfinite(piston)
     if np.count_nonzero(known) < 10:
@@ -87,12 +87,12 @@ def moved_by(last: Array, drift: float, rate: float) -> Motion:
 
 
 def recentring(moved: Motion, centre: float, seconds: float, cap: float) -> float:
-    """Return the drift to ask for [m/s]: half of the offset in `seconds`, at most `cap` [m]."""
+    """Return the target drift [m/s]: half of the offset in `seconds`, at most `cap` [m]."""
     return -float(np.clip(ENGINE.recentre_share * (moved.ends - centre), -cap, cap)) / seconds
 
 
 def free_path(wave: Array, period: int, gain: float, rate: float) -> Array:
-    """Return the way (period,) [m] of a piston about its mean that goes by `gain` [m/(s V)]."""
+    """Return the motion (period,) [m] about its mean of a piston with `gain` [m/(s V)]."""
     command = np.resize(wave, period)
     way = np.cumsum(command - command.mean()) * gain / rate
     return np.asarray(way - way.mean())
@@ -101,8 +101,8 @@ def free_path(wave: Array, period: int, gain: float, rate: float) -> Array:
 def under_loop(piston: Array, pull: float, rate: float) -> Array:
     """Return a period (n,) of the piston, about zero, while a position loop centres it.
 
-    `pull` [1/s] is the loop's gain times the piston's speed per volt; a line at w goes by
-    j w / (j w + pull). Slow lines shrink, but turn against the others: the peaks may grow.
+    `pull` [1/s] is the loop's gain times the piston's speed per volt; a line at w is multiplied by
+    j w / (j w + pull). Slow lines shrink and phases change, so that peaks may grow.
     """
     w = 2 * np.pi * np.fft.rfftfreq(len(piston), 1.0 / rate)
     lines = np.fft.rfft(piston) * 1j * w / (1j * w + pull)
@@ -110,7 +110,7 @@ def under_loop(piston: Array, pull: float, rate: float) -> Array:
 
 
 def trim(bias: float, drift: float, wanted: float, gain: float) -> float:
-    """Return the bias [V] that changes the drift [m/s] into the one wanted: v + (w - d) / k."""
+    """Return the bias [V] that changes the drift [m/s] into the wanted one: v + (w - d) / k."""
     return bias + (wanted - drift) / gain
 
 
@@ -118,8 +118,7 @@ def trim(bias: float, drift: float, wanted: float, gain: float) -> float:
 class BiasForecast:
     """Lowest and highest piston [m] expected until the end.
 
-    `shift` [m] is how far the piston is now from where it was a period ago, `slope` [m/s] how
-    fast that grows.
+    `shift` [m] is the change of the piston since one period ago, `slope` [m/s] its rate.
     """
 
     low: float
@@ -133,10 +132,10 @@ def forecast(
 ) -> BiasForecast:
     """Predict the motion of a piston from one period that it is known, or assumed, to repeat.
 
-    `reference` (period,) is that period; `seen` (m,) what came since, from phase 0; `horizon`
-    the samples still to come. seen - reference is a straight line where the drift changed once,
-    at the trim. Where `shortest` samples or more have been seen the line is continued, but no
-    further than it was seen: a slope from a short look does not carry far.
+    `reference` (period,) is that period; `seen` (m,) the samples since, from phase 0; `horizon` the
+    number of samples to come. seen - reference is a straight line where the drift changed once, at
+    the trim. From `shortest` samples on the line is extrapolated, by its own length at most,
+    because the slope of a short line is inaccurate.
     """
     period, m = len(reference), len(seen)
     stride = max(1, min(period, m) // 500)
@@ -155,5 +154,5 @@ def forecast(
 
 
 def leaves(expected: BiasForecast, low: float, high: float) -> bool:
-    """Say whether the forecast passes a piston limit [m], less a margin."""
+    """Return whether the forecast exceeds a piston limit [m], less a margin."""
     return expected.low < low + ENGINE.limit_margin or expected.high > high - ENGINE.limit_margin

@@ -1,9 +1,9 @@
-"""Where people and estimates come into a run: the screen's commands, the terminal, the tracker.
+"""Inputs of a run besides the bench: the screen's commands, the terminal, the tracker.
 
-A person may ask a run to pause, resume, skip, abort, or answer its prompt. A request is accepted
-or refused at once, in one line, by the state that the run is in. What was accepted is done at the
-next safe point: between two records, or within a tenth of a second where nothing moves. An abort
-does not wait for one: the outputs go to zero with the next block.
+A person may request a pause, a resume, a skip, an abort, or answer a prompt. A request is accepted
+or refused at once, in one line, according to the state of the run, and executed at the next safe
+point: between two records, or within a tenth of a second where nothing moves. An abort does not
+wait for one: the outputs are zeroed with the next block.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from rig.bench.screens.commands import Command
 
 
 class Estimates(Protocol):
-    """The on-line estimator, as a run sees it."""
+    """The on-line estimator, as used by a run."""
 
     def values(self) -> Mapping[str, float]:
         """Return the estimates in SI by parameter, and `NAME.rsd`, their relative deviation."""
 
     def complete(self, record: str) -> bool:
-        """Say whether a record is in the estimates; True also where nothing more will come."""
+        """Return whether a record is in the estimates; also True if none will follow."""
 
 
 class NoEstimates:
-    """Nothing is estimated: no condition on a parameter holds."""
+    """No estimator: no condition on a parameter holds."""
 
     def values(self) -> Mapping[str, float]:
         """Return nothing."""
         return {}
 
     def complete(self, record: str) -> bool:
-        """Say that nothing more will come."""
+        """Return True: no estimates will follow."""
         return True
 
 
 @dataclass
 class OperatorRequests:
-    """What operators requested and is not yet done."""
+    """Requests of operators that are still to be executed."""
 
     pause: bool = False
     resume: bool = False
@@ -50,7 +50,7 @@ class OperatorRequests:
 
 
 class RunControl:
-    """Judges the commands of screens and keeps their requests for the engine."""
+    """Accepts or refuses the commands of screens and keeps their requests for the engine."""
 
     def __init__(self, machine: StateMachine) -> None:
         self.requests = OperatorRequests()
@@ -58,10 +58,10 @@ class RunControl:
         self._machine = machine
 
     def accept(self, command: Command) -> str | None:
-        """Take a command; returns None, or in one line why it is refused."""
+        """Accept a command; return None, or in one line why it is refused."""
         state = self._machine.state
         if state in (EngineState.SAFE, EngineState.TRIPPED):
-            return f"the run is over ({state}); nothing can be asked of it"
+            return f"the run is over ({state}); it accepts no command"
         handler = {
             "pause": self._pause,
             "resume": self._resume,
@@ -77,14 +77,14 @@ class RunControl:
         if state is EngineState.PAUSED:
             return "the run is paused already"
         if self.requests.pause:
-            return "a pause is asked for already; it comes at the end of the record"
+            return "a pause is requested already; it comes at the end of the record"
         self.requests.pause = True
         return None
 
     def _resume(self, command: Command, state: EngineState) -> str | None:
         if state is not EngineState.PAUSED:
             if self.requests.pause:
-                self.requests.pause = False  # taken back before it came
+                self.requests.pause = False  # withdrawn before it took effect
                 return None
             return f"the run is not paused but {state}"
         self.requests.resume = True
@@ -111,11 +111,11 @@ class RunControl:
 
 @dataclass(frozen=True)
 class Desk:
-    """What a run needs of the world outside.
+    """Inputs of a run besides the bench.
 
     `terminal` returns a line that a person typed, None for none; without a terminal the run is
-    unattended. `longest_pause` [s] is how long a pause, or a question to someone who attends, may
-    last before the run ends.
+    unattended. `longest_pause` [s] is the longest time of a pause, or of a question to a person,
+    before the run ends.
     """
 
     machine: StateMachine = field(default_factory=StateMachine)

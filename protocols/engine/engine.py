@@ -1,8 +1,8 @@
 """Runs a resolved plan on a bench, step after step, and ends with the outputs at zero.
 
-The engine only asks; the bench checks every sample, writes it down, and zeroes the outputs on any
-exit. What ends a run early (SafetyTrip, OperatorStop, DeviceLost, ProtocolAborted) passes through,
-after the outputs were zeroed and the state was noted.
+The engine sends requests; the bench checks and records every sample, and zeroes the outputs on any
+exit. Exceptions that end a run early (SafetyTrip, OperatorStop, DeviceLost, ProtocolAborted) are
+raised again after the outputs were zeroed and the state was noted.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def run(
     """Run every step of a plan; the records are in the bench's recorder when it returns.
 
     `on_phase` is called with every phase: "place", "lock", "warm-up", "centre", "record", "stop",
-    "done" and those of the other steps; `desk` is where people and estimates come in. Raises
-    ProtocolAborted (or its LockFailed) if the bench does not do what a step needs, and whatever the
-    bench raises; in every case the outputs were put to zero first.
+    "done" and those of the other steps; `desk` connects people and estimates. Raises
+    ProtocolAborted (or its LockFailed) if the bench fails a requirement of a step, and the bench's
+    own exceptions; in every case the outputs were put to zero first.
     """
     runner = PlanRunner(plan, rig, bench, on_phase or _nobody, desk or Desk())
     machine = runner.machine
@@ -61,7 +61,7 @@ def _nobody(step: str, phase: str, repeat: int, repeats: int, message: str) -> N
 
 
 def _all(plan: Plan, runner: PlanRunner) -> None:
-    """Run the steps; what fails is skipped or retried as the protocol allows."""
+    """Run the steps; failed ones are skipped or retried as the protocol allows."""
     skipped, lost = 0, 0
     rule, retry = plan.protocol.on_error, plan.protocol.retry
     waiting: Sequence[PlannedStep] = plan.sequence
@@ -89,7 +89,7 @@ def _all(plan: Plan, runner: PlanRunner) -> None:
 
 
 def _reconnect(runner: PlanRunner, error: DeviceLost, wait: float, left: int) -> None:
-    """Come to rest and connect anew; each further loss uses up the budget in the caller."""
+    """Zero the outputs and reconnect; the caller counts further losses."""
     log.warning("%s; connecting again in %g s, %d more allowed", error, wait, left)
     runner.rest_now("the device was lost", confirmed=False)
     runner.bench.event("device lost", runner.bench.tick, message=str(error), retries=left)
@@ -105,7 +105,7 @@ def _trip(plan: Plan, runner: PlanRunner, trip: SafetyTrip) -> None:
 
 
 def _make_safe(runner: PlanRunner) -> None:
-    """Zero the outputs and say so; a device that does not confirm leaves the state as it was."""
+    """Zero the outputs and note it; without the device's confirmation the state is unchanged."""
     try:
         sure = runner.bench.zero_outputs()
     except DeviceError as error:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from protocols.engine.excited_joint import ExcitedJoint
-from protocols.engine.locking import Hold, JointLock, give, lock, look, move
+from protocols.engine.locking import Hold, JointLock, lock, lock_movement, move, placement
 from protocols.engine.playback import Playback
 from protocols.engine.session import Session
 from protocols.engine.settings import ENGINE
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class ExcitationDesk(Protocol):
-    """What an excitation needs of the engine that runs it."""
+    """The engine's interface for an excitation."""
 
     @property
     def machine(self) -> StateMachine:
@@ -29,14 +29,14 @@ class ExcitationDesk(Protocol):
 
     @property
     def interrupted(self) -> bool:
-        """Whether a person asked for a pause, or to skip the step."""
+        """Whether a person has requested a pause, or to skip the step."""
 
     def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         """Receive the progress of the step."""
 
 
 class ExcitationRun:
-    """The excitation of one step, from rest to rest as often as it is interrupted."""
+    """The excitation of one step, from rest to rest, repeated after each interruption."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class ExcitationRun:
         self._desk.report_phase(self.step.name, phase, repeat, self.step.repeats, message)
 
     def run(self) -> bool:
-        """Take the records that are not taken yet; False where a person asked to stop earlier."""
+        """Take the missing records; return False where a person requested a stop."""
         excitation = self._start()
         self.report_phase("centre", "open loop; biases are trimmed")
         excitation.settle_bias()
@@ -72,7 +72,7 @@ class ExcitationRun:
         return complete
 
     def move_until(self, done: Callable[[], bool], most: float) -> bool:
-        """Excite without records until `done`; False after `most` seconds or where interrupted."""
+        """Excite without records until `done`; return False after `most` seconds or a stop."""
         excitation = self._start()
         excitation.hold()
         began, good = self.session.now, done()
@@ -105,7 +105,7 @@ class ExcitationRun:
         self.session.bench.guard(self._roles(moving=True))
 
     def _roles(self, moving: bool = False) -> list[JointRole]:
-        """Return what each joint does; a joint on its way may touch the ends of its stroke."""
+        """Return the role of each joint; a joint in transit may touch the ends of its stroke."""
         roles = [FREE] * self.session.joints
         if moving:
             return roles
@@ -120,15 +120,15 @@ class ExcitationRun:
         targets = {e.joint: e.centre for e in self.step.excite}
         where = ", ".join(f"joint {j + 1} to {1e3 * s:g} mm" for j, s in targets.items())
         self.report_phase("place", where)
-        self.session.wait(0.01)  # so that the session knows the device's time
-        # They are centred again when they move: here half of what that allows is near enough.
+        self.session.wait(0.01)  # to obtain the device's time
+        # They are centred again when they move: half of the offset allowed then is enough here.
         near = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
         tolerance = max(self.place.tolerance, near)
         settle, name = self.step.settle, self.step.name
         return move(self.session, targets, self.place, tolerance, settle, name)
 
     def _lock(self) -> list[JointLock]:
-        """Lock the joints: end stops first, because the push shakes what is merely closed."""
+        """Lock the joints: end stops first, because the push disturbs closed joints."""
         hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
         locks = []
         for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
@@ -138,7 +138,7 @@ class ExcitationRun:
         return locks
 
     def _records(self, excitation: Playback) -> bool:
-        """Take records until all are there, or a person interrupts between two of them."""
+        """Take records until all are complete, or a person interrupts between two of them."""
         disturbed = 0
         while self.taken < self.step.repeats:
             repeat = self._first + self.taken
@@ -163,7 +163,7 @@ class ExcitationRun:
         return True
 
     def _record(self, excitation: Playback, repeat: int) -> bool:
-        """Take one record; False if it was disturbed, and so is none."""
+        """Take one record; return False if it was disturbed and discarded."""
         self.report_phase(
             "record", f"record {repeat} of {self._first - 1 + self.step.repeats}", repeat
         )
@@ -197,7 +197,7 @@ class ExcitationRun:
     def _attributes(
         self, first: int, driven: Sequence[ExcitedJoint], excitation: Playback
     ) -> dict[str, str | float | int]:
-        """Return what is known of a record only when it has been taken."""
+        """Return the attributes of a record that are known only after it."""
         attributes: dict[str, str | float | int] = {}
         last = first + self.step.record
         for held in self.locks:
@@ -205,7 +205,7 @@ class ExcitationRun:
             attributes[f"lock_{j}"] = held.at
             attributes[f"lock_piston_m_{j}"] = held.piston
             attributes[f"lock_gain_v_per_m_{j}"] = held.law.position_gain
-            attributes[f"lock_give_m_{j}"] = give(self.session, held, first, last)
+            attributes[f"lock_give_m_{j}"] = lock_movement(self.session, held, first, last)
         for before, after in zip(driven, excitation.joints, strict=True):
             j = before.joint + 1
             attributes[f"bias_v_{j}"] = before.bias
@@ -215,13 +215,13 @@ class ExcitationRun:
         return attributes
 
     def _relock(self, excitation: Playback) -> bool:
-        """Close a valve anew that let its piston creep; says whether one had to be."""
+        """Close a valve again whose piston crept; return whether there was one."""
         changed = False
         for n, held in enumerate(self.locks):
             if held.at != CLOSED:
                 continue
             first = self.session.now - self.step.period
-            off = look(self.session, held.joint, first, self.session.now).piston - held.piston
+            off = placement(self.session, held.joint, first, self.session.now).piston - held.piston
             if abs(off) <= ENGINE.relock_share * held.tolerance:
                 continue
             self.report_phase(

@@ -31,7 +31,7 @@ AT_REST = Motion(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class ExcitedJoint:
-    """An excited joint: its plan, bias [V], gain k [m/(s V)], drift asked for [m/s], motion."""
+    """An excited joint: its plan, bias [V], gain k [m/(s V)], target drift [m/s], motion."""
 
     plan: ExcitePlan
     bias: float
@@ -46,7 +46,7 @@ class ExcitedJoint:
 
     @property
     def centring(self) -> Centring:
-        """How it is to be kept centred."""
+        """Its centring settings."""
         return self.plan.settings.centring
 
     @property
@@ -58,10 +58,10 @@ class ExcitedJoint:
 def found_under_loop(
     driven: ExcitedJoint, command: Array, piston: Array, period: int, rate: float, step: str
 ) -> ExcitedJoint:
-    """Return the joint with gain and bias as seen while a loop centred it; arrays of shape (n,).
+    """Return the joint with gain and bias measured under the loop; arrays of shape (n,).
 
-    Two whole periods give the drift exactly, less of them by the fit of `follow`. Raises
-    ProtocolAborted for a piston that does not follow its command.
+    The drift is exact over two whole periods, else from the fit of `follow`. Raises ProtocolAborted
+    for a piston that does not follow its command.
     """
     seen = follow(command, piston, rate)
     if not seen.gain > 0.0:
@@ -82,7 +82,7 @@ def found_under_loop(
 
 
 def off_centre(driven: ExcitedJoint) -> float:
-    """Return how far the piston was off its centre, as a share of the offset allowed."""
+    """Return the offset of the piston from its centre, as a share of the allowed one."""
     return abs(driven.moved.ends - driven.plan.centre) / driven.centring.offset
 
 
@@ -102,7 +102,7 @@ def check_swing(
 
 
 def settled(driven: ExcitedJoint, moved: Motion, record: float, step: str) -> bool:
-    """Say whether drift over a record of `record` seconds and offset are as small as allowed."""
+    """Return whether offset and drift over a record of `record` seconds are within limits."""
     off = moved.ends - driven.plan.centre
     log.info(
         "%s: joint %d at bias %.4f V drifts %.3f mm/s (asked %.3f), centre off by %.2f mm",
@@ -115,7 +115,7 @@ def settled(driven: ExcitedJoint, moved: Motion, record: float, step: str) -> bo
 def trimmed(driven: ExcitedJoint, moved: Motion, seconds: float, gently: bool) -> ExcitedJoint:
     """Return the joint with the bias for its next `seconds`; `gently` where that is a record."""
     if driven.loop > 0.0:
-        # The loop stands off by what it has to add to the bias: take that over.
+        # The loop's steady offset is what it adds to the bias: move it into the bias.
         off = moved.mean - driven.plan.centre
         bias = driven.bias - driven.loop * off - moved.drift / driven.gain
         return replace(driven, bias=bias, moved=moved)
@@ -135,16 +135,15 @@ def corrected(
     limits: tuple[float, float],
     step: str,
 ) -> ExcitedJoint | None:  # fmt: skip
-    """Return the joint with a bias that keeps it within `limits` [m], None if it stays anyway.
+    """Return the joint with a bias that keeps it within `limits` [m], None if none is needed.
 
-    `reference`, `seen` and `horizon` are those of `forecast`; `other_law`, if the reference was
-    measured under another law than this. The piston is sent back so as to be centred at the end
-    of the period.
+    `reference`, `seen` and `horizon` are those of `forecast`; `other_law` states that the reference
+    was measured under another law. The piston is moved to be centred at the end of the period.
     """
     if driven.loop > 0.0:
         return None
-    # Another law gave the reference another shape, whose mismatch looks like a drift until a whole
-    # period has passed; and its own drift tells nothing of this one.
+    # Under another law the reference has another shape, whose difference looks like a drift until a
+    # whole period has passed; its own drift is also different.
     shortest = len(reference) if other_law else max(ENGINE.shortest_line, len(reference) // 10)
     ahead = forecast(reference, seen, horizon, rate, shortest)
     if not leaves(ahead, *limits):
@@ -162,12 +161,12 @@ def corrected(
 
 
 def returned(driven: ExcitedJoint) -> ExcitedJoint:
-    """Return the joint with the way back taken out of its bias."""
+    """Return the joint without the correction in its bias."""
     return replace(driven, bias=trim(driven.bias, driven.target, 0.0, driven.gain), target=0.0)
 
 
 def not_centred(driven: ExcitedJoint, record: float, tries: int, step: str) -> ProtocolAborted:
-    """Return the refusal to go on with a joint whose bias would not settle."""
+    """Return the error of a joint whose bias did not settle."""
     allowed = driven.centring
     return ProtocolAborted(
         f"{step}: joint {driven.joint + 1} is not centred after {tries} trials: it drifts "

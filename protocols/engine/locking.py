@@ -1,12 +1,11 @@
-"""Bringing pistons to a place, locking joints there, and proving from the piston that they are.
+"""Positioning of pistons, locking of joints, and verification by the measured piston.
 
-The device's position law leaves an error where the valve needs a command to stand still (spool
-offset, leakage, dead band): here the host integrates that error away, slowly.
-
-A lock at an end stop is a steady push against it; a closed valve is zero volts where the piston
-stands. With a spool offset or a leak the piston creeps at zero volts, and no steady command stops
-it: one step of a 12-bit output is already 0.8 mm/s on the seed bench. There the position loop that
-brought the piston to its place goes on holding it.
+The device's position law has a steady error where the valve needs a command to stop the piston
+(spool offset, leakage, dead band); the host removes it by slow integral action. A lock at an end
+stop is a steady push against it; a closed valve is zero volts at the piston's position. With a
+spool offset or a leak the piston creeps at zero volts, and no constant command stops it: one step
+of a 12-bit output is 0.8 mm/s on the seed bench. In that case the position loop stays active to
+hold it.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ class PlacementReading:
     command: float
 
 
-def look(session: Session, joint: int, first: int, last: int) -> PlacementReading:
-    """Return what joint `joint` (0-based) did over ticks [first, last).
+def placement(session: Session, joint: int, first: int, last: int) -> PlacementReading:
+    """Return the mean motion of joint `joint` (0-based) over ticks [first, last).
 
-    Speed is the difference of the means of the two halves over half the time: unlike the
-    difference of the end samples it averages the sensor's noise.
+    Speed is the difference of the means of the two halves over half the time: unlike the difference
+    of the end samples it averages the sensor's noise.
     """
     piston = session.piston(joint, first, last)
     middle = len(piston) // 2
@@ -75,13 +74,13 @@ def move(
     began, still_since = session.now, session.now
     while True:
         first = session.wait(ENGINE.look_seconds)
-        seen = {j: look(session, j, first, session.now) for j in targets}
+        seen = {j: placement(session, j, first, session.now) for j in targets}
         late = {j for j in targets if not _in_place(seen[j], targets[j], tolerance)}
         if late:
             still_since = session.now
         elif session.now - still_since >= settle * session.rate:
-            return {j: look(session, j, still_since, session.now).command for j in targets}
-        # Only what no longer moves is off for want of a command; the rest is still on its way.
+            return {j: placement(session, j, still_since, session.now).command for j in targets}
+        # Only the error of a piston at rest is due to a missing command; others are still moving.
         stuck = {j for j in late if abs(seen[j].speed) < ENGINE.rocking_speed}
         for j in stuck:
             biases[j] += ENGINE.integral_share * place.position_gain * (targets[j] - seen[j].piston)
@@ -105,7 +104,7 @@ def _in_place(seen: PlacementReading, target: float, tolerance: float) -> bool:
 
 @dataclass(frozen=True)
 class JointLock:
-    """A joint (0-based) that is locked: where [m], by which law, how far it may give [m]."""
+    """A locked joint (0-based): position [m], law, tolerance of its movement [m]."""
 
     joint: int
     at: str
@@ -116,7 +115,7 @@ class JointLock:
 
 @dataclass(frozen=True)
 class Hold:
-    """What locking needs to know of its step: name, time at rest, length of a record [s]."""
+    """Data of a step for locking: name, time at rest, length of a record [s]."""
 
     step: str
     settle: float
@@ -124,7 +123,7 @@ class Hold:
 
 
 def lock(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLock:
-    """Lock one joint as planned; raises LockFailed where the piston does not prove it."""
+    """Lock one joint as planned; raises LockFailed where the piston moves too much."""
     if plan.at == CLOSED:
         return close_valve(session, plan, place, hold)
     return push_to_end(session, plan, place, hold)
@@ -133,15 +132,15 @@ def lock(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLoc
 def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLock:
     """Drive a piston against its end stop and keep pushing.
 
-    One law does both: far from the end the position gain drives at `place.limit`, at the end
-    only the push is left of it. Locked is: within tolerance of the stroke's end and still, for
-    the time of `settle`. Raises LockFailed at `place.timeout`.
+    One law does both: far from the end the command is limited to `place.limit`, at the end only the
+    push remains. The joint counts as locked when it is at rest within tolerance of the stroke's end
+    for the time of `settle`. Raises LockFailed at `place.timeout`.
     """
     push = place.push if plan.at == END_MAX else -place.push
     session.apply({plan.joint: OutputLaw(0.0, push, place.position_gain, plan.piston, place.limit)})
     began, still_since = session.now, session.now
     while session.now - still_since < hold.settle * session.rate:
-        seen = look(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
+        seen = placement(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
         if abs(seen.piston - plan.piston) > plan.tolerance or abs(seen.speed) > ENGINE.still_speed:
             still_since = session.now
         if session.now - began > place.timeout * session.rate:
@@ -155,7 +154,7 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     law = OutputLaw(bias=push, limit=abs(push))
     session.apply({plan.joint: law})
     first = session.wait(hold.settle)
-    stands = look(session, plan.joint, first, session.now).piston
+    stands = placement(session, plan.joint, first, session.now).piston
     held = JointLock(plan.joint, plan.at, stands, law, plan.tolerance)
     verify(session, held, hold.step, first, session.now)
     log.info("%s: joint %d held at %s, %.2f mm", hold.step, plan.joint + 1, plan.at, 1e3 * stands)
@@ -163,10 +162,10 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
 
 
 def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLock:
-    """Bring a piston to its place, close the valve there, and watch that it stays.
+    """Bring a piston to its place, close the valve, and verify that it stays.
 
-    If it creeps so that more than a quarter of the tolerance were gone by the end of a record,
-    the position loop holds it instead. Raises LockFailed if that does not keep it either.
+    If it creeps by more than a quarter of the tolerance over a record, the position loop holds it
+    instead. Raises LockFailed if that does not hold it either.
     """
     joint, target = plan.joint, {plan.joint: plan.piston}
     null = move(session, target, place, place.tolerance, hold.settle, hold.step)[joint]
@@ -192,25 +191,25 @@ def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
 
 
 def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> PlacementReading:
-    """Put a law in force, let the pressures find their balance, and look for as long again."""
+    """Apply a law, wait until the pressures settle, and measure for the same time again."""
     session.apply({joint: law})
     session.wait(hold.settle)
     first = session.wait(hold.settle)
-    return look(session, joint, first, session.now)
+    return placement(session, joint, first, session.now)
 
 
 def _near(seen: PlacementReading, plan: LockPlan) -> bool:
     return abs(seen.piston - plan.piston) <= 0.5 * plan.tolerance
 
 
-def give(session: Session, held: JointLock, first: int, last: int) -> float:
-    """Return how far a locked piston left its place over ticks [first, last) at most [m]."""
+def lock_movement(session: Session, held: JointLock, first: int, last: int) -> float:
+    """Return the largest movement of a locked piston over ticks [first, last) [m]."""
     moved = np.abs(session.piston(held.joint, first, last) - held.piston)
     return float(np.nanmax(moved, initial=0.0))
 
 
 def verify(session: Session, held: JointLock, step: str, first: int, last: int) -> None:
-    """Raise LockFailed if a locked piston left its place by more than the tolerance."""
+    """Raise LockFailed if a locked piston moved by more than the tolerance."""
     piston = session.piston(held.joint, first, last)
     moved = np.abs(piston - held.piston)
     if (moved > held.tolerance).any():

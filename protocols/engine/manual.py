@@ -1,11 +1,11 @@
 """Manual operation: a person moves one joint at a time, and only while a key is held.
 
-A jog holds for `ENGINE.jog_hold` seconds of wall time after the newest press; a terminal repeats
-a held key faster than that, so letting go, a broken link or a dead screen closes the valve. The
+A jog lasts `ENGINE.jog_hold` seconds of wall time after the newest press; a terminal repeats a held
+key faster than that, so that releasing it, a broken link or a crashed screen closes the valve. The
 device's own position law drives towards a point inside the joint's limits and slows down before it:
-it does not pass them even if this process dies. A locked joint is held where it stands, and the
-guard trips where it moves by more than the tolerance. Nothing here knows of a protocol: while one
-runs, the device is busy and this session does not begin.
+it does not pass them even if this process dies. A locked joint is held at its position, and the
+guard trips if it moves by more than the tolerance. While a protocol runs, the device is busy and
+this session cannot begin.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ KIND: Final = "manual"  # of the session, as screens see it
 
 
 class ManualBench(BenchSession, Protocol):
-    """What manual operation needs of `rig.bench.session.Bench`."""
+    """The interface of `rig.bench.session.Bench` for manual operation."""
 
 
 class Manual:
-    """One manual session: which joint moves, which are locked, and until when."""
+    """One manual session: the moving joint, the locked joints, and the end of the jog."""
 
     def __init__(
         self,
@@ -63,10 +63,10 @@ class Manual:
             rig.recorded.index(ch.channel(ch.PISTON, j + 1)) for j in range(len(rig.joints))
         ]
 
-    # What a person asks for
+    # Commands of a person
 
     def accept(self, command: Command) -> str | None:
-        """Take a command; returns None, or in one line why it is refused."""
+        """Accept a command; return None, or in one line why it is refused."""
         self._last_command = self._clock()
         if command.word == "abort":
             self._over = True
@@ -113,12 +113,12 @@ class Manual:
             return f"unlock: joint {joint + 1} is not locked"
         return None
 
-    # What the bench does
+    # Actions on the bench
 
     def run(self) -> None:
-        """Serve until a person ends the session, or nobody commands for a time; raises as Bench.
+        """Serve until a person ends the session, or no command comes for a time; raises as Bench.
 
-        Whatever ends it, the bench puts the outputs to zero.
+        The bench zeroes the outputs at any end.
         """
         bench = self._bench
         bench.listen(self.accept)
@@ -136,7 +136,7 @@ class Manual:
         bench.zero_outputs()
 
     def _put_out(self) -> None:
-        """Put laws and roles in force where they have changed."""
+        """Apply laws and roles if they have changed."""
         laws, roles = [], []
         for joint in range(len(self._rig.joints)):
             at = self._locked.get(joint)

@@ -1,4 +1,4 @@
-"""What steps do at the bench: implements `protocols.steps.base.Actions` on a session."""
+"""The actions of steps at the bench: implements `protocols.steps.base.Actions` on a session."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from protocols.engine.desk import Desk
 from protocols.engine.excitation import ExcitationRun
-from protocols.engine.locking import Hold, lock, look, move
+from protocols.engine.locking import Hold, lock, move, placement
 from protocols.engine.session import BenchSession, Session
 from protocols.engine.settings import ENGINE
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded, StateMachine
@@ -32,7 +32,7 @@ OnPhase = Callable[[str, str, int, int, str], None]
 
 
 class PlanRunner:
-    """One run of a plan: its session, its state, what is done and what is left."""
+    """One run of a plan: its session, its state, steps done and remaining."""
 
     def __init__(
         self, plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase, desk: Desk
@@ -53,9 +53,9 @@ class PlanRunner:
         self._part_began = 0.0
         self._later_seconds = 0.0
         self._origin: int | None = None  # tick of the run's first block
-        self._elapsed_before = 0.0  # [s] until a lost device was connected anew
+        self._elapsed_before = 0.0  # [s] until a lost device was reconnected
 
-    # Where it stands
+    # Progress
 
     @property
     def machine(self) -> StateMachine:
@@ -81,26 +81,26 @@ class PlanRunner:
         self.bench.status(part=self._parts - len(rest))
 
     def remaining_seconds(self) -> float:
-        """Return the expected time [s] to the end; conditions count as little as they may."""
+        """Return the expected remaining time [s]; conditions count with their least time."""
         if self._part is None:
             return self._later_seconds
         own = self._part.seconds - (self.elapsed - self._part_began)
         return self._later_seconds + max(0.0, own)
 
     def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
-        """Report a phase, and when the run is expected to end."""
+        """Report a phase and the expected end of the run."""
         self.bench.status(total_s=self.elapsed + self.remaining_seconds())
         self._on_phase(step, phase, repeat, repeats, message)
 
     def note_state(self, before: EngineState, after: EngineState, why: str) -> None:
-        """Write a change of state to the run's log and show it."""
+        """Write a change of state to the run's log and publish it."""
         self.bench.event("state", self.bench.tick, before=str(before), state=str(after), why=why)
         self.bench.status(engine=str(after))
 
-    # What steps ask for
+    # Actions of steps
 
     def do(self, planned: PlannedStep) -> None:
-        """Run one step, unless a person wants a pause before it."""
+        """Run one step, after a pause if a person has requested one."""
         self._safe_point()
         if self._skipped(planned.name):
             return
@@ -110,7 +110,7 @@ class PlanRunner:
         self._skipped(planned.name)
 
     def excite(self, planned: PlannedStep) -> None:
-        """Take the records of an excitation, from its place on after every pause."""
+        """Take the records of an excitation, again from its positioning after every pause."""
         (step,) = planned.excitations
         before = self._at_begin.setdefault(step.name, self._complete.get(step.name, 0))
         swept = planned.step.parameters if isinstance(planned.step, Step) else {}
@@ -182,8 +182,8 @@ class PlanRunner:
             self.session.until(first + ticks)
             span = min(round(ENGINE.look_seconds * self.session.rate), ticks // 2)
             for j in range(self.session.joints):
-                began = look(self.session, j, first, first + span).piston
-                ended = look(self.session, j, first + ticks - span, first + ticks).piston
+                began = placement(self.session, j, first, first + span).piston
+                ended = placement(self.session, j, first + ticks - span, first + ticks).piston
                 record.note(**{f"creep_m_{j + 1}": ended - began})
         self._complete[name] = repeat
         self.records += 1
@@ -211,7 +211,7 @@ class PlanRunner:
         return self._pass(most, self._judge(condition))
 
     def ask(self, question: Question) -> str:
-        """Ask a person, outputs at zero; returns the answer, or the default where nobody attends.
+        """Ask a person, outputs at zero; return the answer, or the default if unattended.
 
         Raises RunEnded where there is neither.
         """
@@ -268,7 +268,7 @@ class PlanRunner:
         return False
 
     def _await_estimates(self) -> None:
-        """Let the estimator take in the last record; wall time, because it runs beside the run."""
+        """Wait, in wall time, until the parallel estimator has the last record."""
         until = time.monotonic() + ENGINE.estimate_seconds
         while not self.desk.estimates.complete(self._last_record):
             if time.monotonic() > until:
@@ -291,14 +291,14 @@ class PlanRunner:
     # Rest and safe points
 
     def rest_now(self, why: str, *, confirmed: bool = True) -> None:
-        """Put every output to zero and the state to idle; unconfirmed where the device is lost."""
+        """Zero every output and set the state to idle; unconfirmed where the device is lost."""
         if confirmed:
             self.session.off()
         if self.machine.state not in (EngineState.TRIPPED, EngineState.SAFE):
             self.machine.to(EngineState.IDLE, why)
 
     def reconnect(self, wait: float) -> None:
-        """Connect anew to a lost device and drop what was read of it."""
+        """Reconnect to a lost device and drop the samples read before."""
         self._elapsed_before = self.elapsed
         self.bench.reconnect(wait)
         self.session.forget()
@@ -310,7 +310,7 @@ class PlanRunner:
             raise OperatorStop(self.desk.control.requests.abort)
 
     def _safe_point(self) -> None:
-        """Pause here if a person asked for it; raises RunEnded when nobody resumes."""
+        """Pause here if a person requested it; raises RunEnded if nobody resumes."""
         requests = self.desk.control.requests
         if not requests.pause:
             return
@@ -339,7 +339,7 @@ class PlanRunner:
         return True
 
     def _pass(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
-        """Let time pass at rest; True when `done`, or a person wants to go on; else False."""
+        """Wait at rest; return True when `done`, or a person wants to continue; else False."""
         began = self.elapsed
         self.session.wait(min(ENGINE.look_seconds, seconds))
         while done is None or not done():
@@ -354,7 +354,7 @@ class PlanRunner:
         return True
 
     def _judge(self, condition: Condition | None) -> Callable[[], bool]:
-        """Return what says whether a condition holds now; `elapsed` counts from here."""
+        """Return a function that evaluates a condition; `elapsed` counts from this call."""
         began = self.elapsed
 
         def holds() -> bool:
@@ -363,7 +363,7 @@ class PlanRunner:
         return holds
 
     def readings(self, condition: Condition) -> str:
-        """Return the present values of what a condition compares, with units."""
+        """Return the present values of a condition's names, with units."""
         return condition.readings(self._values(condition, self.elapsed))
 
     def _values(self, condition: Condition, began: float) -> Mapping[str, float]:

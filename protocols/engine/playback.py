@@ -1,8 +1,8 @@
 """Playing the waveforms of one step: warm-up, trials of the bias, records.
 
 All boundaries are ticks: the waveforms start at `start`, and every later stretch begins a whole
-number of periods after it, so all records of a step begin at the same sample of the waveform. A
-law is changed when the block that holds the boundary has been read: a few samples after it.
+number of periods after it, so all records of a step begin at the same sample of the waveform. A law
+is changed when the block with the boundary has been read, a few samples after it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from protocols.steps.plans import FIRM_SECONDS, StepPlan
 
 
 class Playback:
-    """One step's excitation in progress; `at` is the tick of the boundary reached."""
+    """One step's excitation in progress; `at` is the tick of the last boundary."""
 
     def __init__(
         self, session: Session, step: StepPlan, place: Place, locks: Sequence[JointLock]
@@ -44,16 +44,16 @@ class Playback:
         self.start = 0
         self.at = 0
         self._alone = True  # the period before ran under other laws than this one
-        self._references: list[Array] = []  # the last period of each joint that went undisturbed
-        self._checked = 0  # locks are verified up to here
+        self._references: list[Array] = []  # the last undisturbed period of each joint
+        self._checked = 0  # locks are verified up to this tick
 
     def warm_up(self, nulls: Mapping[int, float]) -> None:
-        """Let the waveforms grow under a firm position loop, then loosen it and find the biases.
+        """Let the waveforms grow under a firm position loop, lower its gain and find the biases.
 
-        `nulls` [V] are the commands that held the pistons still, by joint (0-based). A loop turns
-        the phase of the motion, so loosening it at once would leave the piston off centre: it is
-        loosened slowly. Raises ProtocolAborted for a piston that does not follow its command or
-        swings too far.
+        `nulls` [V] are the commands that held the pistons at rest, by joint (0-based). A loop
+        shifts the phase of the motion, so that a sudden change would leave the piston off centre:
+        the gain is lowered slowly. Raises ProtocolAborted for a piston that does not follow its
+        command or swings too far.
         """
         self.joints = tuple(ExcitedJoint(e, nulls[e.joint]) for e in self.step.excite)
         for driven in self.joints:
@@ -82,7 +82,7 @@ class Playback:
             check_swing(driven, period, limits, self.step.name)
 
     def settle_bias(self) -> None:
-        """Play trials until every piston is centred and its drift is what was asked for.
+        """Play trials until every piston is centred and has its target drift.
 
         Raises ProtocolAborted after as many tries as the protocol allows.
         """
@@ -103,10 +103,10 @@ class Playback:
         raise not_centred(worst, record, self.step.tries + 1, self.step.name)
 
     def _release(self) -> None:
-        """Let go of the slow loop, each joint where the free waveform would have its piston.
+        """Switch the slow loop off when each piston is on its open-loop path.
 
-        From elsewhere it would go the same way off centre: for a slow waveform, whose phase a loop
-        turns by a quarter, by as much as its whole swing. A fast one has no way to be off.
+        Elsewhere it would continue off centre: for a slow waveform, whose phase a loop shifts by a
+        quarter period, by as much as its whole swing. For a fast one the difference is negligible.
         """
         period, rate = self.step.period, self.session.rate
         paths = {
@@ -134,15 +134,15 @@ class Playback:
         ]
 
     def _off_path(self, joint: int, path: Array) -> float:
-        """Return how far [m] a piston is from its free way, at the last sample read."""
+        """Return the distance [m] of a piston from its open-loop path at the last sample."""
         now = self.session.now
         (piston,) = self.session.piston(joint, now - 1, now)
         return float(piston - path[(now - 1 - self.start) % len(path)])
 
     def record(self) -> bool:
-        """Play one record from the boundary reached; False if it had to be disturbed.
+        """Play one record from the last boundary; return False if it had to be disturbed.
 
-        The biases are trimmed for the next one from what was seen in it.
+        The biases are then trimmed by its motion for the next one.
         """
         self._play()
         moved = self._stretch(self.step.record)
@@ -160,7 +160,7 @@ class Playback:
         self._alone = True
 
     def resume(self, locks: Sequence[JointLock]) -> None:
-        """Go on at the next boundary, with locks that were made anew meanwhile."""
+        """Continue at the next boundary, with renewed locks."""
         self.locks = tuple(locks)
         self._checked = self.session.now
         behind = self.session.now - self.at
@@ -179,7 +179,7 @@ class Playback:
         return OutputLaw(scale, driven.bias, position_gain, driven.plan.centre, limit)
 
     def _play(self, scale: float = 1.0, loop: float | None = None) -> None:
-        """Put the laws of all excited joints in force; `loop` [V/m] overrides their own."""
+        """Apply the laws of all excited joints; `loop` [V/m] overrides their own."""
         self.session.apply(
             {d.joint: self._law(d, scale, d.loop if loop is None else loop) for d in self.joints}
         )
@@ -192,7 +192,7 @@ class Playback:
             self._play(size / sizes, loop)
 
     def _loosen(self, firm: float) -> None:
-        """Lower the position gain to the slow loop's, no faster than the loop itself settles."""
+        """Lower the position gain to the slow loop's, no faster than the loop settles."""
         loop, loose = firm, self._loose()
         slowest = min(d.gain for d in self.joints)
         while loop * ENGINE.looser > loose:
@@ -204,11 +204,11 @@ class Playback:
         return min(d.centring.position_gain for d in self.joints)
 
     def keep_on(self, seconds: float) -> None:
-        """Play on under the slow loop, without records, with an eye on the locks."""
+        """Continue under the slow loop, without records, checking the locks."""
         self._go_on(seconds)
 
     def _go_on(self, seconds: float) -> None:
-        """Play on for a time, wherever that ends, with an eye on the locks."""
+        """Continue for a time, to any tick, checking the locks."""
         self.session.wait(seconds, self._watch_locks)
 
     def _watch_locks(self) -> None:
@@ -217,12 +217,12 @@ class Playback:
         self._checked = self.session.now
 
     def _advance(self, samples: int) -> None:
-        """Go on to the boundary `samples` later, with an eye on the locks."""
+        """Continue to the boundary `samples` later, checking the locks."""
         self.at += samples
         self.session.until(self.at, self._watch_locks)
 
     def _find_biases(self, samples: int) -> None:
-        """Take each bias from the last `samples`, or the last two periods if those are fewer."""
+        """Compute each bias from the last `samples`, or the last two periods if those are fewer."""
         last = self.session.now
         first = last - min(samples, 2 * self.step.period)
         self.joints = tuple(
@@ -251,10 +251,10 @@ class Playback:
         return [self.session.piston(d.joint, first, self.at) for d in self.joints]
 
     def _stretch(self, samples: int) -> list[Motion] | None:
-        """Play on for whole periods; returns how each joint moved.
+        """Continue for whole periods; return how each joint moved.
 
-        None, if a piston had to be kept from leaving its limits: then the biases were changed at
-        once, and the stretch ended with the period begun.
+        None if a piston was about to leave its limits: then the biases were changed at once, and
+        the stretch ended with the period begun.
         """
         first, last = self.at, self.at + samples
         while self.at < last:
@@ -271,7 +271,7 @@ class Playback:
         return moved
 
     def _correct(self, first: int, last: int) -> bool:
-        """Correct the biases of pistons about to leave their limits; says whether any was."""
+        """Correct the biases of pistons about to leave their limits; return whether any was."""
         measured = [
             corrected(
                 driven,

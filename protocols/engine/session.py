@@ -1,4 +1,4 @@
-"""A conversation with the bench: laws in force, samples read so far, waiting in device time."""
+"""The session with the bench: laws in force, samples read so far, waiting in device time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Watch = Callable[[], None]
 
 
 class OpenRecord(Protocol):
-    """A record being taken: complete where its `with` block ends, partial if it is left early."""
+    """A record in progress: complete at the end of its `with` block, partial if left early."""
 
     def __enter__(self) -> Self:
         """Begin the record."""
@@ -36,14 +36,14 @@ class OpenRecord(Protocol):
         """End the record."""
 
     def note(self, **attributes: str | float | int) -> None:
-        """Add what is known of it only now."""
+        """Add attributes that are known only now."""
 
     def discard(self, reason: str) -> None:
-        """Make it no record; its samples stay in the run."""
+        """Discard the record; its samples stay in the run."""
 
 
 class BenchSession(Protocol):
-    """What the engine needs of `rig.bench.session.Bench`."""
+    """The engine's interface of `rig.bench.session.Bench`."""
 
     info: DeviceInfo
 
@@ -55,13 +55,13 @@ class BenchSession(Protocol):
         """Put the outputs to zero now; False if the device does not answer."""
 
     def reconnect(self, wait: float) -> None:
-        """Connect anew to a device that was lost."""
+        """Reconnect to a device that was lost."""
 
     def listen(self, judge: Judge) -> None:
-        """Let `judge` take or refuse the commands of screens."""
+        """Let `judge` accept or refuse the commands of screens."""
 
     def status(self, **changes: Any) -> None:
-        """Say where the protocol stands."""
+        """Publish the state of the protocol."""
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
         """Note one event in the run's log."""
@@ -75,21 +75,21 @@ class BenchSession(Protocol):
     def exchange(self, more: bool = False) -> SampleBlock:
         """Read one block, checked and journalled; raises what ends a run, outputs zeroed.
 
-        `more` says that another exchange follows with no command between them.
+        `more` states that another exchange follows without a command between them.
         """
 
     def guard(self, roles: Sequence[JointRole]) -> None:
-        """Say what each joint does, and so which limits hold."""
+        """Set the role of each joint, and thereby its limits."""
 
     def record(
         self, meta: RecordMeta | None = None, *, start_tick: int | None = None,
         ticks: int | None = None,
     ) -> OpenRecord:  # fmt: skip
-        """Make a record of `ticks` samples from `start_tick`, to be entered by `with`."""
+        """Begin a record of `ticks` samples from `start_tick`, used in a `with` block."""
 
 
 class Session:
-    """Holds the laws in force and the samples read lately; every wait is in device time."""
+    """Holds the laws in force and the recent samples; every wait is in device time."""
 
     def __init__(
         self, bench: BenchSession, rig: Rig, keep: int, machine: StateMachine, heed: Watch
@@ -107,7 +107,7 @@ class Session:
         self._ring = np.full((keep, len(rig.recorded)), np.nan)  # NaN where lost
 
     def apply(self, changes: Mapping[int, OutputLaw], restart: bool = False) -> int:
-        """Put new laws in force for some joints; returns the tick from which they hold.
+        """Apply new laws for some joints; return the tick from which they hold.
 
         Raises RuntimeError for any law but zero while the engine is at rest.
         """
@@ -118,17 +118,17 @@ class Session:
         return self.bench.apply(tuple(self.laws), restart)
 
     def off(self) -> None:
-        """Put every output to zero."""
+        """Zero every output."""
         self.apply(dict.fromkeys(range(self.joints), OFF))
 
     def forget(self) -> None:
-        """Drop what was read and the laws: the device was connected anew."""
+        """Drop samples and laws, because the device was reconnected."""
         self._ring[:] = np.nan
         self.laws = [OFF] * self.joints
         self.now = 0
 
     def until(self, tick: int, watch: Watch | None = None) -> None:
-        """Read blocks until sample `tick` - 1 is in; `watch` is called after each."""
+        """Read blocks up to sample `tick` - 1; `watch` is called after each."""
         while self.now < tick:
             self._heed()
             more = tick - self.now > self.bench.info.block_samples
@@ -142,7 +142,7 @@ class Session:
                 watch()
 
     def wait(self, seconds: float, watch: Watch | None = None) -> int:
-        """Read for a time from now on; returns the tick where it began."""
+        """Read for a time from now on; return the tick at its beginning."""
         first = self.now
         self.until(first + max(1, round(seconds * self.rate)), watch)
         return first
@@ -156,14 +156,14 @@ class Session:
         column = self._columns[name]
         begin, end = max(first, self.now - len(self._ring)), min(last, self.now)
         if (begin, end) == (first, last):
-            return self._ring[self._places(first, last), column].copy()  # for the ring goes on
+            return self._ring[self._places(first, last), column].copy()  # the ring is overwritten
         values = np.full(last - first, np.nan)
         if begin < end:
             values[begin - first : end - first] = self._ring[self._places(begin, end), column]
         return values
 
     def _places(self, first: int, last: int) -> slice | NDArray[np.int64]:
-        """Return where ticks [first, last) stand in the ring: a slice unless its end is between."""
+        """Return the indices of ticks [first, last) in the ring, a slice if contiguous."""
         size = len(self._ring)
         begin = first % size
         if begin + last - first <= size:

@@ -1,4 +1,4 @@
-"""The states of a run, the only ways from one to the next, and why a run ends early.
+"""The states of a run, their transitions, and reasons for an early end.
 
     idle        outputs at zero; between two steps
     checking    the plan is proved on the twin; no device is connected
@@ -10,9 +10,9 @@
     tripped     a safety limit was passed; outputs at zero, the trip latched
     safe        outputs confirmed at zero; the run is over
 
-Only `homing` leads from rest to motion, and only from `idle`: whatever was interrupted begins again
-with its places and locks. A session refuses every output law in a state that is at rest, so a
-pause that someone forgot cannot move anything.
+Only `homing` leads from rest to motion, and only from `idle`: after an interruption, positioning
+and locking are repeated. A session refuses every output law in a state of rest, so that nothing can
+move in a forgotten pause.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ OnChange = Callable[[EngineState, EngineState, str], None]
 
 
 class StateMachine:
-    """Holds the state of one run; every change is passed on, those before a listener are kept."""
+    """The state of one run; changes are passed to a listener, earlier ones when it is added."""
 
     def __init__(self) -> None:
         self._state = EngineState.IDLE
@@ -71,16 +71,16 @@ class StateMachine:
 
     @property
     def state(self) -> EngineState:
-        """The state now."""
+        """The present state."""
         return self._state
 
     @property
     def energised(self) -> bool:
-        """Whether outputs other than zero are allowed now."""
+        """Whether outputs other than zero are allowed."""
         return self._state in ENERGISED
 
     def to(self, state: EngineState, why: str = "") -> None:
-        """Change the state; raises RuntimeError for a way that does not exist."""
+        """Change the state; raises RuntimeError for an invalid transition."""
         if state is self._state:
             return
         if state not in WAYS[self._state]:
@@ -93,7 +93,7 @@ class StateMachine:
             self._listener(before, state, why)
 
     def listen(self, listener: OnChange) -> None:
-        """Pass every change to `listener`, beginning with those that came before it."""
+        """Pass every change to `listener`, earlier ones first."""
         self._listener = listener
         early, self._early = self._early, []
         for before, after, why in early:
@@ -101,14 +101,14 @@ class StateMachine:
 
 
 class ProtocolAborted(Exception):
-    """The bench did not do what the step needs; the message names joint, measured, expected.
+    """The bench did not do what a step needs; the message names joint, measured, expected.
 
-    The bench zeroes the outputs on this as on any other end of a run.
+    The bench zeroes the outputs, as at any other end of a run.
     """
 
 
 class LockFailed(ProtocolAborted):
-    """A joint that was to stand still did not; `joint` is 1-based, lengths in m."""
+    """A locked joint moved; `joint` is 1-based, lengths in m."""
 
     def __init__(self, step: str, joint: int, what: str, measured: float, expected: str) -> None:
         self.step = step
@@ -122,4 +122,4 @@ class LockFailed(ProtocolAborted):
 
 
 class RunEnded(ProtocolAborted):
-    """A person, or what stands for one, ended the run; no rule of the protocol goes on after it."""
+    """A person, or a default answer, ended the run; no rule of the protocol continues it."""

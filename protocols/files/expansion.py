@@ -1,9 +1,8 @@
-"""Replacing what is written once by what is meant: parameters, sweeps, includes.
+"""Expansion of parameters, sweeps and includes.
 
-Works on the plain data of a file, so that a parameter may stand for any value. Every step that
-results keeps the lines of the file it came from, so that what is wrong in it is named there. What
-is wrong in a step is noted, and the steps after it are read all the same: a person corrects a file
-once, not once for each mistake.
+Works on the plain data of a file, so that a parameter may replace any value. Every resulting step
+keeps its lines in the file, so that errors name them. After an error the following steps are still
+read, so that all errors are reported at once.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Lines = Mapping[Path, int]
 
 @dataclass(frozen=True)
 class RawStep:
-    """A step as plain data, the line of each of its keys, and whether another file defined it."""
+    """A step as plain data, the line of each of its keys, and whether another file defines it."""
 
     data: Any
     lines: Lines
@@ -59,7 +58,7 @@ class Expander:
     problems: list[Problem] = field(default_factory=list)
 
     def steps(self, data: Any, path: Path, scope: Scope) -> list[RawStep]:
-        """Return the steps of a list, expanded; `problems` gets what is wrong, with its line.
+        """Return the steps of a list, expanded; `problems` receives errors with their lines.
 
         Raises InputError for more steps than a protocol may have.
         """
@@ -222,18 +221,18 @@ class Expander:
 
     def _note(self, where: Path, text: str) -> None:
         problem = (self._line(where), f"{self._at(where)}: {text}")
-        if problem not in self.problems:  # a sweep reads its steps once for each value
+        if problem not in self.problems:  # a sweep reads its steps for each value
             self.problems.append(problem)
 
 
 def unknown_parameter(name: str, known: Mapping[str, Any]) -> str:
-    """Return the refusal of a parameter that the file does not declare."""
+    """Return the error of a parameter that the file does not declare."""
     has = " ".join(known) if known else "none; declare them under 'parameters'"
     return f"no parameter {name!r}; the file has: {has}"
 
 
 def _numbered(step: RawStep, number: int) -> RawStep:
-    """Return a step with a number behind its name, and behind those nested in it."""
+    """Return a step with a number appended to its name and those nested in it."""
     return RawStep(_renamed(step.data, f"_{number}"), step.lines, step.included)
 
 
@@ -251,7 +250,7 @@ def _renamed(data: Any, ending: str) -> Any:
 
 
 def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
-    """Return the steps, with a number behind names that an included file uses once more."""
+    """Return the steps, with a number appended to repeated names of an included file."""
     taken = {s.data.get("name") for s in steps if not s.included and isinstance(s.data, dict)}
     unique = []
     for step in steps:

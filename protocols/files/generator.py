@@ -1,7 +1,7 @@
-"""Python protocols: a function that yields the same steps, for what a file should not do.
+"""Python protocols: a function that yields steps, for logic beyond a file.
 
-The module states what the head of a file states, as a dictionary `PROTOCOL`, and defines
-`steps(parameters)`, which yields steps as objects or as the dictionaries that a file would hold:
+The module has the head of a file as a dictionary `PROTOCOL`, and defines `steps(parameters)`, which
+yields steps as objects or as the dictionaries of a file:
 
     PROTOCOL = {"name": "falling", "joints": 2, "parameters": {"amplitude": "0.4 V"}}
 
@@ -9,7 +9,8 @@ The module states what the head of a file states, as a dictionary `PROTOCOL`, an
         for n in range(3):
             yield {"name": f"size_{n}", "excite": [...]}
 
-All steps are drawn before anything is resolved, so that a Python protocol passes the same checks.
+All steps are generated before anything is resolved, so that a Python protocol passes the same
+checks.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rig.model.parse import InputError, validate_model
 
 
 def load_generator(path: Path, values: Mapping[str, Any]) -> Protocol:
-    """Run a Python protocol's generator to its end; raises InputError naming what is wrong in it.
+    """Run a Python protocol's generator to its end; raises InputError naming the error.
 
     `values` replace those of its `PROTOCOL["parameters"]`.
     """

@@ -14,7 +14,7 @@ _PLAIN: Final = ("integer", "number", "boolean")
 def protocol_schema() -> dict[str, Any]:
     """Return the schema; its `$id` ends in the version of the language.
 
-    Numbers may also be references to parameters, which stand in the file as texts.
+    Numbers may also be references to parameters, which are texts in the file.
     """
     made = Protocol.model_json_schema()
     schema: dict[str, Any] = _with_references(made)

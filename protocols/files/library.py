@@ -1,4 +1,4 @@
-"""Where protocols come from: the shipped ones by name, a person's own by path."""
+"""Sources of protocols: the shipped ones by name, the user's own by path."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _NOTHING = RawStep({"mark": "in place of steps that could not be read"}, {})
 
 
 def shipped_names() -> tuple[str, ...]:
-    """Name the protocols that come with the program."""
+    """Return the names of the shipped protocols."""
     folder = resources.files("protocols") / "shipped"
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
 
 
 def load(name: str | Path, values: Mapping[str, Any] | None = None) -> Protocol:
-    """Read a shipped protocol by name or a file by path; raises InputError saying what is wrong.
+    """Read a shipped protocol by name or a file by path; raises InputError naming the error.
 
     `values` replace those of the file's `parameters`. A path that ends in `.py` is a Python
     protocol (`protocols.files.generator`).
@@ -44,7 +44,7 @@ def load(name: str | Path, values: Mapping[str, Any] | None = None) -> Protocol:
 def read_protocol(
     text: str, source: str, values: Mapping[str, Any] | None = None, folder: Path | None = None
 ) -> Protocol:
-    """Read the text of a protocol file; `folder` is where the files it names are."""
+    """Read the text of a protocol file; its relative paths start from `folder`."""
     return _protocol(text, source, values or {}, folder, (source,))[0]
 
 
@@ -63,7 +63,7 @@ def parsed_values(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def _text(name: str, folder: Path | None) -> tuple[str, str, Path | None]:
-    """Return a protocol's text, its shown name, and the folder of the files it names."""
+    """Return a protocol's text, its displayed name, and the folder of its relative paths."""
     if name in shipped_names():
         text = (resources.files("protocols") / "shipped" / f"{name}.yaml").read_text("utf-8")
         return text, f"{name}.yaml", None
@@ -89,7 +89,7 @@ def _read(
 def _protocol(
     text: str, source: str, values: Mapping[str, Any], folder: Path | None, chain: tuple[str, ...]
 ) -> tuple[Protocol, list[Any]]:
-    """Return a protocol and its steps as plain data, everything in them replaced."""
+    """Return a protocol and its steps as plain data, fully expanded."""
     data, lines = load_yaml(text, source)
     if not isinstance(data, dict):
         raise InputError(f"{source}:1: expected keys and values, found {type(data).__name__}")

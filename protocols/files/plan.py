@@ -1,4 +1,4 @@
-"""From a protocol and a rig to a plan: everything that can be checked before anything moves.
+"""Resolution of a protocol on a rig into a plan, with all checks possible before any motion.
 
 A plan is in device terms: waveforms in samples at the rig's rate, joints counted from 0.
 """
@@ -30,10 +30,10 @@ LONGEST_RECORD = 86400.0  # [s]
 
 @dataclass(frozen=True)
 class Overrides:
-    """What a person changes of a protocol without editing its file; None leaves it alone.
+    """Changes of a protocol without editing its file; None means unchanged.
 
-    `amplitude_scale` multiplies every amplitude, `seed` gives the steps' multisines the seeds
-    seed, seed + 1, ..., `steps` keeps only the steps named; `parameters` are for the reader.
+    `amplitude_scale` multiplies every amplitude, `seed` gives the steps' multisines the seeds seed,
+    seed + 1, ..., `steps` keeps only the steps named; `parameters` are for the reader.
     """
 
     repeats: int | None = None
@@ -46,7 +46,7 @@ class Overrides:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the engine runs: the protocol with its overrides, its steps in order, as resolved."""
+    """A protocol with its overrides, and its steps in order, as resolved."""
 
     protocol: Protocol
     rig: str
@@ -55,12 +55,12 @@ class Plan:
 
     @property
     def place(self) -> Place:
-        """How pistons are brought to their places."""
+        """Settings for positioning pistons."""
         return self.protocol.place
 
     @property
     def steps(self) -> tuple[StepPlan, ...]:
-        """The excitations that leave records."""
+        """The excitations with records."""
         return tuple(
             plan
             for part in every_planned(self.sequence)
@@ -70,27 +70,27 @@ class Plan:
 
     @property
     def excitations(self) -> tuple[StepPlan, ...]:
-        """Everything that moves a joint by a waveform, in order."""
+        """All excitations, in order."""
         return tuple(plan for part in self.sequence for plan in part.all_excitations)
 
     @property
     def seconds(self) -> float:
-        """Expected length [s]; what only the bench decides counts as little as it may."""
+        """Expected length [s]; conditions count with their least time."""
         return sum(part.seconds for part in self.sequence)
 
     @property
     def longest(self) -> float:
-        """Length [s] where every condition comes at its time-out."""
+        """Length [s] if every condition lasts until its time-out."""
         return sum(part.longest for part in self.sequence)
 
     @property
     def records(self) -> tuple[str, ...]:
-        """Names of the records it leaves, in their order; of a repetition those of one round."""
+        """Names of the records, in order; of a repetition those of one round."""
         return tuple(name for part in every_planned(self.sequence) for name in part.records)
 
     @property
     def estimates(self) -> tuple[str, ...]:
-        """The parameters whose on-line estimates its conditions ask for."""
+        """The parameters whose on-line estimates its conditions need."""
         conditions = (part.condition for part in every_planned(self.sequence))
         return tuple(dict.fromkeys(name for c in conditions if c for name in c.estimates))
 
@@ -119,7 +119,7 @@ def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) ->
 
 
 def override(protocol: Protocol, overrides: Overrides) -> Protocol:
-    """Return the protocol with what was overridden; raises InputError for what does not fit."""
+    """Return the protocol with overrides applied; raises InputError for an invalid one."""
     if overrides.repeats is not None and not 1 <= overrides.repeats <= MAX_REPEATS:
         raise InputError(f"repeats is {overrides.repeats}; expected 1 to {MAX_REPEATS}")
     if not overrides.amplitude_scale > 0.0 or not math.isfinite(overrides.amplitude_scale):
@@ -207,7 +207,7 @@ class _RigPlanner:
             except InputError as error:
                 problems += str(error).splitlines()
                 if isinstance(step, LockStep):
-                    break  # what follows would lack its joint
+                    break  # later steps would lack its joint
         if problems:
             raise InputError("\n".join(dict.fromkeys(problems)))
         return tuple(planned)
@@ -252,7 +252,7 @@ class _RigPlanner:
         )
 
     def _excite(self, part: Excite, step: str) -> ExcitePlan:
-        # Steps of a sweep often share a waveform, and the flattest multisine takes a while.
+        # Steps of a sweep often share a waveform, and a multisine of low crest factor takes long.
         name = (part.signal.model_dump_json(), part.joint)
         if name not in self._waves:
             self._waves[name] = _waveform(part, step, self._rig)

@@ -1,7 +1,7 @@
-"""The protocol file: frozen models that hold data in SI and refuse what makes no sense alone.
+"""The protocol file: frozen models that hold data in SI and reject inconsistent data.
 
-Steps and signals are kinds of their own (`protocols.steps`, `protocols.signals`). What depends on
-the rig (joints that exist, limits, sample rate) is checked by `protocols.files.plan`.
+Steps and signals are separate classes (`protocols.steps`, `protocols.signals`). What depends on the
+rig (joints that exist, limits, sample rate) is checked by `protocols.files.plan`.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from rig.model.parameters import MAX_JOINTS
 from rig.model.quantity import Time
 
 VERSION: Final = 2
-INCOMPLETE: Final = "incomplete"  # validation context: steps are missing, refused before
+INCOMPLETE: Final = "incomplete"  # validation context: steps are missing, already rejected
 
 
 class OnTrip(ProtocolPart):
-    """What follows a safety trip; the outputs are at zero and the trip latched before.
+    """Actions after a safety trip; the outputs are zeroed and the trip latched before.
 
     A trip always ends the run: only a person clears it.
     """
 
     mark: str = Field(default="", description="written into the run's log")
     record: Time = Field(
-        default=2.0, ge=2.0, le=60.0, description="goes on being recorded, outputs at zero"
+        default=2.0, ge=2.0, le=60.0, description="time of further recording, outputs at zero"
     )
 
 
 class OnError(ProtocolPart):
-    """What follows a step that the bench did not do: a lock that fails, a condition timed out."""
+    """Actions after a failed step: a lock that fails, a condition timed out."""
 
     then: Literal["stop", "skip"] = Field(
         default="stop", description="end the run, or close the valves and go on with the next step"
@@ -48,7 +48,7 @@ class OnError(ProtocolPart):
 
 
 class Retry(ProtocolPart):
-    """How often a lost device is connected to again; nothing else is ever retried."""
+    """How often to reconnect to a lost device; nothing else is ever retried."""
 
     times: int = Field(ge=1, le=20, description="in the whole run")
     wait: Time = Field(default=5.0, gt=0, description="before each attempt")
@@ -97,9 +97,9 @@ class Protocol(ProtocolPart):
         return steps
 
     @model_validator(mode="after")
-    def _every_joint_has_a_job(self, info: ValidationInfo) -> Self:
+    def _every_joint_has_a_role(self, info: ValidationInfo) -> Self:
         if info.context and info.context.get(INCOMPLETE):
-            return self  # a lock may be among the steps that could not be read
+            return self  # a lock may be in a step that could not be read
         wanted = set(range(1, self.joints + 1))
         locked: set[int] = set()
         for step in every_step(self.steps):
@@ -121,7 +121,7 @@ class Protocol(ProtocolPart):
 
 
 def later_version(version: int) -> str:
-    """Return the sentence that refuses a file of a later version."""
+    """Return the error for a file of a later version."""
     return (
         f"version {version} is later than this program reads, which is {VERSION}; "
         "use a newer bramah"

@@ -9,7 +9,7 @@ import yaml
 
 from protocols.files.schema import Protocol
 
-# Unit written beside each quantity, and how many of it make an SI unit.
+# Unit written after each quantity, and its number per SI unit.
 _UNITS: Mapping[str, tuple[str, float]] = {
     "position_gain": ("V/m", 1.0),
     "limit": ("V", 1.0),
@@ -51,7 +51,7 @@ class _Row(list[Any]):
 
 
 class _Dumper(yaml.SafeDumper):
-    """A dumper of its own, so that the library's is left alone."""
+    """A separate dumper, so that the library's is unchanged."""
 
 
 _Dumper.add_representer(
@@ -60,7 +60,7 @@ _Dumper.add_representer(
 
 
 def protocol_text(protocol: Protocol, comment: str = "") -> str:
-    """Return the YAML of a protocol, `comment` above it; only what differs from the defaults."""
+    """Return the YAML of a protocol with `comment` above it, without default values."""
     data = _quantities(protocol.model_dump(mode="json", exclude_defaults=True))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     body = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)

@@ -1,4 +1,4 @@
-"""Conditions on what is measured or estimated: read once, judged as often as wanted, no code run.
+"""Conditions on measured or estimated values: parsed once, evaluated repeatedly, without code.
 
     condition   = comparison, {("and" | "or"), comparison}    "and" binds before "or"
     comparison  = name, (">" | ">=" | "<" | "<="), number, [unit]
@@ -6,8 +6,8 @@
 
 `oil_temperature > 40 degC`, `b.rsd < 0.5 %`, `supply_pressure < 6.5 MPa or elapsed > 2 min`.
 A channel counts as its mean over the last 0.1 s; `elapsed` is the time in the step; a parameter is
-the on-line estimate and its `.rsd` the standard deviation over the value. What is not known yet
-fulfils no comparison.
+the on-line estimate and its `.rsd` the standard deviation over the value. An unknown value fulfils
+no comparison.
 """
 
 from __future__ import annotations
@@ -46,42 +46,42 @@ class Comparison:
     value: float
 
     def holds(self, values: Mapping[str, float]) -> bool:
-        """Say whether it holds; never for a value that is missing or not a number."""
+        """Return whether it holds; False for a missing or NaN value."""
         seen = values.get(self.name, math.nan)
         return math.isfinite(seen) and _COMPARE[self.sign](seen, self.value)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Alternatives, each a group of comparisons that must hold together; `text` as it was read."""
+    """Alternatives, each a group of comparisons that must hold together; `text` as read."""
 
     text: str
     alternatives: tuple[tuple[Comparison, ...], ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What must be known to judge it."""
+        """The names of the values it needs."""
         return tuple(dict.fromkeys(c.name for group in self.alternatives for c in group))
 
     @property
     def estimates(self) -> tuple[str, ...]:
-        """The parameters whose on-line estimates it asks for."""
+        """The parameters whose on-line estimates it needs."""
         known = [n.removesuffix(RSD) for n in self.names if n != ELAPSED and not _is_channel(n)]
         return tuple(dict.fromkeys(known))
 
     def holds(self, values: Mapping[str, float]) -> bool:
-        """Say whether it holds for `values` in SI by name."""
+        """Return whether it holds for `values` in SI by name."""
         return any(all(c.holds(values) for c in group) for group in self.alternatives)
 
     def readings(self, values: Mapping[str, float]) -> str:
-        """Return what it compares, in an operator's units: 'oil_temperature 38.2 °C'."""
+        """Return the values it compares, in display units: 'oil_temperature 38.2 °C'."""
         names = [name for name in self.names if name != ELAPSED]
         seen = [_reading(name, values.get(name, math.nan)) for name in names]
         return ", ".join(seen) or "it compares the time alone"
 
 
 def parse_condition(text: str) -> Condition:
-    """Read a condition; raises ValueError that says which part is wrong and what was expected."""
+    """Parse a condition; raises ValueError naming the wrong part and what was expected."""
     if len(text) > LONGEST:
         raise ValueError(f"a condition of {len(text)} characters; expected at most {LONGEST}")
     groups = re.split(r"\s+or\s+", text.strip())

@@ -1,4 +1,4 @@
-"""Finding plug-ins: every class of a kind that stands in a module of a folder."""
+"""Discovery of plug-ins: every class of a kind in the modules of a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base of every piece of a protocol file: frozen, in SI, unknown keys refused."""
+"""Base of every part of a protocol file: frozen, in SI, unknown keys refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rig.model.quantity import UnitError, parse_quantity, shown_in_schema
 
 
 class ProtocolPart(BaseModel):
-    """A piece of a protocol file."""
+    """A part of a protocol file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -1,4 +1,4 @@
-"""What every kind of signal can do; a kind is one class in one module of `protocols.signals`."""
+"""Base of every kind of signal; a kind is one class in one module of `protocols.signals`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rig.model.quantity import Length, UnitError, Voltage, parse_quantity
 class SignalKind(ProtocolPart):
     """A periodic command of one valve; a kind is recognised by its field `kind`.
 
-    Adding one: a subclass in a module of `protocols.signals` with ``kind: Literal["name"]``, its
+    To add one: a subclass in a module of `protocols.signals` with ``kind: Literal["name"]``, its
     fields, and `waveform`.
     """
 
@@ -30,7 +30,7 @@ class SignalKind(ProtocolPart):
         """Return the signal with all its amplitudes multiplied."""
 
     def sized(self, gain: float, sample_rate: float) -> Waveform:
-        """Return one period for a piston that goes by `gain` [m/(s V)]."""
+        """Return one period for a piston with `gain` [m/(s V)]."""
         return self.waveform(sample_rate)
 
     def reseeded(self, seed: int) -> Self:
@@ -39,7 +39,7 @@ class SignalKind(ProtocolPart):
 
 
 class AmplitudeSignal(SignalKind):
-    """A signal of one size: volts of command, or millimetres of piston to either side."""
+    """A signal with one amplitude: volts of command, or millimetres of piston to either side."""
 
     amplitude: Voltage = Field(
         default=0.0,
@@ -91,9 +91,9 @@ class AmplitudeSignal(SignalKind):
         return self.model_copy(update={"amplitude": factor * self.amplitude})
 
     def sized(self, gain: float, sample_rate: float) -> Waveform:
-        """Return one period for a piston that goes by `gain` [m/(s V)].
+        """Return one period for a piston with `gain` [m/(s V)].
 
-        A travel s asks for the volts with which the integral of the command peaks at s / gain.
+        For a travel s, the volts with which the integral of the command peaks at s / gain.
         """
         made = self.waveform(sample_rate)
         if self.travel is None:

@@ -1,8 +1,8 @@
-"""Periodic commands in samples, and the tools that make them.
+"""Periodic commands in samples, and tools to make them.
 
-All are uploaded to the device as one period that repeats. A piston integrates the command of its
-valve, so a waveform starts where its integral passes its own mean: a piston that stood at rest then
-moves about the place where it stood.
+Each is uploaded to the device as one period, which repeats. A piston integrates the command of its
+valve, so a waveform starts where its integral passes its own mean: a piston at rest then moves
+about its initial position.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LineNumbers = NDArray[np.int64]
-MAX_CYCLES = 1000  # of a sine in one waveform; beyond, its frequency does not suit the clock
-LONGEST_PERIOD = 600.0  # [s] a waveform beyond this is a mistake, and so is a common period of two
+MAX_CYCLES = 1000  # of a sine in one waveform; with more, its frequency does not suit the clock
+LONGEST_PERIOD = 600.0  # [s] a longer waveform, or common period of two, is a mistake
 NYQUIST_SHARE = 4.0  # excited lines stay below Nyquist / 4
-FAINT = 1e-3  # of the largest line; a fainter one is no excitation
+FAINT = 1e-3  # of the largest line; a smaller one does not count as excited
 SMOOTH = 8.0  # lines of a shape with edges end at this many times 1 / the edge's time
 
 
@@ -111,8 +111,8 @@ def sum_of_lines(n: int, lines: LineNumbers, amplitudes: NDArray[np.complex128])
 def shaped(samples: Array, highest: float, sample_rate: float) -> Waveform:
     """Return the waveform of any shape (n,) [V], its mean removed and its lines limited.
 
-    What lies above `highest` [Hz] is taken away, and what is fainter than `FAINT` of the largest
-    line is not counted as excited. Raises ValueError for a shape without any variation.
+    Lines above `highest` [Hz] are removed, and lines below `FAINT` of the largest do not count as
+    excited. Raises ValueError for a constant shape.
     """
     n = len(samples)
     if n < 4 or not np.isfinite(samples).all() or np.ptp(samples) == 0.0:

@@ -1,4 +1,4 @@
-"""Kinds of signal, one class in one module each; a new module here is found by itself."""
+"""Kinds of signal, one class in one module each; modules here are discovered automatically."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ SIGNALS: tuple[type[SignalKind], ...] = classes_in(sys.modules[__name__], Signal
 if TYPE_CHECKING:
     Signal = SignalKind
 else:
-    _union: Any = Union[SIGNALS]  # noqa: UP007 - made of what was found
+    _union: Any = Union[SIGNALS]  # noqa: UP007 - of the classes discovered
     Signal = Annotated[_union, Field(discriminator="kind")]

@@ -15,8 +15,8 @@ from rig.model.quantity import Frequency, Time
 class Chirp(AmplitudeSignal):
     """A sin(phase(t)), its frequency linear from `f_min` to `f_max` and back within `period`.
 
-    Up and down, so that one period joins the next without a jump of frequency; the whole number
-    of cycles that this needs is had by a slight change of `f_max`.
+    Up and down, so that periods join without a jump of frequency; `f_max` is changed slightly to
+    obtain the whole number of cycles that this needs.
     """
 
     kind: Literal["chirp"]

@@ -19,8 +19,8 @@ class FileSignal(SignalKind):
     """One period of a command from a CSV file: a column of volts, or `time` [s] and volts.
 
     A file with times is resampled to the bench's rate; without, its rows are the bench's samples.
-    Its mean is removed: the bias that keeps the piston centred is found on the bench. What lies
-    above `f_max` is taken away.
+    Its mean is removed: the bias that keeps the piston centred is found on the bench. Lines above
+    `f_max` are removed.
     """
 
     kind: Literal["file"]
@@ -50,7 +50,7 @@ class FileSignal(SignalKind):
         return self.model_copy(update={"scale": factor * self.scale})
 
     def waveform(self, sample_rate: float) -> Waveform:
-        """Return the file's period at `sample_rate`; raises ValueError where it is none."""
+        """Return the file's period at `sample_rate`; raises ValueError for an unsuitable one."""
         volts = self.scale * np.array(self.volts)
         if self.times:
             times = np.array(self.times)
@@ -67,7 +67,7 @@ class FileSignal(SignalKind):
 
 
 def _columns(path: Path) -> tuple[Array, Array]:
-    """Return (times [s] or empty, volts) of a CSV file; raises ValueError naming what is wrong."""
+    """Return (times [s] or empty, volts) of a CSV file; raises ValueError naming the error."""
     try:
         lines = path.read_text("utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as error:

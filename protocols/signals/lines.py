@@ -1,4 +1,4 @@
-"""Chosen lines, as a design of experiments writes them."""
+"""A signal of chosen lines, as written by the design of experiments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random-phase multisines with empty lines that show what nonlinearity puts there."""
+"""Random-phase multisines with empty lines for detecting nonlinearity."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Multisine(AmplitudeSignal):
         """Return (excited, detection) line numbers; raises ValueError if no line is left.
 
         With a fraction, one line at random in every full group of consecutive candidates stays
-        empty, so that detection lines cover the band evenly and yet without a pattern.
+        empty, so that detection lines cover the band evenly but not periodically.
         """
         slack = 1e-9  # 0.3 Hz / 0.1 Hz is 2.9999999999999996
         first = math.ceil(self.f_min / self.base_frequency - slack)
@@ -91,7 +91,7 @@ class Multisine(AmplitudeSignal):
 
         A_k follows f^-tilt and is scaled to the asked rms or peak. Of `draws` sets of phases the
         one is kept whose crest factors of command and of piston motion have the lowest product:
-        the stroke binds as much as the voltage does. The same seed gives the same samples. Raises
+        stroke and voltage both limit the amplitude. Equal seeds result in equal samples. Raises
         ValueError where the period is not a whole number of samples or a line is beyond Nyquist.
         """
         n = base_period(self.base_frequency, sample_rate)
@@ -102,7 +102,7 @@ class Multisine(AmplitudeSignal):
         weight = lines.astype(np.float64) ** -self.tilt
         phases = rng.uniform(0.0, 2.0 * np.pi, (self.draws, len(lines)))
         waves = [sum_of_lines(n, lines, weight * np.exp(1j * phase)) for phase in phases]
-        # All draws have the same rms, of command and of motion: comparing the peaks is enough.
+        # All draws have the same rms of command and motion, so that comparing peaks is sufficient.
         wave = min(waves, key=lambda w: float(np.ptp(w) * np.ptp(integral(w, lines))))
         size = np.sqrt(np.mean(wave**2)) if self.amplitude_is == "rms" else np.max(np.abs(wave))
         wave = wave * (self.volts / size)

@@ -17,8 +17,8 @@ _CORNER = 40.0  # lines up to so many times 1 / rise keep the corners to 1 % of 
 class Ramp(AmplitudeSignal):
     """0 to +A in `rise`, held for `hold`, back to 0, rest; then the same to -A.
 
-    With a small amplitude the spool passes its null slowly: what a dead band, a leak and the
-    friction at rest do shows there.
+    With a small amplitude the spool passes its null slowly, where dead band, leakage and static
+    friction are visible.
     """
 
     kind: Literal["ramp"]

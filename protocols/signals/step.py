@@ -21,8 +21,8 @@ from rig.model.quantity import Time
 class StepSignal(AmplitudeSignal):
     """+A for `width`, 0 for `rest`, -A for `width`, 0 for `rest`; edges last `edge` each.
 
-    The mean is zero, so that the piston comes back. An edge is a raised cosine: a command that
-    jumps within one sample hammers, and excites what no sample shows.
+    The mean is zero, so that the piston comes back. An edge is a raised cosine: a jump within one
+    sample would cause shocks and excite frequencies above Nyquist.
     """
 
     kind: Literal["step"]

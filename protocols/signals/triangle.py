@@ -1,4 +1,4 @@
-"""A command that runs up and down at constant slope."""
+"""A command that rises and falls at constant slope."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kinds of step, one class in one module each; a new module here is found by itself.
+"""Kinds of step, one class in one module each; modules here are discovered automatically.
 
 `STEPS` maps a kind's key to its class. `AnyStep` is their union, chosen by the key that a step has.
 """
@@ -18,7 +18,7 @@ STEPS: dict[str, type[StepKind]] = {found.key: found for found in sorted(_kinds,
 
 
 def kind_of_step(data: Any) -> str | None:
-    """Return the key of the kind that a step's data, or a step, is; None where it has none."""
+    """Return the key of the kind of a step, or of its data; None if it has none."""
     return choose_kind(data, STEPS)
 
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 else:
     _tagged = tuple(Annotated[found, Tag(f"{key} step")] for key, found in STEPS.items())
     AnyStep = Annotated[
-        Union[_tagged],  # noqa: UP007 - made of what was found
+        Union[_tagged],  # noqa: UP007 - of the classes discovered
         Discriminator(
             _tag_of_step,
             custom_error_type="step_kind",

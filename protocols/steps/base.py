@@ -1,6 +1,6 @@
-"""What every kind of step is: data of the file, its plan on a rig, and what it does at the bench.
+"""Base of every kind of step: data of the file, its plan on a rig, its actions at the bench.
 
-Adding one: a subclass of `StepKind` in a module of `protocols.steps`, with the key by which the
+To add one: a subclass of `StepKind` in a module of `protocols.steps`, with the key by which the
 file names it. The registry, the JSON schema, `check` and the engine then know it.
 """
 
@@ -23,7 +23,7 @@ NAME = r"^[a-z0-9]+(?:_[a-z0-9]+)*$"
 
 
 class Planner(Protocol):
-    """What a step may ask while it is resolved on a rig."""
+    """The resolver's interface for steps."""
 
     @property
     def rig(self) -> Rig:
@@ -47,7 +47,7 @@ class Planner(Protocol):
 
 @dataclass(frozen=True)
 class PlannedStep:
-    """A step resolved on a rig: in words, its expected time [s], what it excites, what it nests.
+    """A step resolved on a rig: title, expected time [s], excitations, nested steps.
 
     `least` and `most` [s] bound the time where only the bench decides it.
     """
@@ -69,7 +69,7 @@ class PlannedStep:
 
     @property
     def longest(self) -> float:
-        """The time [s] it may take at most."""
+        """The longest time [s]."""
         return self.seconds if self.most is None else self.most
 
     @property
@@ -80,10 +80,10 @@ class PlannedStep:
 
 
 class Actions(Protocol):
-    """What a step may do at the bench; the engine implements it.
+    """The actions of a step at the bench; the engine implements it.
 
-    Every one of these leaves the state machine in `idle` with the outputs at zero, unless it says
-    otherwise; raises what ends the run.
+    Each leaves the state machine in `idle` with the outputs at zero, unless stated otherwise, and
+    raises what ends the run.
     """
 
     def excite(self, planned: PlannedStep) -> None:
@@ -93,19 +93,19 @@ class Actions(Protocol):
         """Excite without taking records until a condition holds; False after `most` seconds."""
 
     def hold(self, planned: PlannedStep, locks: Sequence[LockPlan], seconds: float) -> None:
-        """Lock joints, stand still and take one record where the step has a name."""
+        """Lock joints, keep still, and take one record if the step has a name."""
 
     def lock(self, planned: PlannedStep, locks: Sequence[LockPlan]) -> None:
         """Prove that joints can be locked."""
 
     def rest(self, seconds: float, why: str) -> None:
-        """Let time pass with all outputs at zero."""
+        """Wait with all outputs at zero."""
 
     def wait(self, condition: Condition, most: float) -> bool:
         """Rest until a condition holds; False after `most` seconds."""
 
     def readings(self, condition: Condition) -> str:
-        """Return the present values of what a condition compares, with units."""
+        """Return the present values of a condition's names, with units."""
 
     def ask(self, question: Question) -> str:
         """Ask a person, outputs at zero; returns the answer."""
@@ -117,7 +117,7 @@ class Actions(Protocol):
         """Write a line into the run's log."""
 
     def fail(self, why: str) -> None:
-        """Fail the step with a reason; the protocol's `on_error` says what follows."""
+        """Fail the step with a reason; the protocol's `on_error` applies."""
 
     def end(self, why: str) -> None:
         """End the run with a reason, whatever `on_error` says."""
@@ -125,7 +125,7 @@ class Actions(Protocol):
 
 @dataclass(frozen=True)
 class Question:
-    """A question to the operator; `default` counts after `timeout` [s] where nobody attends."""
+    """A question to the operator; `default` is used after `timeout` [s] if unattended."""
 
     text: str
     answers: tuple[str, ...]
@@ -134,7 +134,7 @@ class Question:
 
 
 class StepKind(ProtocolPart):
-    """A step of a protocol; `key` is the key by which a file names the kind."""
+    """A step of a protocol; `key` names its kind in a file."""
 
     key: ClassVar[str]
     rank: ClassVar[int] = 1  # kinds of lower rank are recognised first
@@ -148,28 +148,28 @@ class StepKind(ProtocolPart):
 
     @abstractmethod
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Do it at the bench."""
+        """Execute the step at the bench."""
 
 
 class Macro(StepKind):
     """A step that the reader replaces by others before anything is resolved."""
 
     def plan(self, planner: Planner) -> PlannedStep:
-        """Refuse: nothing of it is left when a protocol is resolved."""
+        """Raise an error: macros are replaced before."""
         raise TypeError(f"{self.key} is replaced when a protocol file is read")
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Refuse: it is never planned."""
+        """Raise an error: macros are never planned."""
         raise TypeError(f"{self.key} is replaced when a protocol file is read")
 
 
 def by_rank(kind: type[StepKind]) -> tuple[int, str]:
-    """Return the order in which kinds are recognised."""
+    """Return the sort key of the order in which kinds are recognised."""
     return kind.rank, kind.key
 
 
 def choose_kind(data: Any, kinds: Mapping[str, type[StepKind]]) -> str | None:
-    """Return the key of the first kind whose key a step's data has; None for no kind."""
+    """Return the key of the first kind whose key is in a step's data; None for no kind."""
     if isinstance(data, StepKind):
         return data.key
     if not isinstance(data, dict):

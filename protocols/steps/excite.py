@@ -1,4 +1,4 @@
-"""Locking some joints and exciting the others: the step that records are taken in."""
+"""Locking some joints and exciting the others: the step with records."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import ClassVar, Self
 from pydantic import Field, model_validator
 
 from protocols.steps.base import NAME, Actions, PlannedStep, Planner, StepKind
-from protocols.steps.parts import Excite, Lock, require_one_job
+from protocols.steps.parts import Excite, Lock, require_one_role
 from rig.model.quantity import Time
 
 MAX_REPEATS = 1000
-MOVE_SECONDS = 4.0  # a joint's way to its place, for the estimate of the duration only
+MOVE_SECONDS = 4.0  # [s] for positioning a joint, for the estimate of the duration only
 
 
 class Step(StepKind):
-    """What is locked, what is excited, how long and how often."""
+    """Locked and excited joints, length and number of records."""
 
     key: ClassVar[str] = "excite"
     rank: ClassVar[int] = 0  # it may also have the keys `lock` and `warm_up`
@@ -29,19 +29,19 @@ class Step(StepKind):
         default=1, ge=1, le=1000, description="periods under the slow loop, before the first trim"
     )
     ramp: Time = Field(default=2.0, gt=0, description="the waveform grows to full size in [s]")
-    settle: Time = Field(default=1.0, gt=0, description="at rest before a lock is believed [s]")
+    settle: Time = Field(default=1.0, gt=0, description="at rest before a lock counts [s]")
     parameters: dict[str, str] = Field(
         default_factory=dict, description="of the sweep that made it; kept with its records"
     )
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """The joints (1-based) it gives a job to, locked ones first."""
+        """The joints (1-based) of the step, locked ones first."""
         return (*(part.joint for part in self.lock), *(part.joint for part in self.excite))
 
     @model_validator(mode="after")
-    def _one_job_per_joint(self) -> Self:
-        require_one_job(self.name, self.joints)
+    def _one_role_per_joint(self) -> Self:
+        require_one_role(self.name, self.joints)
         return self
 
     def plan(self, planner: Planner) -> PlannedStep:

@@ -1,4 +1,4 @@
-"""Standing still: what leaks and creeps shows."""
+"""Keeping still, to record leakage and creep."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pydantic import Field, model_validator
 
 from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 from protocols.steps.excite import MOVE_SECONDS
-from protocols.steps.parts import CLOSED, Lock, require_one_job
+from protocols.steps.parts import CLOSED, Lock, require_one_role
 from rig.model.quantity import Time
 
 
 class HoldStep(StepKind):
-    """Bring joints to their places, close the valves, and let time pass.
+    """Bring joints to their places, close the valves, and wait.
 
-    With a name a record of the whole time is taken. Without locks of its own or of an earlier
-    `lock` step nothing is moved before: every valve just stays closed.
+    With a name a record of the whole time is taken. Without locks, of this or of an earlier `lock`
+    step, nothing moves: every valve stays closed.
     """
 
     key: ClassVar[str] = "hold"
@@ -26,7 +26,7 @@ class HoldStep(StepKind):
 
     @model_validator(mode="after")
     def _valves_are_closed(self) -> Self:
-        require_one_job(self.name or self.key, tuple(part.joint for part in self.lock))
+        require_one_role(self.name or self.key, tuple(part.joint for part in self.lock))
         pushed = [part.joint for part in self.lock if part.at != CLOSED]
         if pushed:
             raise ValueError(
@@ -45,5 +45,5 @@ class HoldStep(StepKind):
         return PlannedStep(self, title, seconds, locks=locks, records=records)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Stand still."""
+        """Keep still."""
         actions.hold(planned, planned.locks, self.hold)

@@ -10,7 +10,7 @@ from protocols.steps.base import Macro
 
 
 class IncludeStep(Macro):
-    """Insert the steps of a shipped protocol, or of a file beside this one."""
+    """Insert the steps of a shipped protocol, or of another file."""
 
     key: ClassVar[str] = "include"
 

@@ -8,11 +8,11 @@ from pydantic import Field, model_validator
 
 from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 from protocols.steps.excite import MOVE_SECONDS
-from protocols.steps.parts import Lock, require_one_job
+from protocols.steps.parts import Lock, require_one_role
 
 
 class LockStep(StepKind):
-    """Prove that joints lock, and lock them in all steps that follow and do not name them."""
+    """Prove that joints lock, and lock them in all later steps that do not name them."""
 
     key: ClassVar[str] = "lock"
     rank: ClassVar[int] = 2  # other kinds may have locks too
@@ -20,8 +20,8 @@ class LockStep(StepKind):
     lock: tuple[Lock, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _one_job_per_joint(self) -> Self:
-        require_one_job(self.name or self.key, tuple(part.joint for part in self.lock))
+    def _one_role_per_joint(self) -> Self:
+        require_one_role(self.name or self.key, tuple(part.joint for part in self.lock))
         return self
 
     def plan(self, planner: Planner) -> PlannedStep:
@@ -32,5 +32,5 @@ class LockStep(StepKind):
         return PlannedStep(self, f"lock {title}", (MOVE_SECONDS + 2.0) * len(locks), locks=locks)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Lock them once, now."""
+        """Lock them once."""
         actions.lock(planned, planned.locks)

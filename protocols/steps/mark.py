@@ -10,7 +10,7 @@ from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 
 
 class MarkStep(StepKind):
-    """Write a line into the run's log, at this moment of the stream."""
+    """Write a line into the run's log at this time."""
 
     key: ClassVar[str] = "mark"
 

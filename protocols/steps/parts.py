@@ -1,9 +1,9 @@
-"""Pieces that several kinds of step share: places, locks, excited joints.
+"""Parts that several kinds of step share: places, locks, excited joints.
 
 Glossary: a *period* is the time after which the uploaded waveform starts again; a *record* is one
-repeat of one step, a whole number of periods; *centring* keeps the mean of an excited piston at its
-place without disturbing the waveform; a *detection line* is a frequency left empty to see what
-nonlinearity puts there.
+repeat of one step, a whole number of periods; *centring* keeps the mean of an excited piston in
+place without disturbing the waveform; a *detection line* is a frequency left empty, at which a
+response is due to nonlinearity.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OPEN_LOOP: Final = "open-loop"
 
 
 class Place(ProtocolPart):
-    """How pistons are brought to their places, before anything is excited."""
+    """Settings for positioning pistons before excitation."""
 
     position_gain: PositionGain = Field(default=12.0, gt=0, description="of the loop [V/m]")
     limit: Voltage = Field(default=0.6, gt=0, description="largest command while moving [V]")
@@ -40,7 +40,7 @@ class Place(ProtocolPart):
 
 
 class Lock(ProtocolPart):
-    """A joint that stays where it is during a step."""
+    """A joint that is held during a step."""
 
     joint: int = Field(ge=1, le=MAX_JOINTS)
     at: Literal["closed", "end_min", "end_max"]
@@ -55,10 +55,10 @@ class Lock(ProtocolPart):
 
 
 class Centring(ProtocolPart):
-    """How the mean of an excited piston is kept in place.
+    """Centring of the mean of an excited piston.
 
     `open-loop`: the command is the waveform plus a bias that is trimmed between records;
-    `position-loop`: the device also pulls slowly to the centre while it is recorded.
+    `position-loop`: the device also drives slowly towards the centre during the record.
     """
 
     mode: Literal["open-loop", "position-loop"] = "open-loop"
@@ -77,7 +77,7 @@ class Excite(ProtocolPart):
     centring: Centring = Centring()
 
 
-def require_one_job(name: str, joints: tuple[int, ...]) -> None:
+def require_one_role(name: str, joints: tuple[int, ...]) -> None:
     """Raise ValueError where a joint is named twice by one step."""
     for joint in joints:
         if joints.count(joint) > 1:

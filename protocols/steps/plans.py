@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from protocols.language.waveforms import Waveform
 from protocols.steps.parts import Excite
 
-FIRM_SECONDS = 3.0  # at full size under the firm loop, until its mean correction is known
-LOOSEN_SECONDS = 8.0  # about as long as it takes to loosen that loop, for the estimate only
+FIRM_SECONDS = 3.0  # at full amplitude under the firm loop, until its mean correction is known
+LOOSEN_SECONDS = 8.0  # about the time to reduce that loop's gain, for the estimate only
 
 
 @dataclass(frozen=True)
 class LockPlan:
-    """A joint (0-based) to be held; `piston` [m] is where it is to stand."""
+    """A joint (0-based) to be held; `piston` [m] is its position."""
 
     joint: int
     at: str
@@ -32,7 +32,7 @@ class ExcitePlan:
 
     @property
     def centre(self) -> float:
-        """Where the mean of the piston is kept [m]."""
+        """The mean position of the piston [m]."""
         return self.settings.centre
 
 
@@ -57,13 +57,13 @@ class StepPlan:
 
     @property
     def lines(self) -> tuple[int, ...]:
-        """The lines any joint excites, as multiples of 1 / the common period."""
+        """The lines that any joint excites, as multiples of 1 / the common period."""
         harmonics = {k * (self.period // e.wave.period) for e in self.excite for k in e.wave.lines}
         return tuple(sorted(harmonics))
 
     @property
     def tries(self) -> int:
-        """How often a bias is trimmed, or a disturbed record repeated, before giving up."""
+        """How often to trim a bias, or repeat a disturbed record, before giving up."""
         return max(e.settings.centring.tries for e in self.excite)
 
     def samples(self, rate: float) -> int:

@@ -11,7 +11,7 @@ from rig.model.quantity import Time
 
 
 def _word(value: Any) -> Any:
-    """Return YAML's true and false as the yes and no that were written."""
+    """Return YAML's true and false as yes and no."""
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
 
 
@@ -22,8 +22,8 @@ Word = Annotated[str, BeforeValidator(_word), _WORD_OR_YES]
 class PromptStep(StepKind):
     """Ask, outputs at zero, and wait for an answer.
 
-    At a terminal or from a screen a person answers; where nobody attends, `default` counts after
-    `timeout`, and without a default the run ends there.
+    A person answers at a terminal or from a screen; unattended, `default` is used after `timeout`,
+    and without a default the run ends.
     """
 
     key: ClassVar[str] = "prompt"
@@ -31,7 +31,7 @@ class PromptStep(StepKind):
     prompt: str = Field(min_length=1, max_length=500)
     answers: tuple[Word, ...] = Field(default=("yes", "no"), min_length=1)
     default: Word | None = Field(default=None, description="counts after the time-out, unattended")
-    timeout: Time = Field(gt=0, description="for an answer where nobody attends")
+    timeout: Time = Field(gt=0, description="for an answer when unattended")
     abort_on: tuple[Word, ...] = Field(default=("no",), description="answers that end the run")
 
     @model_validator(mode="after")

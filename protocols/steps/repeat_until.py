@@ -1,4 +1,4 @@
-"""Repeating steps until what is estimated is good enough."""
+"""Repeating steps until the estimates are good enough."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 
 
 class RepeatStep(StepKind):
-    """Run `steps` again and again until a condition holds, `at_most` times.
+    """Run `steps` repeatedly until a condition holds, `at_most` times.
 
-    Records of a later round go on counting the repeats of their step. That `at_most` is reached is
-    noted; with `required` it is an error.
+    Records of a later round continue the repeat numbers of their step. Reaching `at_most` is noted;
+    with `required` it is an error.
     """
 
     key: ClassVar[str] = "repeat_until"

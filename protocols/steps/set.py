@@ -1,4 +1,4 @@
-"""Giving parameters other values."""
+"""Setting parameters to other values."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class WarmUpStep(StepKind):
     move: tuple[Excite, ...] = Field(min_length=1, description="what moves the oil")
     lock: tuple[Lock, ...] = ()
     ramp: Time = Field(default=2.0, gt=0, description="the waveform grows to full size in [s]")
-    settle: Time = Field(default=1.0, gt=0, description="at rest before a lock is believed [s]")
+    settle: Time = Field(default=1.0, gt=0, description="at rest before a lock counts [s]")
 
     def plan(self, planner: Planner) -> PlannedStep:
         """Resolve the motion and the condition."""
@@ -36,7 +36,7 @@ class WarmUpStep(StepKind):
         return PlannedStep(self, title, before, (step,), condition=condition, most=most)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Move until it is warm."""
+        """Move until the condition holds."""
         assert planned.condition is not None
         if not actions.excite_until(planned, planned.condition, self.timeout):
             seen = actions.readings(planned.condition)

@@ -114,7 +114,12 @@ class BenchState:
             return True
         where = "" if run is None else str(run.absolute())
         kept = LatchedTrip(
-            trip, runstate.now(), where, rig.name, runstate.user_name(), runstate.here()
+            trip,
+            runstate.utc_now(),
+            where,
+            rig.name,
+            runstate.user_name(),
+            runstate.computer_name(),
         )
         try:
             replace_text(self.folder / _TRIP, json.dumps(asdict(kept)) + "\n")
@@ -141,9 +146,9 @@ class BenchState:
         """
         trip = self.read_trip()
         entry = {
-            "time": runstate.now(),
+            "time": runstate.utc_now(),
             "who": runstate.user_name(),
-            "host": runstate.here(),
+            "host": runstate.computer_name(),
             "reason": reason,
             "trip": None if trip is None else asdict(trip),
             "device": device_cause,
@@ -196,7 +201,7 @@ class BenchState:
 
 def _note_in_run(trip: LatchedTrip, entry: dict[str, Any]) -> None:
     """Append the reset to the events of the run that tripped, if its folder is still there."""
-    if not trip.run or not Path(trip.run).is_dir() or trip.host != runstate.here():
+    if not trip.run or not Path(trip.run).is_dir() or trip.host != runstate.computer_name():
         return
     fields = {key: entry[key] for key in ("who", "reason")}
     try:

@@ -56,9 +56,9 @@ def monitor(
     is_file = rig is not None and rig not in shipped_rigs() and Path(rig).is_file()
     name = load_rig(rig).name if rig is not None and is_file else rig
     if plain:
-        from rig.tui.plain import read_aloud
+        from rig.tui.plain import print_status
 
-        read_aloud(name, typer.echo)
+        print_status(name, typer.echo)
         return
     if web:
         raise typer.Exit(_serve(rig, runs, endpoint, port or 0))

@@ -10,7 +10,7 @@ from analysis.report.night import Night, NightEstimate, NightItem, write_night
 from rig.queue.items import Item
 from rig.queue.store import QueueStore
 from rig.runs.listing.summary import summarise
-from rig.runs.runstate import here
+from rig.runs.runstate import computer_name
 from rig.runs.store import is_run
 
 
@@ -25,7 +25,7 @@ def night_of(store: QueueStore, since: datetime | None) -> Night:
     ]
     return Night(
         queue=str(store.path),
-        host=here(),
+        host=computer_name(),
         made=datetime.now(UTC),
         items=tuple(map(_shown, order)),
         notes=tuple(note for note in notes if since is None or note[0] >= since),

@@ -17,9 +17,9 @@ def make_physical(result: Identification) -> tuple[Identification, dict[str, Any
     Raises InputError if a parameter is not identified.
     """
     projection = physical(result)
-    given = with_physics(result, projection)
-    document = {**identification_json(given), "physical": physical_json(projection)}
-    return given, document, "\n\n" + physical_text(projection)
+    returned = with_physics(result, projection)
+    document = {**identification_json(returned), "physical": physical_json(projection)}
+    return returned, document, "\n\n" + physical_text(projection)
 
 
 def physical_text(physical: Physical) -> str:
@@ -32,7 +32,7 @@ def physical_text(physical: Physical) -> str:
             value = level.estimates[name].value
             cells.append(f"{value:.5g} ({100 * (value / free.value - 1):+.2f} %)")
         rows.append(cells)
-    level = physical.levels[physical.given]
-    more = physical.levels[physical.given + 1 :]
+    level = physical.levels[physical.returned]
+    more = physical.levels[physical.returned + 1 :]
     why = f"; '{more[0].name}' is rejected by the data" if more else ""
     return f"{table(header, rows)}\nresult: '{level.name}'{why}"

@@ -37,7 +37,7 @@ def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
         biases={joint - 1: bias for joint, bias in biases.items()},
         samples=step.record,
         repeats=step.repeats,
-        gives={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
+        yields={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
         offsets={e.joint: e.settings.centring.offset for e in step.excite},
     )
 

@@ -146,7 +146,7 @@ def _search(data: Mapping[str, Any]) -> str:
     """Return the search's counts of candidates and its errors."""
     rows = [
         ["candidates", str(data["evaluations"])],
-        *([f"lost: {fate}", str(count)] for fate, count in data["lost"].items()),
+        *([f"lost: {cause}", str(count)] for cause, count in data["lost"].items()),
         [f"lost of the first {data['generation_sizes'][0]}", str(data["lost_first_generation"])],
         ["best error of the first generation", _error(data["error_first_generation"])],
         ["best error", _error(data["error"])],

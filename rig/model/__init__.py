@@ -1,1 +1,1 @@
-"""The vocabulary every layer shares: quantities, rig, channels, records; no I/O, no devices."""
+"""The vocabulary shared by all layers: quantities, rig, channels, records; no I/O, no devices."""

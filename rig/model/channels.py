@@ -1,10 +1,8 @@
-"""Names and units of what a bench measures (`spool_i piston_i cap_pressure_i …`).
+"""Names and units of the channels of a bench (`spool_i piston_i cap_pressure_i …`).
 
 Electric joints have `position_i` and `drive_i` instead; their units are the joint's
-(`Rig.unit_of`).
-
-Glossary: joint i is 1-based in names and 0-based in arrays; `command_i` is the voltage the
-device put out to the valve of joint i, kept beside what was measured.
+(`Rig.unit_of`). Glossary: joint i is 1-based in names and 0-based in arrays; `command_i` is the
+voltage that the device put out to the valve of joint i, recorded with the measured channels.
 """
 
 from __future__ import annotations
@@ -53,7 +51,7 @@ def kind_of(name: str) -> tuple[str, int | None]:
 
 
 def place_in_words(where: str) -> str:
-    """Return an effect's `where` for people: ``joint 1, spool`` for ``joint 1 spool``."""
+    """Return an effect's `where` in words: ``joint 1, spool`` for ``joint 1 spool``."""
     words = where.split()
     count = 2 if words[:1] == ["joint"] else 1
     return ", ".join(" ".join(part) for part in (words[:count], words[count:]) if part)
@@ -62,12 +60,12 @@ def place_in_words(where: str) -> str:
 def unit_of(name: str) -> str:
     """Return the SI unit of a channel's samples; raises ValueError for an unknown name.
 
-    Of an electric joint's channel only the rig knows it (`Rig.unit_of`): empty here.
+    Empty for an electric joint's channel, whose unit is the rig's (`Rig.unit_of`).
     """
     return UNITS.get(kind_of(name)[0], "")
 
 
 def measured(joints: int, *, supply: bool, temperature: bool) -> tuple[str, ...]:
-    """List the measured channels in the order every block and file keeps."""
+    """Return the measured channels in the order of blocks and files."""
     names = [channel(kind, i) for i in range(1, joints + 1) for kind in JOINT_KINDS]
     return (*names, *([SUPPLY] if supply else []), *([TEMPERATURE] if temperature else []))

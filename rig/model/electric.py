@@ -1,7 +1,7 @@
 """Electric joints: a drive gain where a hydraulic joint has cylinder, valve and linkage.
 
-What only a hydraulic joint has (linkage, cylinder, valve) is refused in words when asked for. All
-joints of a rig are of one type; `rig.model.rig.ElectricRig` holds them.
+Access to parts of a hydraulic joint (linkage, cylinder, valve) raises InputError. All joints of a
+rig are of one type; `rig.model.rig.ElectricRig` holds them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PLACE = {"revolute": "rad", "prismatic": "m"}
 
 
 def si_value(value: Any, si: str, info: ValidationInfo) -> Any:
-    """Read a quantity whose unit another key decides; a number alone only outside files."""
+    """Read a quantity whose unit depends on another key; a bare number only outside files."""
     if isinstance(value, str):
         return parse_quantity(value, si)
     if info.context and isinstance(value, int | float):
@@ -39,19 +39,19 @@ def si_value(value: Any, si: str, info: ValidationInfo) -> Any:
 
 
 def si_pair(value: Any, si: str, info: ValidationInfo) -> Any:
-    """Read a pair of quantities (see `si_value`); anything else is left to the checks."""
+    """Read a pair of quantities (see `si_value`); anything else is left to later checks."""
     return [si_value(v, si, info) for v in value] if isinstance(value, list | tuple) else value
 
 
 class Drive(Part):
-    """What turns the drive's signal into a torque or force: `gain` times the signal."""
+    """The drive: force or torque is `gain` times its signal."""
 
     unit: Literal["V", "A", "N", "N*m"]
     gain: float = Field(description="force or torque per unit of drive [N/unit or N*m/unit]")
 
 
 class ElectricLimits(Part):
-    """What may not be passed during a run."""
+    """Limits during a run."""
 
     position: tuple[float, float] = Field(description="allowed positions [rad or m]")
     speed: float = Field(gt=0, description="either way [rad/s or m/s]")
@@ -111,7 +111,7 @@ class ElectricJoint(Part):
 
     @property
     def force_unit(self) -> str:
-        """Unit of what the drive exerts: N*m or N."""
+        """Unit of the drive's torque or force: N*m or N."""
         return _FORCE[self.kind]
 
     @property
@@ -135,7 +135,7 @@ class ElectricJoint(Part):
         return q, np.ones_like(q), np.zeros_like(q)
 
     def __getattr__(self, name: str) -> Any:
-        """Refuse what only a hydraulic joint has, in words; raises InputError."""
+        """Raise InputError for a part that only a hydraulic joint has."""
         if name in _NOT_HERE:
             raise InputError(
                 f"joint {self.name!r} is electric and has no {name}; this works on hydraulic "
@@ -150,7 +150,7 @@ class ElectricSensor(Part):
     range: tuple[float, float]
     bits: int = Field(ge=8, le=32)
     noise: float = Field(ge=0, description="one standard deviation")
-    delay: Time = Field(default=0.0, ge=0, description="the channel lags the world by this [s]")
+    delay: Time = Field(default=0.0, ge=0, description="delay of the channel [s]")
 
     @model_validator(mode="after")
     def _range(self) -> Self:
@@ -172,7 +172,7 @@ class ElectricSensors(Part):
 
 
 def electric_names(joints: tuple[ElectricJoint, ...]) -> tuple[str, ...]:
-    """Name the parameters that an electric rig may give nominal values of."""
+    """Return the names of the parameters of an electric rig that may have nominal values."""
     each = range(1, len(joints) + 1)
     weights = () if joints[0].kind == "prismatic" else tuple(f"W{i}" for i in each)
     extra = tuple(f"{kind}{i}" for kind in ("Fc", "offset") for i in each)

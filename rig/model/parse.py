@@ -1,4 +1,4 @@
-"""YAML text to models: a refusal lists every problem with file, line, key and what is expected."""
+"""YAML text to models: an error lists every problem with file, line, key and what is expected."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 
 from rig.model.quantity import FROM_FILE, UnitError, parse_quantity
 
-_MOST = 30  # problems of one file that are listed; beyond, it is another kind of file
+_MOST = 30  # problems of one file that are listed; a file with more is of another kind
 Model = TypeVar("Model", bound=BaseModel)
 Path = tuple[str | int, ...]
 
@@ -22,12 +22,12 @@ class InputError(ValueError):
     """Bad input by the user: the message says what to do, a line for each problem (exit code 2)."""
 
 
-# YAML 1.1 needs a dot in 7e-4 to see a number; people do not.
+# YAML 1.1 reads 7e-4 as text, because a number needs a dot there.
 _FLOAT = re.compile(r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)$")
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader of its own, so that its resolver does not touch the library's."""
+    """A separate safe loader, so that its resolver does not change the library's."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -44,7 +44,7 @@ def _lines(node: yaml.Node, path: Path, numbers: dict[Path, int], source: str) -
             name = str(key.value)
             line = key.start_mark.line + 1
             if name in seen:
-                raise InputError(f"{source}:{line}: key {name!r} stands here a second time")
+                raise InputError(f"{source}:{line}: key {name!r} occurs twice")
             seen.add(name)
             numbers[(*path, name)] = line
             _lines(value, (*path, name), numbers, source)
@@ -58,7 +58,7 @@ def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
     """Parse YAML safely into (data, line of each path); raises InputError with the line."""
     try:
         loader = _Loader(text)
-    except yaml.YAMLError as error:  # the reader refuses characters before any parsing
+    except yaml.YAMLError as error:  # the reader rejects characters before parsing
         problem = str(error).splitlines()[0]
         raise InputError(f"{source}:1: not a YAML text: {problem}") from error
     try:
@@ -83,11 +83,11 @@ def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
         loader.dispose()
 
 
-Problem = tuple[int, str]  # the line of a file, and the sentence about what is wrong there
+Problem = tuple[int, str]  # the line of a file, and the sentence that describes the problem
 
 
 class Unresolved(str):
-    """A text that stands for a value which could not be found; what fails for it is no problem."""
+    """A text in place of a value that could not be found; its further errors are not reported."""
 
     __slots__ = ()
 
@@ -101,7 +101,7 @@ def refusal(problems: Iterable[Problem], source: str) -> InputError:
     return InputError("\n".join(shown))
 
 
-# What a file's author would call the types that pydantic names.
+# Names for pydantic's types in the words of a file's author.
 WANTED: Final = {
     ("model_type", "model_attributes_type", "dict_type", "mapping_type"): "keys and values",
     ("tuple_type", "list_type"): "a list (each entry after a dash)",
@@ -128,7 +128,7 @@ def _problems(
         for part in path:
             if (*known, part) in lines:
                 known = (*known, part)
-        # What a YAML alias repeats is one mistake.
+        # A problem repeated by a YAML alias counts once.
         mistake = (path[-1] if path else "", f"{text} {problem['input']!r}")
         repeated = bool(lines) and known[-1:] != path[-1:] and problem["type"] != "missing"
         if repeated and mistake in said:
@@ -147,7 +147,7 @@ def _problems(
 
 
 def _causes(error: ValidationError) -> list[ErrorDetails]:
-    """Return the problems without those that follow from others: a list is short of its members."""
+    """Return the problems without consequential ones: a list too short for its invalid members."""
     problems = error.errors()
     places = [tuple(problem["loc"]) for problem in problems]
     return [
@@ -159,13 +159,13 @@ def _causes(error: ValidationError) -> list[ErrorDetails]:
 
 
 def first_problem(error: ValidationError) -> str:
-    """Return the key of the first thing that pydantic found wrong, and what it is."""
+    """Return the key of pydantic's first problem, and the problem."""
     problem = error.errors()[0]
     return f"{'.'.join(map(str, problem['loc']))}: {problem_text(problem)}"
 
 
 def problem_text(problem: ErrorDetails) -> str:
-    """Return what pydantic found wrong with a value, in the words of a file's author."""
+    """Return pydantic's problem with a value in the words of a file's author."""
     text = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "extra_forbidden":
         return "unknown key; remove it or correct its spelling"
@@ -204,12 +204,11 @@ def validate_model(
     context: Mapping[str, Any] | None = None,
     known: Sequence[Problem] = (),
 ) -> Model:
-    """Validate loaded YAML as `model`; raises InputError: a line for each of its problems.
+    """Validate loaded YAML as `model`; raises InputError with a line for each problem.
 
-    Each line names file, line, key, what was found and what was expected.
-
-    `context` is passed to the model's validators beside `FROM_FILE`. `known` are problems that the
-    reader met before: they are stated with the model's own, and with any of them nothing is valid.
+    Each line names file, line, key, the value found and the one expected. `context` is passed to
+    the model's validators with `FROM_FILE`. `known` are problems that the reader found before: they
+    are listed with the model's own, and with any of them validation fails.
     """
     if not isinstance(data, dict):
         raise InputError(f"{source}:1: expected keys and values, found {type(data).__name__}")

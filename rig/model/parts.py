@@ -1,4 +1,4 @@
-"""What a bench is made of: frozen models that hold data in SI and refuse what cannot be built.
+"""Parts of a bench: frozen models that hold data in SI and reject what cannot be built.
 
 Source of the geometry and constants: Sakai and Maeshima, section II and Table II.
 """
@@ -38,7 +38,7 @@ WATCHDOG_RANGE: Final = (0.02, 10.0)  # [s] that a device can be set to (docs/wi
 
 
 class Part(BaseModel):
-    """A piece of a description: frozen, no unknown keys, finite numbers."""
+    """A part of a description: frozen, no unknown keys, finite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -92,7 +92,7 @@ class Cylinder(Part):
 
 
 class Valve(Part):
-    """A proportional valve: the command the device puts out and the spool it moves."""
+    """A proportional valve: command range and spool dynamics."""
 
     command_range: Voltage = Field(gt=0, description="outputs run from -range to +range [V]")
     command_bits: int = Field(ge=8, le=16)
@@ -103,7 +103,7 @@ class Valve(Part):
 
 
 class Limits(Part):
-    """What may not be passed during a run; crossing one zeroes the outputs and latches a trip."""
+    """Limits during a run; crossing one zeroes the outputs and latches a trip."""
 
     piston: tuple[Length, Length] = Field(description="allowed piston positions, excited [m]")
     speed: Speed = Field(gt=0, description="piston speed either way [m/s]")
@@ -123,8 +123,8 @@ class Limits(Part):
 class Joint(Part):
     """One hydraulic joint: link, linkage, cylinder, valve and its limits.
 
-    What the kinds of joint answer alike, each its own way, is the block of class variables and the
-    properties below; `rig.model.electric.ElectricJoint` has the same.
+    The class variables and properties below are common to all kinds of joint, as in
+    `rig.model.electric.ElectricJoint`.
     """
 
     kinds: ClassVar[tuple[str, ...]] = ch.JOINT_KINDS
@@ -178,7 +178,7 @@ class Joint(Part):
     def geometry(self, position: Array | float) -> tuple[Array, Array, Array]:
         """Return angle q [rad], G = ds/dq [m] and dG/dq [m/rad] at piston displacement s [m].
 
-        A sensor may read a little past the stroke's end: beyond 0.55 strokes s is held.
+        A sensor may read slightly beyond the stroke's end: s is limited to 0.55 strokes.
         """
         half = 0.55 * self.cylinder.stroke
         q = self.linkage.angle(np.clip(position, -half, half))
@@ -186,7 +186,7 @@ class Joint(Part):
 
 
 class Calibration(Part):
-    """When, as which piece and by whom a channel's sensor was last calibrated."""
+    """Date, serial number and certificate of a sensor's last calibration."""
 
     date: datetime.date
     serial: str = Field(min_length=1, description="serial number of the sensor")
@@ -195,7 +195,7 @@ class Calibration(Part):
 
 class _Sensor(Part):
     bits: int = Field(ge=8, le=16)
-    delay: Time = Field(default=0.0, ge=0, description="the channel lags the world by this [s]")
+    delay: Time = Field(default=0.0, ge=0, description="delay of the channel [s]")
 
 
 class SpoolSensor(_Sensor):
@@ -291,11 +291,11 @@ class Oil(Part):
 
 
 LOCALHOST: Final = "127.0.0.1"
-PORT: Final = 5020  # of a bench that listens on TCP, where its rig file names none
+PORT: Final = 5020  # of a bench on TCP, if its rig file has none
 
 
 class BenchLimits(Part):
-    """What may not be passed of what the whole bench shares; a limit that is not given is none."""
+    """Limits of quantities of the whole bench; an omitted limit is none."""
 
     supply_pressure: tuple[Pressure, Pressure] | None = None
     oil_temperature: tuple[Temperature, Temperature] | None = None
@@ -310,9 +310,9 @@ class BenchLimits(Part):
 
 
 class Wire(Part):
-    """How the bench is reached: the kind of wire, times, and the settings of that kind's driver.
+    """The connection to the bench: the kind of wire, times, and the settings of its driver.
 
-    Keys beyond these are kept as the file has them and read by the driver (`drivers.registry`).
+    Other keys are kept as in the file and read by the driver (`drivers.registry`).
     """
 
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
@@ -344,7 +344,7 @@ class Wire(Part):
 
     @property
     def endpoint(self) -> str:
-        """Where the bench answers, as `--endpoint` takes it: device file, bus, or host and port."""
+        """The bench's address in the form of `--endpoint`: device file, bus, or host and port."""
         at = self.settings
         if "bus" in at:
             rest = urlencode({key: value for key, value in at.items() if key != "bus"}, safe="/")

@@ -1,8 +1,8 @@
-"""Numbers with units at the files' edge, plain SI floats inside.
+"""Quantities with units in files, plain SI floats in code.
 
-A model field is declared as ``stroke: Length``. Read from a file it must carry its unit
-(``75 mm``) and becomes a float in SI; built in code it is given as a float in SI already.
-The difference is the validation context that `rig.model.parse` passes: `FROM_FILE`.
+A model field is declared as ``stroke: Length``. In a file it must have its unit (``75 mm``) and
+becomes a float in SI; in code it is a float in SI. The difference is the validation context that
+`rig.model.parse` passes: `FROM_FILE`.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def _linear_map(unit: str, si: str) -> tuple[float, float]:
 
 def _other_dimension(unit: str, si: str) -> UnitError:
     return UnitError(
-        f"unit {unit or 'dimensionless'!r} does not measure what is wanted here; "
+        f"unit {unit or 'dimensionless'!r} is of another dimension; "
         f"expected one like {si or 'dimensionless'!r}"
     )
 
 
 def map_by_pint(unit: str, si: str) -> tuple[float, float]:
-    """Return the same of any unit that pint knows; raises UnitError."""
+    """Return (scale, offset) as `_linear_map`, for any unit that pint knows; raises UnitError."""
     registry = _registry()
     text = unit or "dimensionless"
     target = si or "dimensionless"
@@ -66,7 +66,7 @@ def map_by_pint(unit: str, si: str) -> tuple[float, float]:
     try:
         zero = registry.Quantity(0.0, parsed).to(target).magnitude
         unit_size = registry.Quantity(1.0, parsed).to(target).magnitude
-    except Exception as error:  # of another dimension, or one that no conversion exists for
+    except Exception as error:  # of another dimension, or without a conversion
         raise _other_dimension(unit, si) from error
     return float(unit_size - zero), float(zero)
 
@@ -78,7 +78,7 @@ def to_si(value: float, unit: str, si: str) -> float:
 
 
 def unit_map(unit: str, si: str) -> tuple[float, float]:
-    """Return (scale, offset) of the map from `unit` to `si`, for whole arrays at a file's edge."""
+    """Return (scale, offset) of the map from `unit` to `si`, for whole arrays."""
     return _linear_map(unit, si)
 
 
@@ -113,7 +113,7 @@ def _validator(si: str) -> BeforeValidator:
 
 
 def shown_in_schema(si: str) -> WithJsonSchema:
-    """Return how a quantity in `si` appears in a JSON schema: a text with its unit."""
+    """Return the JSON schema of a quantity in `si`: a text with its unit."""
     if not si:
         return WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string"}]})
     return WithJsonSchema({"type": "string", "examples": [f"1 {si}"]})

@@ -1,4 +1,4 @@
-"""What a run leaves behind, as data: one record per step and repeat."""
+"""The data of a run: one record per step and repeat."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Record:
 
 @dataclass(frozen=True)
 class RecordHead:
-    """What is known of a record without its samples; fields as in `Record`."""
+    """Description of a record without its samples; fields as in `Record`."""
 
     name: str
     step: str
@@ -83,7 +83,7 @@ class RecordHead:
 
 
 def head_of(record: Record) -> RecordHead:
-    """Return what is known of a record without its samples."""
+    """Return a record's description without its samples."""
     return RecordHead(
         record.name, record.step, record.locked, record.repeat, record.sample_rate,
         record.samples, tuple(record.channels),
@@ -93,7 +93,7 @@ def head_of(record: Record) -> RecordHead:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder's content: the rig it was taken on, its records, where it came from."""
+    """A run folder's content: the rig, the records, the source."""
 
     rig: Rig
     records: tuple[Record, ...]

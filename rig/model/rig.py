@@ -1,8 +1,8 @@
-"""The rig description: a whole bench, its channels and what it is designed to be.
+"""The rig description: a whole bench, its channels and its design values.
 
-The pieces of a bench stand in `rig.model.parts`, those of electric joints in `rig.model.electric`.
-An `ElectricRig` is a `Rig` for everything that asks for joints, channels, sensors or mechanics; a
-rig file chooses by `type: electric` at its joints, and `Rig.model_validate` returns that class.
+The parts of a bench are in `rig.model.parts`, those of electric joints in `rig.model.electric`. An
+`ElectricRig` has the interface of a `Rig` for joints, channels, sensors and mechanics; a rig file
+selects it by `type: electric` at its joints, and `Rig.model_validate` returns that class.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from rig.model import channels as ch
-from rig.model.alarms.bands import Alarms, Range, refuse_unseen
+from rig.model.alarms.bands import Alarms, Range, refuse_unreachable
 from rig.model.electric import (
     UNKNOWN,
     ElectricJoint,
@@ -66,7 +66,7 @@ class Rig(Part):
     def _by_type(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Any:
-        """Read a description by the class of rig that its joints' `type` names."""
+        """Read a description by the class of rig that its joints' `type` selects."""
         types = _types(data) & set(_CLASSES) if cls is Rig else set()
         if len(types) > 1:
             raise ValueError("joints of both types, hydraulic and electric, in one rig: not yet")
@@ -85,7 +85,7 @@ class Rig(Part):
         if not isinstance(value, dict):
             return value
         if "joints" not in info.data:
-            return {}  # the joints are refused; which parameters there are is known with them
+            return {}  # the joints are invalid, and the list of parameters depends on them
         joints = len(info.data["joints"])
         known = parameter_names(joints)
         for name in value:
@@ -100,7 +100,7 @@ class Rig(Part):
 
     @model_validator(mode="after")
     def _limits_can_be_seen(self) -> Self:
-        """Refuse a limit that no sample could pass: the sensor ends before it."""
+        """Reject a limit beyond the sensor's range, which no sample could pass."""
         if self.electric:
             if self.limits != BenchLimits():
                 raise ValueError("an electric rig has neither supply nor oil; remove limits")
@@ -113,7 +113,7 @@ class Rig(Part):
             if limit >= top:
                 raise ValueError(
                     f"joint {joint.name!r}: limits pressure up to {limit / 1e6:g} MPa can never be "
-                    f"seen to be passed: the range of sensors chamber_pressure ends at "
+                    f"exceeded by a reading: the range of sensors chamber_pressure ends at "
                     f"{top / 1e6:g} MPa; lower the limit or state the sensor's true range"
                 )
         for name in BenchLimits.model_fields:
@@ -124,15 +124,15 @@ class Rig(Part):
                 raise ValueError(f"limits {name}: this rig has no sensor {name}")
             if limits[1] >= sensor.range[1]:
                 raise ValueError(
-                    f"limits {name}: the upper one, {limits[1]:g}, can never be seen to be passed: "
-                    f"the sensor's range ends at {sensor.range[1]:g}"
+                    f"limits {name}: the upper one, {limits[1]:g}, can never be exceeded by a "
+                    f"reading: the sensor's range ends at {sensor.range[1]:g}"
                 )
         limits = {name: self.limits_of(name) for name in self.recorded}
-        refuse_unseen(self.alarms, self.recorded, self.range_of, limits)
+        refuse_unreachable(self.alarms, self.recorded, self.range_of, limits)
         return self
 
     def range_of(self, channel: str) -> Range:
-        """Return what a channel can read: its sensor's range, or that of the output."""
+        """Return a channel's readable range: that of its sensor, or of the output."""
         kind, joint = ch.kind_of(channel)
         if kind == ch.COMMAND and joint is not None:
             reach = self.joints[joint - 1].valve.command_range
@@ -140,7 +140,7 @@ class Rig(Part):
         return self.sensors.of(kind).range
 
     def limits_of(self, channel: str) -> Range:
-        """Return the limits of a channel in SI, whatever its joint does; infinite where none."""
+        """Return the limits of a channel in SI, excited or locked; infinite where none are set."""
         kind, joint = ch.kind_of(channel)
         everything = (-math.inf, math.inf)
         if joint is None:
@@ -158,11 +158,11 @@ class Rig(Part):
 
     @property
     def uncertain_numbers(self) -> tuple[UncertainNumber, ...]:
-        """The areas, volumes and lengths that `tolerances` states; none without that section."""
+        """The areas, volumes and lengths with `tolerances`; none without that section."""
         return uncertain_numbers(self.tolerances, self.joints)
 
     def with_moved(self, number: UncertainNumber) -> Self:
-        """Return the rig with one of its numbers larger by its tolerance."""
+        """Return the rig with one of its numbers increased by its tolerance."""
         return self.model_copy(update={"joints": number.moved(self.joints)})
 
     @property
@@ -177,7 +177,7 @@ class Rig(Part):
 
     @property
     def drive_kind(self) -> str:
-        """Channel kind of what drives a joint: spool or drive."""
+        """Channel kind of a joint's drive: spool or drive."""
         return self.joints[0].drive_kind
 
     @property
@@ -192,7 +192,7 @@ class Rig(Part):
 
     @property
     def families(self) -> tuple[str, ...]:
-        """Families of equations that the joints have: mechanical, and fluid where there is oil."""
+        """Families of the joints' equations: mechanical, and fluid for hydraulic joints."""
         return self.joints[0].families
 
     @property
@@ -219,7 +219,7 @@ class Rig(Part):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The measured channels, in the order every block and file keeps."""
+        """The measured channels, in the order of blocks and files."""
         return ch.measured(
             len(self.joints),
             supply=self.sensors.supply_pressure is not None,
@@ -228,7 +228,7 @@ class Rig(Part):
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """The measured channels, then the commands put out."""
+        """The measured channels, then the commands."""
         return (*self.channels, *(ch.channel(ch.COMMAND, i + 1) for i in range(len(self.joints))))
 
     def chamber_volumes(self, joint: int, piston: Array) -> tuple[Array, Array]:
@@ -250,7 +250,7 @@ class ElectricRig(Rig):
     claim).
     """
 
-    # A Rig to whoever asks for mechanics; the narrower types are this module's whole purpose.
+    # The narrower types of these fields are the purpose of this class.
     gravity: Acceleration = Field(default=9.8, ge=0)
     inclination: Angle | Literal["unknown"] = 0.0
     supply: Supply | None = Field(default=None, exclude=True)  # type: ignore[assignment]
@@ -279,7 +279,7 @@ class ElectricRig(Rig):
         if not isinstance(value, dict):
             return value
         if not joints:
-            raise ValueError("judged once the joints are right: they say which units these have")
+            raise ValueError("depends on the joints, which must be corrected first")
         units = {"position": joints[0].position_unit, "drive": joints[0].drive.unit}
         out = dict(value)
         for key, si in units.items():
@@ -299,7 +299,7 @@ class ElectricRig(Rig):
         if not isinstance(value, dict):
             return value
         if not joints:
-            return {}  # refused; which parameters there are is known with them
+            return {}  # invalid, and the list of parameters depends on them
         known = {name: electric_unit(name, joints) for name in electric_names(joints)}
         for name in value:
             if name not in known:
@@ -332,13 +332,13 @@ class ElectricRig(Rig):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The measured channels, in the order every block and file keeps."""
+        """The measured channels, in the order of blocks and files."""
         each = range(1, len(self.joints) + 1)
         return tuple(ch.channel(kind, i) for i in each for kind in ch.ELECTRIC_KINDS)
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """The channels of a record: the measured ones, for the drive is its own command."""
+        """The channels of a record: the measured ones, which include the drive."""
         return self.channels
 
     @property
@@ -369,7 +369,7 @@ _CLASSES: dict[str, type[Rig]] = {"hydraulic": Rig, "electric": ElectricRig}
 
 
 def _types(data: Any) -> set[str]:
-    """Return the types of the joints of a raw description, as far as it is one."""
+    """Return the types of the joints of a raw description, as far as it is valid."""
     joints = data.get("joints") if isinstance(data, dict) else None
     if not isinstance(joints, list | tuple):
         return set()

@@ -1,7 +1,7 @@
-"""The section `tolerances` of a rig file: how well its areas, volumes and pin distances are known.
+"""The section `tolerances` of a rig file: uncertainty of its areas, volumes and pin distances.
 
-Each value is a standard uncertainty (one sigma) that every number of its kind has, at every joint,
-independently of the others. A rig file without the section states its numbers as exact.
+Each value is a standard uncertainty (one sigma) of every number of its kind, at every joint,
+independently of the others. Without the section the numbers count as exact.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class UncertainNumber:
 
     @property
     def name(self) -> str:
-        """The number as people call it: cap_area of joint 1."""
+        """The number's name in words: cap_area of joint 1."""
         return f"{self.key} of joint {self.joint + 1}"
 
     def moved(self, joints: Sequence[Joint]) -> tuple[Joint, ...]:
-        """Return the joints with this number larger by one sigma."""
+        """Return the joints with this number increased by one sigma."""
         out = list(joints)
         joint = out[self.joint]
         part = getattr(joint, self.part)
@@ -96,7 +96,7 @@ def uncertain_numbers(
 
 
 def refuse_open_triangles(tolerances: Tolerances | None, joints: Sequence[Joint]) -> None:
-    """Raise ValueError where a linkage with a length larger by its tolerance cannot close."""
+    """Raise ValueError if a linkage with a length increased by its tolerance cannot close."""
     for number in uncertain_numbers(tolerances, joints):
         if number.part != "linkage":
             continue

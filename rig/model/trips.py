@@ -1,4 +1,4 @@
-"""What stops a run: a limit that was passed, an operator, a recorder that cannot write."""
+"""Reasons to stop a run: a limit exceeded, an operator, a recorder that cannot write."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ NOISY: Final = "noisy sensor"
 SWAPPED: Final = "swapped pressures"
 SENSOR_DRIFT: Final = "drifting pressure sensor"
 
-_LARGEST = 1e300  # an end beyond is none
+_LARGEST = 1e300  # an end beyond this counts as open
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A limit and the sample that passed it, in SI; `joint` is 1-based, None for the bench."""
+    """A limit and the sample that exceeded it, in SI; `joint` is 1-based, None for the bench."""
 
     limit: str
     value: float
@@ -42,7 +42,7 @@ class Violation:
 
 
 def show(value: float, unit: str) -> str:
-    """Write a value for a person: '9.31 MPa'."""
+    """Return a value with its display unit: '9.31 MPa'."""
     shown = display_unit(unit, LIMITS)
     return f"{value * shown.scale:.4g} {shown.text}"
 
@@ -72,7 +72,7 @@ def _allowed(violation: Violation) -> str:
 
 
 def describe(violation: Violation, rig: Rig) -> str:
-    """Return where, how much, when and what was allowed: one clause."""
+    """Return a violation as one clause: place, value, time and allowed range."""
     where = "the bench"
     if violation.joint is not None:
         where = f"joint {violation.joint} ({rig.joints[violation.joint - 1].name})"
@@ -84,7 +84,7 @@ def describe(violation: Violation, rig: Rig) -> str:
 
 
 class SafetyTrip(Exception):
-    """A limit was passed and the outputs are at zero; the message names everything (exit 3).
+    """A limit was exceeded and the outputs are at zero; the message names everything (exit 3).
 
     `violation` is the frozen data; `limit value allowed unit joint channel tick` are its fields,
     `device_time` [s] is the violating sample's.
@@ -109,10 +109,10 @@ def reset_command(rig: Rig) -> str:
 
 
 class Latched(Exception):
-    """The bench tripped earlier and the trip is not cleared; nothing was moved (exit 3)."""
+    """The bench tripped earlier and the trip is not cleared; nothing moves (exit 3)."""
 
     def __init__(self, what: str, rig: Rig) -> None:
-        super().__init__(f"{what}; look at the bench, then clear it with `{reset_command(rig)}`")
+        super().__init__(f"{what}; examine the bench, then clear it with `{reset_command(rig)}`")
 
 
 class OperatorStop(Exception):
@@ -120,4 +120,4 @@ class OperatorStop(Exception):
 
 
 class RecordingFailed(Exception):
-    """What is measured can no longer be written; the message is one line (exit 1)."""
+    """Samples can no longer be written; the message is one line (exit 1)."""

@@ -1,8 +1,8 @@
-"""The units that files name and people read, in tables: pint takes a third of a second to load.
+"""Units of files and displays, in tables: pint takes a third of a second to load.
 
-Products, quotients and powers of them with SI prefixes are understood; whatever else is left to
-pint (`rig.model.quantity`). What is answered here is what pint answers. The tables at the end say
-in which unit an SI quantity is shown: on the screen, as a limit, as a result, as a residual.
+Products, quotients and powers of them with SI prefixes are understood; anything else is left to
+pint (`rig.model.quantity`), with whose results these agree. The tables at the end map an SI
+quantity to its display unit: on the screen, as a limit, as a result, as a residual.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ _NAMES: Final = {
 
 
 def linear_map(unit: str, si: str) -> tuple[float, float] | None:
-    """Return (scale, offset) of value_si = scale value + offset; None where pint must say."""
+    """Return (scale, offset) of value_si = scale value + offset; None if pint is needed."""
     unit, si = unit.strip(), si.strip()
     if si == "degC":
         return {"degC": (1.0, 0.0), "K": (1.0, -_ZERO_CELSIUS)}.get(unit)
@@ -90,13 +90,13 @@ def linear_map(unit: str, si: str) -> tuple[float, float] | None:
 
 
 def differs(unit: str, si: str) -> bool:
-    """Whether a unit is known here to measure something else than `si`."""
+    """Return whether a unit is known to be of another dimension than `si`."""
     given, target = measure(unit.strip()), measure(si.strip())
     return given is not None and target is not None and given.powers != target.powers
 
 
 def measure(text: str) -> Measure | None:
-    """Return what a unit's text means; None for a unit or a form that is not known here."""
+    """Return the measure of a unit's text; None for an unknown unit or form."""
     if text in _NAMES:
         return _NAMES[text]
     tokens, end = [], 0
@@ -114,7 +114,7 @@ def measure(text: str) -> Measure | None:
 
 
 def _product(tokens: Iterator[str], end: str) -> Measure:
-    """Read factors up to the token `end`; raises KeyError or ValueError where they make no unit."""
+    """Read factors up to the token `end`; raises KeyError or ValueError if they are no unit."""
     total, sign = ONE, 1.0
     while True:
         token = next(tokens)
@@ -138,7 +138,7 @@ def _product(tokens: Iterator[str], end: str) -> Measure:
 
 @dataclass(frozen=True)
 class DisplayUnit:
-    """How an SI quantity is shown: shown number = scale * SI number, its unit, fixed decimals."""
+    """Display of an SI quantity: shown number = scale * SI number, its unit, decimals."""
 
     scale: float
     text: str
@@ -173,12 +173,12 @@ RESIDUALS: Final = {
 
 
 def display_unit(si: str, table: Mapping[str, DisplayUnit]) -> DisplayUnit:
-    """Return how an SI unit is shown; one that the table does not hold is shown in SI."""
+    """Return the display unit of an SI unit; SI itself if the table has none."""
     return table.get(si) or DisplayUnit(1.0, si)
 
 
 def plain(value: float, digits: int) -> str:
-    """Return a number with so many significant digits, without exponent below 1e5."""
+    """Return a number with `digits` significant digits, without exponent below 1e5."""
     text = f"{value:.{digits}g}"
     return f"{Decimal(text):f}" if "e+" in text and abs(value) < _PLAIN_BELOW else text
 
@@ -186,8 +186,8 @@ def plain(value: float, digits: int) -> str:
 def with_interval(value: float, half: float, unit: str = "") -> str:
     """Return ``value ± half unit``: half an interval with two digits, the value to its decimals.
 
-    Without exponent where the larger of both is from 1e-3 to 1e5, else both with the same one. A
-    half interval that is not known (NaN or 0) is left out.
+    Without exponent where the larger of both is from 1e-3 to 1e5, else both with the same one. An
+    unknown half interval (NaN or 0) is left out.
     """
     if not math.isfinite(value) or not math.isfinite(half) or half <= 0.0:
         text = plain(value, 4) + (" ± ∞" if half == math.inf else "")

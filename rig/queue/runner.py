@@ -134,7 +134,7 @@ class Runner:
         self._ended: list[Item] = []
         self._lost = 0  # consecutive losses of the device
         self._readings: dict[tuple[str, str], tuple[float, dict[str, float] | str]] = {}
-        self._told: dict[int, str] = {}
+        self._announced: dict[int, str] = {}
 
     def __enter__(self) -> Self:
         path = folder_of(self._queue.path) / "runner.lock"
@@ -163,7 +163,7 @@ class Runner:
 
     def run(self) -> QueueReport:
         """Run until no item can start any more, the queue is paused, or it must stop."""
-        self._queue.note("runner begins", f"process {os.getpid()} on {runstate.here()}")
+        self._queue.note("runner begins", f"process {os.getpid()} on {runstate.computer_name()}")
         try:
             self._resolve_leftovers()
             reason = self._loop()
@@ -211,8 +211,8 @@ class Runner:
         for other, verdict in verdicts:
             if verdict.state:
                 self._finish(other, ItemOutcome(verdict.state, verdict.reason))
-            elif self._told.get(other.id) != verdict.reason:
-                self._told[other.id] = verdict.reason
+            elif self._announced.get(other.id) != verdict.reason:
+                self._announced[other.id] = verdict.reason
                 self._say(f"item {other.id} {other.job.name}: {verdict.reason}")
         return item, verdicts
 
@@ -384,9 +384,9 @@ class Runner:
             if item.state == it.CHECKING:
                 self._queue.release(item.id, "the runner ended during its check")
             elif item.state == it.RUNNING:
-                self._after(item, self._left_running(item))
+                self._after(item, self._ended_unwatched(item))
 
-    def _left_running(self, item: Item) -> ItemOutcome:
+    def _ended_unwatched(self, item: Item) -> ItemOutcome:
         lock = item_lock(self._queue.path, item.id)
         request = it.CANCELLED if item.cancel else ""
         if held(lock):
@@ -408,8 +408,8 @@ class Runner:
         self._hook.send(
             {
                 "event": event,
-                "time": runstate.now(),
-                "host": runstate.here(),
+                "time": runstate.utc_now(),
+                "host": runstate.computer_name(),
                 "queue": str(self._queue.path),
                 "reason": reason,
                 "item": about,

@@ -22,7 +22,7 @@ from rig.queue.items import (
     Item,
     QueueJob,
 )
-from rig.runs.runstate import now
+from rig.runs.runstate import utc_now
 
 SCHEMA_VERSION: Final = 1
 _PATIENCE = 20.0  # [s] to wait for another process that has locked the file
@@ -185,7 +185,7 @@ class QueueStore:
             number = self._db.execute(
                 "INSERT INTO item (priority, place, state, reason, job, added, proof) "
                 "VALUES (?, ?, ?, '', ?, ?, ?)",
-                (priority, place, QUEUED, json.dumps(job.as_dict()), now(), json.dumps(proof)),
+                (priority, place, QUEUED, json.dumps(job.as_dict()), utc_now(), json.dumps(proof)),
             ).lastrowid
             assert number is not None
             self._note(number, 0, QUEUED, "added")
@@ -258,7 +258,7 @@ class QueueStore:
     def pause(self, who: str) -> None:
         """Start no further item until `resume`."""
         with self._transaction():
-            text = f"paused by {who} at {now()}"
+            text = f"paused by {who} at {utc_now()}"
             self._db.execute("INSERT OR REPLACE INTO setting VALUES (?, ?)", (_PAUSE, text))
             self._note(None, None, "paused", f"by {who}")
 
@@ -276,7 +276,7 @@ class QueueStore:
             item = self.item(number)
             if item.state != QUEUED or self.paused:
                 return None
-            self._db.execute("UPDATE item SET started = ? WHERE id = ?", (now(), number))
+            self._db.execute("UPDATE item SET started = ? WHERE id = ?", (utc_now(), number))
             self._enter(item, CHECKING, "")
         return self.item(number)
 
@@ -332,7 +332,7 @@ class QueueStore:
 
     def _enter(self, item: Item, state: str, reason: str) -> None:
         ended = ", ended = ?" if state in OVER else ""
-        values = [state, reason, *([now()] if ended else []), item.id]
+        values = [state, reason, *([utc_now()] if ended else []), item.id]
         self._db.execute(f"UPDATE item SET state = ?, reason = ?{ended} WHERE id = ?", values)
         if state not in ACTIVE:
             self._db.execute("UPDATE item SET pid = NULL WHERE id = ?", (item.id,))
@@ -341,5 +341,5 @@ class QueueStore:
     def _note(self, number: int | None, attempt: int | None, event: str, reason: str) -> None:
         self._db.execute(
             "INSERT INTO history (time, item, attempt, event, reason) VALUES (?, ?, ?, ?, ?)",
-            (now(), number, attempt, event, reason),
+            (utc_now(), number, attempt, event, reason),
         )

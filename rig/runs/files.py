@@ -61,9 +61,9 @@ def sync_to_disk(path: Path) -> None:
 
 
 def no_place_for(path: Path) -> str:
-    """Say why no file or folder of this name can be made, '' where it can; makes nothing.
+    """Return why no file or folder of this name can be created, '' if it can; creates nothing.
 
-    Folders above it that are missing can be made where the last one that exists may be written.
+    Missing folders above it can be created if the last existing one is writable.
     """
     try:
         above = path.absolute().parent

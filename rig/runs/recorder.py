@@ -25,8 +25,8 @@ from rig.runs.runstate import (
     STREAM,
     EventLog,
     StreamClock,
-    now,
     release_ownership,
+    utc_now,
     write_state,
 )
 from rig.runs.sections import Written
@@ -179,7 +179,7 @@ class Recorder:
         # In virtual time the clocks are unrelated: streams follow without a gap.
         began = 0.0 if first else self._newest if virtual else arrived - self._began
         self._newest = began
-        self._clock = StreamClock(block.tick, began, now())
+        self._clock = StreamClock(block.tick, began, utc_now())
         self.event(STREAM, block.tick, stream=self._stream)
         self._newest = began + length
 

@@ -79,7 +79,7 @@ def _refuse_if_alive(folder: Path, force: bool) -> None:
             f"{folder}: is being written by process {owner.pid}; stop that run first "
             "(`bramah monitor`, or Ctrl-C in its window)"
         )
-    if owner.host != runstate.here() and not force:
+    if owner.host != runstate.computer_name() and not force:
         raise InputError(
             f"{folder}: was being written on computer {owner.host!r}; recover it there, or with "
             "force if that run is surely over"

@@ -39,7 +39,7 @@ BETWEEN: Final = "between"  # group of records.h5 for samples outside all record
 _STATE, _OWNER = "state", "owner.json"
 
 
-def here() -> str:
+def computer_name() -> str:
     """Return this computer's name."""
     return socket.gethostname()
 
@@ -52,7 +52,7 @@ def user_name() -> str:
         return str(os.getuid())
 
 
-def now() -> str:
+def utc_now() -> str:
     """Return the wall clock as ISO 8601 in UTC."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
@@ -97,7 +97,7 @@ def process_alive(pid: int, started: str = "") -> bool:
 
 def take_ownership(folder: Path) -> None:
     """Store this process as the writer of the run."""
-    owner = Owner(os.getpid(), process_started(os.getpid()) or "", here())
+    owner = Owner(os.getpid(), process_started(os.getpid()) or "", computer_name())
     replace_text(folder / _OWNER, json.dumps(asdict(owner)) + "\n")
 
 
@@ -116,7 +116,7 @@ def read_owner(folder: Path) -> Owner | None:
 
 def owner_alive(owner: Owner | None) -> bool:
     """Return whether the run's writer is running; True if this machine cannot determine it."""
-    if owner is None or owner.host != here():
+    if owner is None or owner.host != computer_name():
         return False
     return process_alive(owner.pid, owner.started)
 
@@ -157,7 +157,7 @@ class EventLog:
 
     def append(self, event: str, tick: int | None, fields: Mapping[str, Any]) -> None:
         """Write one event, on the disk when this returns."""
-        entry = {"time": now(), "event": event, "tick": tick, **fields}
+        entry = {"time": utc_now(), "event": event, "tick": tick, **fields}
         line = json.dumps(entry, default=str) + "\n"
         try:
             self._stream.write(line.encode())

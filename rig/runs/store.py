@@ -25,12 +25,12 @@ from rig.runs.runstate import (
     INTERRUPTED,
     JOURNAL,
     RUNNING,
-    now,
     read_owner,
     read_state,
     release_ownership,
     take_ownership,
     user_name,
+    utc_now,
     write_state,
 )
 from rig.runs.versions import versions
@@ -100,7 +100,7 @@ def create_run(
     refuse_occupied(folder)
     head = {
         "format": _FORMAT,
-        "created": now(),
+        "created": utc_now(),
         "operator": user_name() if operator is None else operator,
         "host": socket.gethostname(),
         "seed": seed,

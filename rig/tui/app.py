@@ -1,6 +1,6 @@
 """`bramah monitor`: the operator's screen. It renders the link's newest frame, nothing else.
 
-The screen may come, go, hang or crash: the run is another process and does not notice.
+Closing, hanging or crashing does not affect the run, which is another process.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from rig.tui.words import LINGER, KeyAnswer, Stop
 SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
 LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
 CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
-SLOW: Final = 0.2  # ages are redrawn this often where nothing arrives [s]
+SLOW: Final = 0.2  # interval of redrawing ages while nothing arrives [s]
 BLINK: Final = 0.5  # half a period of an unacknowledged alarm [s]
 TWICE: Final = 0.7  # two presses of Escape within this time stop [s]
-ALARM_WINDOW: Final = 60.0  # of samples held while the alarms are looked at [s]
+ALARM_WINDOW: Final = 60.0  # of samples held while alarms are on the screen [s]
 
 HELP: Final = (
     "SPACE, s or Esc-Esc STOP: all outputs to zero, at once, on every page",
@@ -59,7 +59,7 @@ HELP: Final = (
 
 
 def with_early_keys(kind: type[Driver], early: Callable[[events.Key], None]) -> type[Driver]:
-    """Return a kind of driver that hands keys to `early` as soon as they are read."""
+    """Return a driver class that passes keys to `early` as soon as they are read."""
 
     class EarlyKeys(kind):  # type: ignore[misc, valid-type]
         def process_message(self, message: Message) -> None:
@@ -71,13 +71,13 @@ def with_early_keys(kind: type[Driver], early: Callable[[events.Key], None]) -> 
 
 
 def automatic_span(speed: float) -> float:
-    """Return the shortest span that a curve does not cross too fast to be read."""
-    # A run in real time jitters around speed 1 and must not flip between two spans.
+    """Return the shortest span in which a curve moves slowly enough to be read."""
+    # A run in real time has a speed around 1, which must not alternate between two spans.
     return next((s for s in LONG_SPANS[2:] if s / speed > CROSSING), LONG_SPANS[-1])
 
 
 class Monitor(ByHand, App[int]):
-    """Attach, watch, stop, command."""
+    """The operator's screen: attach, watch, stop, command."""
 
     TITLE = "bramah monitor"
     ENABLE_COMMAND_PALETTE = False
@@ -103,22 +103,22 @@ class Monitor(ByHand, App[int]):
         self.look = ScreenStyle()
         self.browsed = browsed or BrowserState()
         self.dialog: Dialog | None = None
-        self.accept: Callable[[str], None] | None = None  # what the open question's answer does
+        self.accept: Callable[[str], None] | None = None  # takes the answer to the open question
         self.remark = ""
-        self.stop_asked: Stop | None = None  # the newest stop and what became of it
+        self.stop_asked: Stop | None = None  # the newest stop and its result
         self.seen_alarms: frozenset[tuple[int, str]] = frozenset()  # acknowledged after the end
         self.reset_alarms: frozenset[tuple[int, str]] = frozenset()
         self.marked_session: Endpoint | None = None
         self._span: float | None = None  # None: automatic
-        self._held_frame: Frame | None = None  # what a held picture shows
+        self._held_frame: Frame | None = None  # frame of a held picture
         self._drawn_frame: object = None
         self._slow = -float("inf")
         self._last_escape = -float("inf")
-        self._stopped_by: events.Key | None = None  # the newest key that stopped before its turn
+        self._stopped_by: events.Key | None = None  # the newest key that has already stopped
         self._ticking: asyncio.Task[None] | None = None
         self._wake: Callable[[], None] = lambda: None  # ends the wait for the next picture
         self.canvas = Canvas()
-        self.pictures = 0  # drawn since the start; an idle screen draws none
+        self.pictures = 0  # drawn since the start; none while nothing changes
 
     def compose(self) -> ComposeResult:
         """The whole screen is one widget."""
@@ -132,7 +132,7 @@ class Monitor(ByHand, App[int]):
         self.draw()
 
     async def _tick(self) -> None:
-        """Draw as soon as the link has a new window; look less often while nothing can change."""
+        """Draw as soon as the link has a new window; more rarely while nothing can change."""
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
@@ -149,7 +149,7 @@ class Monitor(ByHand, App[int]):
             self.draw()
 
     def on_unmount(self) -> None:
-        """Let go of the run."""
+        """Detach from the run."""
         if self._ticking is not None:
             self._ticking.cancel()
         self.link.close()
@@ -185,7 +185,7 @@ class Monitor(ByHand, App[int]):
         )
 
     def draw(self, *, force: bool = False) -> None:
-        """Draw what has changed, and what depends on time as long as something is going on."""
+        """Draw changed parts, and time-dependent parts while anything is in progress."""
         frame, now = self.link.frame, self.clock()
         blink = int(now / BLINK) % 2 == 0 if self.alarms_of(frame).unacknowledged else True
         if blink != self.look.blink:
@@ -202,7 +202,7 @@ class Monitor(ByHand, App[int]):
         self.pictures += 1
 
     def alarms_of(self, frame: Frame) -> AlarmTable:
-        """Return the alarms of a frame, with what was acknowledged and reset after its end."""
+        """Return the alarms of a frame, with acknowledgements and resets made after its end."""
         snapshot = frame.snapshot
         if snapshot is None:
             return AlarmTable()
@@ -218,28 +218,28 @@ class Monitor(ByHand, App[int]):
     # Keys
 
     def get_driver_class(self) -> type[Driver]:
-        """Return the terminal's driver, which lets a stop through before everything that waits."""
+        """Return the terminal's driver, which passes a stop on before everything that waits."""
         return with_early_keys(super().get_driver_class(), self.early_key)
 
     def early_key(self, event: events.Key) -> None:
-        """Stop a live run by the thread that reads the terminal: nothing is drawn before."""
+        """Stop a live run from the thread that reads the terminal, before any drawing."""
         frame, dialog = self.link.frame, self.dialog
-        lives = frame.endpoint is not None and not frame.over
-        if lives and (event.key == "space" or (event.key == "s" and dialog is None)):
+        run_is_live = frame.endpoint is not None and not frame.over
+        if run_is_live and (event.key == "space" or (event.key == "s" and dialog is None)):
             self._stopped_by = event
             self.act_stop()
 
     def on_key(self, event: events.Key) -> None:
-        """Do what a key asks for; the stop comes before everything else."""
+        """Handle a key; the stop comes before everything else."""
         event.stop()
         event.prevent_default()
         key = event.key
         typing = self.dialog is not None and self.dialog.text is not None
-        lives = self.link.frame.endpoint is not None and not self.link.frame.over
+        run_is_live = self.link.frame.endpoint is not None and not self.link.frame.over
         choosing = self.link.frame.stage is LinkStage.CHOOSING
         if event is self._stopped_by:
             self._stopped_by = None
-        elif key == "space" and (lives or choosing or not typing):
+        elif key == "space" and (run_is_live or choosing or not typing):
             self.act_stop()
         elif key == "escape":
             self._escape()
@@ -261,11 +261,11 @@ class Monitor(ByHand, App[int]):
         self.dialog, self.accept = None, None
 
     def ask(self, dialog: Dialog, accept: Callable[[str], None] | None = None) -> None:
-        """Open a question above the page; `accept` takes its answer."""
+        """Open a question above the page; `accept` is called with its answer."""
         self.dialog, self.accept = dialog, accept
 
     def _answer(self, dialog: Dialog, key: str, character: str | None) -> None:
-        """Take a key for the open question: type, mark, accept."""
+        """Pass a key to the open question: type, mark, accept."""
         if key == "enter" or (dialog.text is None and not dialog.choices):
             accept, self.dialog, self.accept = self.accept, None, None
             if accept is not None and key == "enter":
@@ -281,7 +281,7 @@ class Monitor(ByHand, App[int]):
 
     def _page_key(self, key: str, character: str) -> None:
         page = next((name for number, name, _ in PAGES if number == character), None)
-        if key not in ("up", "down"):  # a held key must not wipe out the answer to itself
+        if key not in ("up", "down"):  # a held key must not clear its own answer
             self.remark = ""
         if page is not None:
             self.open_page(page)
@@ -301,7 +301,7 @@ class Monitor(ByHand, App[int]):
         marked = self.look.marked if back or opens else 0
         self.look = replace(self.look, page=page, marked=marked, offset=0)
         if page == "runs":
-            self.look_around()
+            self.read_folder()
 
     def _choose(self, key: str) -> None:
         sessions = self.link.frame.sessions
@@ -352,7 +352,7 @@ class Monitor(ByHand, App[int]):
         self.ask(Dialog("keys", HELP, keys="any key closes; SPACE stops"))
 
     def act_hold(self) -> None:
-        """Hold the picture, or let it live again."""
+        """Hold the picture, or let it continue."""
         self._held_frame = None if self._held_frame is not None else self.link.frame
 
     def act_zoom(self) -> None:
@@ -373,16 +373,16 @@ class Monitor(ByHand, App[int]):
         self._step_span(-1)
 
     def act_automatic(self) -> None:
-        """Leave the span to the screen."""
+        """Choose the span automatically."""
         self._span = None
 
     def act_filter(self) -> None:
-        """Keep one kind of line in the log, or all."""
+        """Show one kind of line in the log, or all."""
         at = (KINDS.index(self.look.only) + 1) % len(KINDS)
         self.look = replace(self.look, only=KINDS[at], offset=0)
 
     def act_search(self) -> None:
-        """Ask what to look for in the log."""
+        """Ask for a text to search in the log."""
 
         def found(text: str) -> None:
             page = self.look.page if self.look.page == "run log" else "log"
@@ -396,7 +396,7 @@ class Monitor(ByHand, App[int]):
         self.look = replace(self.look, offset=0)
 
     def act_choose(self) -> None:
-        """Go back to the list of runs; with a single one there is nothing to choose."""
+        """Return to the list of runs, if there are several."""
         if len(self.link.frame.sessions) < 2:
             self.remark = "No other run to choose."
         else:
@@ -407,11 +407,11 @@ class Monitor(ByHand, App[int]):
         self.action_leave(0)
 
     def action_leave(self, code: int) -> None:
-        """Close the screen and say what becomes of the run."""
+        """Close the screen and state what happens to the run."""
         self.exit(code, message=farewell(self.link.frame))
 
     def stop_answered(self, stop: Stop, where: Endpoint | None, answered: bool) -> None:
-        """Note what became of a stop; called by the sending thread."""
+        """Note the result of a stop; called by the sending thread."""
         # Replacing one attribute needs no lock.
         if self.stop_asked is stop:
             missed = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
@@ -420,7 +420,7 @@ class Monitor(ByHand, App[int]):
             self.redraw()
 
     def redraw(self) -> None:
-        """Draw at once, whether or not anything arrived; any thread may ask."""
+        """Draw at once; any thread may call this."""
         self._drawn_frame = None
         self._wake()
 

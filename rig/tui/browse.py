@@ -1,4 +1,4 @@
-"""What stands on the disk: runs, protocols and the queue, as they are read for the screen."""
+"""Runs, protocols and the queue on the disk, as read for the screen."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from rig.tui.run_trace import RunTrace
 
 TABS: Final = ("protocols", "runs", "queue")
 STEPS: Final = re.compile(rb"^steps:", re.MULTILINE)
-READ_AT_MOST: Final = 1_000_000  # [bytes] of a file, to see whether it is a protocol
+READ_AT_MOST: Final = 1_000_000  # [bytes] of a file that are read to recognise a protocol
 
 
 @dataclass(frozen=True)
 class BrowserState:
-    """What was found; `trouble` says in one line what could not be read.
+    """Contents of the folder; `trouble` is one line about what cannot be read.
 
-    `log` and `trace` are those of the run that was opened last. `job` is the newest verb that was
-    started here, `rig` and `endpoint` what it is started for.
+    `log` and `trace` are those of the run opened last; `job` is the newest verb started here, for
+    `rig` and `endpoint`.
     """
 
     folder: Path = Path()
@@ -54,12 +54,12 @@ class BrowserState:
 
     @property
     def lines(self) -> int:
-        """How many lines the open tab has."""
+        """Number of lines of the open tab."""
         return len((self.protocols, self.runs, self.queue)[self.tab])
 
 
 def read_disk(before: BrowserState) -> BrowserState:
-    """Read everything anew; never raises: what cannot be read is said in `trouble`."""
+    """Read everything again; never raises: `trouble` states what cannot be read."""
     troubles: list[str] = []
     runs: tuple[RunSummary, ...] = ()
     queue: tuple[Item, ...] = ()

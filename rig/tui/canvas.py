@@ -1,4 +1,4 @@
-"""The one widget of the screen: shows rows, and draws again only those that changed."""
+"""The screen's one widget: shows rows, and redraws only those that changed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Canvas(Widget):
         self._ground = Style.null()
 
     def show(self, rows: Sequence[Row]) -> int:
-        """Show these rows; returns how many had changed."""
+        """Show these rows; return how many have changed."""
         before, self.rows = self.rows, tuple(rows)
         self._ground = self.rich_style
         padded = [*before, *[BLANK] * (len(rows) - len(before))]

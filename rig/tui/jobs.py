@@ -1,6 +1,6 @@
-"""Verbs of `bramah` that the operator starts from the screen, each a process of its own.
+"""Verbs of `bramah` that the operator starts from the screen, each a separate process.
 
-The screen never holds the hardware: closing or killing it leaves what it started as it was.
+The screen never holds the hardware: closing or killing it does not affect these processes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MEANINGS: Final = {
 
 @dataclass(frozen=True)
 class VerbJob:
-    """One verb: what was asked, its process, its output so far, its exit code once it has ended."""
+    """One verb: its arguments, process, output so far, and exit code once it has ended."""
 
     words: tuple[str, ...]
     pid: int = 0
@@ -42,12 +42,12 @@ class VerbJob:
 
     @property
     def title(self) -> str:
-        """The command as a person would type it."""
+        """The command line as typed."""
         return " ".join(("bramah", *self.words))
 
     @property
     def ended(self) -> str:
-        """How it ended, in words; empty while it runs."""
+        """Its end, in words; empty while it runs."""
         if self.code is None:
             return ""
         meaning = MEANINGS.get(self.code, f"ended with code {self.code}")
@@ -111,6 +111,6 @@ def _text(stream: IO[bytes]) -> str:
 
 
 def rig_of_run(run: str, rig: str) -> str:
-    """Return what names the rig of a run for a verb: the run's own description, else its name."""
+    """Return the rig of a run as an argument of a verb: the run's description, else its name."""
     header = Path(run) / "run.yaml"
     return str(header) if run and header.is_file() else rig

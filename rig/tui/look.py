@@ -1,4 +1,4 @@
-"""What the operator has chosen to see, and everything a page is drawn from; immutable."""
+"""The operator's choices of display, and all data of a page; immutable."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rig.tui.browse import BrowserState
 from rig.tui.following.link import Frame
 from rig.tui.words import Freshness, Stop, freshness
 
-# The key of each page, its name, and the name where there is little room.
+# The key of each page, its name, and a short name.
 PAGES: Final = (
     ("1", "overview", "over"),
     ("2", "joint", "joint"),
@@ -30,7 +30,7 @@ OF_A_RECORDED_RUN: Final = ("run log", "run trace")  # opened from the page of r
 
 @dataclass(frozen=True)
 class ScreenStyle:
-    """What is chosen: page, joint, channel, the marked line, span of the plots, filters."""
+    """The operator's choices: page, joint, channel, marked line, span of the plots, filters."""
 
     page: str = "overview"
     joint: int = 1
@@ -58,7 +58,7 @@ class Dialog:
 
 @dataclass(frozen=True)
 class PlotView:
-    """One picture: `frame` is shown, `newest` what the link has (they differ where held)."""
+    """One picture: `frame` is shown, `newest` is the link's newest (they differ while held)."""
 
     frame: Frame
     newest: Frame
@@ -67,7 +67,7 @@ class PlotView:
     alarms: AlarmTable = field(default_factory=AlarmTable)
     stop: Stop | None = None
     dialog: Dialog | None = None
-    remark: str = ""  # what became of the operator's newest act
+    remark: str = ""  # result of the operator's newest action
     me: str = ""  # this screen, as a holder of the controls
     rig: str | None = None
     browsed: BrowserState = field(default_factory=BrowserState)
@@ -81,7 +81,7 @@ class PlotView:
 
     @property
     def fresh(self) -> Freshness:
-        """What the numbers are."""
+        """Freshness of the numbers."""
         return freshness(self.newest, self.now, held=self.held)
 
     @property

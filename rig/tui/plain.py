@@ -1,7 +1,7 @@
 """`bramah monitor --plain`: one line a second, for screen readers, logs and pipes.
 
-Each line begins with the state in a word; what happened stands in lines of its own at once. After
-the end of a run it is silent until the next one.
+Each line begins with the state in a word; events are separate lines, shown at once. After the end
+of a run it is silent until the next one.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _without(frame: Frame) -> str:
 
 
 class Reader:
-    """Says what changed: status lines every second, and what happened as it is received."""
+    """Prints changes: status lines every second, and events as they are received."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
@@ -63,7 +63,7 @@ class Reader:
         self._last = ""
 
     def read(self, frame: Frame, now: float) -> None:
-        """Say what is new in a frame."""
+        """Print what is new in a frame."""
         fresh = min(frame.total_lines - self._written, len(frame.event_lines))
         self._written = frame.total_lines
         for what in frame.event_lines[len(frame.event_lines) - fresh :]:
@@ -80,8 +80,8 @@ class Reader:
         self._last = line
 
 
-def read_aloud(rig: str | None, say: Callable[[str], None]) -> None:
-    """Say what a run does until interrupted; it is watched, never commanded."""
+def print_status(rig: str | None, say: Callable[[str], None]) -> None:
+    """Print a run's status and events until interrupted; the run is not commanded."""
     link = Link(LocalSessions(rig), time.monotonic)
     reader = Reader(say)
     link.start()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.runs.runstate import EVENTS
-from rig.tui.following.event_lines import EventLine, said_of_event
+from rig.tui.following.event_lines import EventLine, event_text
 
 MOST: Final = 20_000  # newest lines that are kept
 LONGEST: Final = 400  # characters of a line
@@ -17,7 +17,7 @@ LONGEST: Final = 400  # characters of a line
 
 @dataclass(frozen=True)
 class RunLog:
-    """The lines of a run's log, oldest first; `trouble` says in one line what is damaged."""
+    """The lines of a run's log, oldest first; `trouble` is one line about damage."""
 
     folder: Path
     lines: tuple[EventLine, ...] = ()
@@ -26,7 +26,7 @@ class RunLog:
 
 
 def read_log(folder: Path) -> RunLog:
-    """Read the events of a run; never raises: what cannot be read is said in `trouble`."""
+    """Read the events of a run; never raises: `trouble` states what cannot be read."""
     path = folder / EVENTS
     try:
         raw = path.read_bytes()
@@ -44,7 +44,7 @@ def read_log(folder: Path) -> RunLog:
             bad.append(number)
             continue
         newest = _time(event, newest)
-        text, style, kind = said_of_event(event)
+        text, style, kind = event_text(event)
         entries.append(EventLine(newest, _printable(text), style, kind))
     torn = bad == [len(lines)] and not raw.endswith(b"\n")
     return RunLog(folder, tuple(entries[-MOST:]), _trouble(path, bad, len(lines), torn=torn))
@@ -59,21 +59,21 @@ def _event(line: bytes) -> dict[str, Any] | None:
 
 
 def _time(event: dict[str, Any], before: float) -> float:
-    """Return when an event was [s since the run began]; the time before where it does not say."""
+    """Return an event's time [s since the run began]; the previous one's where it has none."""
     at = event.get("t")
     known = isinstance(at, int | float) and not isinstance(at, bool) and math.isfinite(at)
     return float(at) if known and at is not None else before
 
 
 def _printable(text: str) -> str:
-    """Return a text that does nothing to a terminal, whatever a damaged file holds."""
+    """Return a text without control characters, which a damaged file may hold."""
     flat = " ".join(text.split())
     return "".join(c if c.isprintable() else "·" for c in flat[:LONGEST])
 
 
 def _trouble(path: Path, bad: list[int], count: int, *, torn: bool) -> str:
     if torn:
-        return f"{path}: the last line was cut off, as by a kill; what stands before it is shown"
+        return f"{path}: the last line was cut off, as by a kill; the lines before it are shown"
     if bad:
         return (
             f"{path}: {len(bad)} of {count} lines cannot be read, the first is line {bad[0]}; "

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.model.channels import place_in_words
 
-STORED: Final = "trace.json"  # what `bramah trace --json` wrote, in the run's folder or above it
+STORED: Final = "trace.json"  # the output of `bramah trace --json`, in the run's folder or above it
 
 Numbers = Mapping[str, float | None]
 
@@ -50,7 +50,7 @@ class StoredEffect(_Stored):
 
     @property
     def location(self) -> str:
-        """Where it is, in words: of one sensor of a joint, which."""
+        """Its place in words, with the sensor of a joint."""
         return place_in_words(self.at or self.where)
 
 
@@ -87,13 +87,13 @@ class StoredFreeRun(_Stored):
 
 
 class StoredNext(_Stored):
-    """What to measure next."""
+    """The next experiment."""
 
     text: str = ""
 
 
 class StoredTrace(_Stored):
-    """What the screen shows of a trace's JSON."""
+    """The parts of a trace's JSON that the screen shows."""
 
     verdict: str
     sentence: str = ""
@@ -109,7 +109,7 @@ class StoredTrace(_Stored):
 
 @dataclass(frozen=True)
 class RunTrace:
-    """The trace of a run's folder; `trouble` says in one line why there is none."""
+    """The trace of a run's folder; `trouble` is one line on why there is none."""
 
     folder: Path
     path: Path | None = None
@@ -119,7 +119,7 @@ class RunTrace:
 
 
 def read_trace(folder: Path) -> RunTrace:
-    """Read the trace stored in a run's folder, else beside it; never raises."""
+    """Read the trace stored in a run's folder, else next to it; never raises."""
     places = (folder / STORED, folder.parent / STORED)
     path = next((place for place in places if place.is_file()), None)
     if path is None:
@@ -134,7 +134,7 @@ def read_trace(folder: Path) -> RunTrace:
 
 
 def _first(error: ValidationError) -> str:
-    """Return what is wrong first, with its key; expected is what `bramah trace --json` writes."""
+    """Return the first error with its key; `bramah trace --json` is expected."""
     first = error.errors(include_url=False)[0]
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "json_invalid":

@@ -12,9 +12,10 @@ from rig.model.units import READINGS, display_unit
 
 @dataclass(frozen=True)
 class Format:
-    """How a channel's SI unit is shown: its name, SI to shown factor, decimals.
+    """Display of a channel's SI unit: its name, factor from SI, decimals.
 
-    `least` is the smallest height [SI] of a plot without limits: noise must not look like motion.
+    `least` is the smallest height [SI] of a plot without limits, so that noise does not look like
+    motion.
     """
 
     unit: str
@@ -24,7 +25,7 @@ class Format:
 
     @property
     def signed(self) -> bool:
-        """Whether its sign is shown always: what moves to both sides of zero."""
+        """Whether its sign is always shown, for values of both signs."""
         return self.unit not in ("MPa", "°C")
 
     def number(self, value: float | None, *, sign: bool = False) -> str:
@@ -37,7 +38,7 @@ class Format:
         return text.replace("-", "−")
 
     def short(self, value: float | None) -> str:
-        """Return the value with no more decimals than a limit needs: 9, −0.2, 36."""
+        """Return the value with as few decimals as a limit needs: 9, −0.2, 36."""
         if value is None or math.isnan(value):
             return ""
         text = f"{round(value * self.factor, self.decimals) + 0.0:g}"
@@ -49,13 +50,13 @@ _LEAST: Final = {"Pa": 0.2e6, "m": 2e-3, "V": 0.02, "degC": 2.0}
 
 
 def shown(unit: str) -> Format:
-    """Return how an SI unit is shown; one not listed keeps its own name."""
+    """Return the display of an SI unit; an unlisted one keeps its own name."""
     known = display_unit(unit, READINGS)
     return Format(known.text, known.scale, known.decimals, _LEAST.get(unit, 0.0))
 
 
 class Band(IntEnum):
-    """Where a value stands: well inside its limits, close to one, or beyond it."""
+    """Position of a value: well inside its limits, close to one, or beyond it."""
 
     INSIDE = 0
     NEAR = 1
@@ -63,7 +64,7 @@ class Band(IntEnum):
 
 
 def band(value: float, low: float | None, high: float | None, margin: float = 0.02) -> Band:
-    """Return where a value stands; NEAR is within `margin` of the range between the limits."""
+    """Return the position of a value; NEAR is within `margin` of the range between the limits."""
     beyond = (low is not None and value < low) or (high is not None and value > high)
     if beyond:
         return Band.BEYOND
@@ -83,7 +84,7 @@ def clock_text(seconds: float) -> str:
 
 
 def age_text(seconds: float) -> str:
-    """Return the age of a sample in as many digits as matter: 0.05 s, 3.2 s, 75 s, 12 min."""
+    """Return the age of a sample with two digits or so: 0.05 s, 3.2 s, 75 s, 12 min."""
     if seconds < 1:
         return f"{max(seconds, 0.0):.2f} s"
     if seconds < 10:
@@ -92,5 +93,5 @@ def age_text(seconds: float) -> str:
 
 
 def limit(value: float | None) -> float | None:
-    """Return a limit that can be drawn, or None for one that is absent or infinite in effect."""
+    """Return a limit that can be drawn, or None for an absent or practically infinite one."""
     return value if value is not None and abs(value) < 1e300 else None

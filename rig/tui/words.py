@@ -1,4 +1,4 @@
-"""What the screen says in words: the state of the bench, what must not be missed, values."""
+"""Texts of the screen: the state of the bench, notices, values."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from rig.tui.following.link import ENDED_STATES, QUIET, Frame, LinkStage
 from rig.tui.units import Band, age_text, band, limit, shown
 
 VERY_OLD: Final = 3.0  # from here on old data is red instead of yellow [s]
-CONFIRM: Final = 2.0  # a stop is confirmed within this time, or the screen says that it was not [s]
-LINGER: Final = 10.0  # what became of a stop of another run than the one shown stays this long [s]
+CONFIRM: Final = 2.0  # a stop not confirmed within this time is reported [s]
+LINGER: Final = 10.0  # display time of the result of a stop of another run [s]
 RECENT: Final = 1.0  # the nearest margin is that of the last second [s of device time]
 EMERGENCY: Final = "Use the emergency stop of the bench."
 
 
 class Freshness(Enum):
-    """What a number on the screen is; each looks different and has a word."""
+    """Freshness of the numbers on the screen; each has its own look and word."""
 
     LIVE = "live"
     HELD = "held"  # the operator has paused the display
     STALE = "stale"  # nothing new for longer than QUIET
-    DISCONNECTED = "disconnected"  # the device or the run's process is gone
+    DISCONNECTED = "disconnected"  # the device or the run's process has ended
     ENDED = "ended"  # the run is over; this is its last picture
 
 
@@ -49,17 +49,17 @@ class Headline:
 
 
 class KeyAnswer(Enum):
-    """What became of a stop."""
+    """Result of a stop."""
 
     SENDING = 0
     TAKEN = 1
     NONE = 2
-    NOWHERE = 3  # nothing was attached that it could have gone to
+    NOWHERE = 3  # there was no session to send it to
 
 
 @dataclass(frozen=True)
 class Stop:
-    """A stop the operator asked for: when (monotonic [s]), of which run, what came back."""
+    """A stop requested by the operator: time (monotonic [s]), run, answer."""
 
     at: float
     endpoint: Endpoint | None
@@ -76,7 +76,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class Margin:
-    """How far a channel is from a limit, as a share of the width of its band, and in SI."""
+    """Distance of a channel from a limit, as a share of the width of its band, and in SI."""
 
     channel: str
     share: float
@@ -87,7 +87,7 @@ class Margin:
 
 
 def freshness(frame: Frame, now: float, *, held: bool = False) -> Freshness:
-    """Return what the numbers of a frame are."""
+    """Return the freshness of a frame's numbers."""
     snapshot = frame.snapshot
     if snapshot is not None and (snapshot.device == LOST or _run_gone(frame, snapshot)):
         return Freshness.DISCONNECTED
@@ -103,7 +103,7 @@ def _run_gone(frame: Frame, snapshot: Snapshot) -> bool:
 
 
 def headline(frame: Frame, now: float) -> Headline:
-    """Return the state of the bench in a word, the worst that is true."""
+    """Return the state of the bench in a word, the worst that applies."""
     snapshot = frame.snapshot
     if snapshot is None:
         return Headline("NO RUN" if frame.endpoint is None else "NO DATA", "ended")
@@ -149,7 +149,7 @@ def nearest_margin(frame: Frame) -> Margin | None:
 
 
 def place_of(name: str) -> tuple[str, int | None]:
-    """Return (kind, joint or None) of a channel; one of a kind not known stands for itself."""
+    """Return (kind, joint or None) of a channel; an unknown kind is its own name."""
     try:
         return ch.kind_of(name)
     except ValueError:
@@ -170,7 +170,7 @@ def run_time(frame: Frame, device_time: float | None = None) -> float:
 
 
 def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> list[Notice]:
-    """Return what the operator must not miss, the worst first."""
+    """Return the notices, the worst first."""
     standing: list[Notice] = []
     snapshot = frame.snapshot
     if snapshot is not None and UNSURE in snapshot.message:
@@ -178,10 +178,10 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
             Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}")
         )
     if snapshot is not None and snapshot.device == LOST:
-        became = (
+        result = (
             snapshot.message if frame.over else "looking for it; outputs zeroed by its watchdog"
         )
-        standing.append(Notice("alarm", f"DEVICE LOST: {became}"))
+        standing.append(Notice("alarm", f"DEVICE LOST: {result}"))
     if snapshot is not None and snapshot.trip is not None:
         standing.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
     if frame.trouble:
@@ -206,7 +206,7 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
 
 
 def alarm_notices(snapshot: Snapshot) -> list[Notice]:
-    """Return one line on the warnings that stand: the most urgent, and how many there are."""
+    """Return one line on the present warnings: the most urgent, and their number."""
     groups = folded(AlarmTable(tuple(a for a in snapshot.alarms if not a.trips)))
     if not groups:
         return []
@@ -218,7 +218,7 @@ def alarm_notices(snapshot: Snapshot) -> list[Notice]:
 
 
 def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
-    """Return what became of the operator's stop; only the run's own word confirms it."""
+    """Return the result of the operator's stop; only the run itself confirms it."""
     if stop.answer is KeyAnswer.NOWHERE:
         return Notice("alarm", "STOP: NOTHING SENT, no run is attached to this screen.")
     if stop.answer is KeyAnswer.NONE:
@@ -227,12 +227,12 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
         return Notice("alarm", f"STOP: NO ANSWER from the run. {EMERGENCY}")
     if stop.endpoint is not None and stop.endpoint != frame.endpoint:
         whom = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
-        became = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
-        return Notice("warn", f"STOP to {whom}, which is not the run shown: {became}")
-    return _stop_of_the_shown(frame, stop, now)
+        result = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
+        return Notice("warn", f"STOP to {whom}, which is not the run shown: {result}")
+    return _stop_of_shown_run(frame, stop, now)
 
 
-def _stop_of_the_shown(frame: Frame, stop: Stop, now: float) -> Notice:
+def _stop_of_shown_run(frame: Frame, stop: Stop, now: float) -> Notice:
     if frame.snapshot is not None and _zeroed(frame.snapshot):
         return Notice("normal", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
     if stop.answer is KeyAnswer.SENDING:
@@ -248,9 +248,9 @@ def _stop_of_the_shown(frame: Frame, stop: Stop, now: float) -> Notice:
 
 
 def _zeroed(snapshot: Snapshot) -> bool:
-    """Whether the run says that it stopped; it zeroes its outputs before it says so.
+    """Return whether the run reports that it stopped, which it does after zeroing its outputs.
 
-    A run that was aborted for another reason, a lost device say, may not have reached them.
+    A run aborted for another reason, such as a lost device, may not have zeroed them.
     """
     said = snapshot.message.lower()
     stopped = snapshot.state == "aborted" and "stopped" in said
@@ -274,7 +274,7 @@ NEARNESS: Final = {Band.INSIDE: "", Band.NEAR: "▲", Band.BEYOND: "■"}
 
 
 def band_of(view: ChannelView) -> Band:
-    """Return where a channel's newest value stands: within, where it warns, or beyond a limit."""
+    """Return the position of a channel's newest value: within, in a warning band, or beyond."""
     where = band(view.last, limit(view.low), limit(view.high))
     near = band(view.last, limit(view.warn_low), limit(view.warn_high), margin=0.0)
     return Band.NEAR if where is Band.INSIDE and near is Band.BEYOND else where

@@ -33,7 +33,7 @@ def steps(periods: int = 3, repeats: int = 4) -> list[TwinStep]:
                 biases={},
                 samples=periods * PERIOD,
                 repeats=repeats,
-                gives={0: 5e-3} if name == "step1" else {},
+                yields={0: 5e-3} if name == "step1" else {},
                 offsets={joint: 2e-3},
             )
         )

@@ -124,17 +124,17 @@ def test_the_seed_bench_is_told_that_its_data_reject_rigid_bodies(
     signs, rigid = found.levels
     assert not signs.rejected
     assert rigid.rejected
-    price = rigid.prices["mechanical"]
+    price = rigid.costs["mechanical"]
     assert price.active == ("R12 = l1 W2",)
     assert price.residual > 0.5
     assert price.p < 1e-6
-    given = with_physics(identified, found)
-    assert given.estimates["W2"].value == pytest.approx(3.30, rel=0.01)
-    last = given.checks[-1]
+    returned = with_physics(identified, found)
+    assert returned.estimates["W2"].value == pytest.approx(3.30, rel=0.01)
+    last = returned.checks[-1]
     assert not last.ok
     assert "REJECTED by the data" in last.detail
     assert "(-16.9%" in last.detail  # 1.37 / (0.5 * 3.30) - 1
-    assert given.model.provenance["physical"] == "signs"
+    assert returned.model.provenance["physical"] == "signs"
     R12, W2 = rigid.estimates["R12"].value, rigid.estimates["W2"].value
     assert pytest.approx(0.5 * W2) == R12
     assert to_json(found)["given"] == "signs"
@@ -150,12 +150,12 @@ def test_links_of_the_right_length_are_accepted(multisine_run: Run) -> None:
     found = physical(free)
     rigid = found.levels[1]
     assert not rigid.rejected
-    assert found.given == 1
-    assert rigid.prices["mechanical"].residual < 1e-3
-    given = with_physics(free, found).estimates
-    assert given["R12"].value == pytest.approx(true * given["W2"].value)
+    assert found.returned == 1
+    assert rigid.costs["mechanical"].residual < 1e-3
+    returned = with_physics(free, found).estimates
+    assert returned["R12"].value == pytest.approx(true * returned["W2"].value)
     # What is known need not be measured: the scatter of what it binds falls.
-    assert given["R12"].std < free.estimates["R12"].std
+    assert returned["R12"].std < free.estimates["R12"].std
 
 
 def test_friction_that_pushes_is_pulled_to_zero_and_its_price_said(
@@ -171,8 +171,8 @@ def test_friction_that_pushes_is_pulled_to_zero_and_its_price_said(
     found = physical(replace(identified, solutions={**identified.solutions, "mechanical": moved}))
     signs = found.levels[0]
     assert signs.estimates["Fv2"].value == pytest.approx(0.0, abs=1e-4)
-    assert signs.prices["mechanical"].active == ("Fv2 >= 0",)
-    assert signs.prices["mechanical"].residual > 0
+    assert signs.costs["mechanical"].active == ("Fv2 >= 0",)
+    assert signs.costs["mechanical"].residual > 0
 
 
 def test_without_scatter_to_judge_by_compatibility_is_not_claimed(
@@ -181,7 +181,7 @@ def test_without_scatter_to_judge_by_compatibility_is_not_claimed(
     solution = identified.solutions["mechanical"]
     blind = replace(solution, covariance=np.full_like(solution.covariance, np.nan))
     found = physical(replace(identified, solutions={**identified.solutions, "mechanical": blind}))
-    assert np.isnan(found.levels[1].prices["mechanical"].p)
+    assert np.isnan(found.levels[1].costs["mechanical"].p)
     assert "too few" in found.checks[1].detail
 
 

@@ -205,7 +205,7 @@ def test_consistent_parameters_keep_the_tolerances(
     assert by_name["R12"] == pytest.approx(length * by_name["W2"], rel=1e-6)
     assert np.linalg.norm(by_name["W2"]) > 0.0
     # The paper's link length is rejected still, by fewer standard errors.
-    levels = [physical(result).levels[1].prices["mechanical"] for result in (exact, stated)]
+    levels = [physical(result).levels[1].costs["mechanical"] for result in (exact, stated)]
     assert levels[0].p < levels[1].p < 0.01
 
 

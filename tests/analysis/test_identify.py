@@ -13,7 +13,7 @@ from analysis.identify.result import Identification, to_json
 from analysis.regression.rows import FILTERINGS, Filtering
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter, row_filter, row_step
-from analysis.signals.locks import gives
+from analysis.signals.locks import accelerates
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -170,8 +170,8 @@ def test_the_give_of_a_lock_is_seen_and_a_perfect_lock_is_not_invented(rig: Rig)
     noise = rig.sensors.piston.noise
     t = np.arange(10_000) / 1000
     still = noise * rng.standard_normal(10_000)
-    assert not gives(still, 1000.0, noise)
-    assert gives(still + 20e-6 * np.sin(2 * np.pi * 8 * t), 1000.0, noise)
+    assert not accelerates(still, 1000.0, noise)
+    assert accelerates(still + 20e-6 * np.sin(2 * np.pi * 8 * t), 1000.0, noise)
 
 
 def test_a_parameter_that_rests_on_sensor_noise_is_no_parameter(

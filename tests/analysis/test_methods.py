@@ -151,14 +151,14 @@ def task(rig: Rig, sine_run: Run) -> SearchTask:
 def test_the_truth_scores_well_and_a_wrong_machine_badly_or_not_at_all(task: SearchTask) -> None:
     truth = {name: TRUTH[name] for name in STEP1}
     assert task.record == "step1_r1"
-    assert score(task, truth).fate == ""
+    assert score(task, truth).failure == ""
     assert score(task, truth).error < 2e-3
     weak = {**truth, **{name: 0.7 * v for name, v in truth.items() if name.startswith("C_")}}
     assert score(task, weak).error > 10 * score(task, truth).error
     # Eight times too much cap flow one way: the rod chamber is driven beyond the supply.
     torn = score(task, {**truth, "C_pp_2": 8 * truth["C_pp_2"]})
-    assert torn.fate in {COMPLEX, DIVERGED}
-    assert torn.error >= IDENTIFY.dead_error
+    assert torn.failure in {COMPLEX, DIVERGED}
+    assert torn.error >= IDENTIFY.failed_error
 
 
 @pytest.mark.parametrize("method", ["pso", "ga"])

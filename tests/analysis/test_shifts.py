@@ -12,7 +12,7 @@ from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman
 from analysis.identify.estimators.nuisance import Belief, joined
-from analysis.identify.estimators.shifts import Shift, certain_shift, including, shifts_of
+from analysis.identify.estimators.shifts import Shift, including, shifts_of, significant_shift
 from analysis.identify.estimators.statements import noise_statement
 from tests.analysis.straight_line import line
 
@@ -51,7 +51,7 @@ def test_a_shift_must_be_certain_and_large_to_speak_against_least_squares(case: 
     # Attenuation is 1/(1 + noise/signal); what is certain is in the interval.
     if certain:
         assert shift.relative == pytest.approx(-(blurred**2) / (0.5 + blurred**2), rel=0.3)
-        wide = including(error, certain_shift(test, p))
+        wide = including(error, significant_shift(test, p))
         half = student.ppf(0.975, wide.dof[0]) * np.sqrt(wide.covariance[0, 0])
         assert abs(fit.beta[0] - 2.0) < half
 

@@ -75,7 +75,7 @@ def test_a_key_that_a_step_does_not_have_is_named() -> None:
     for changes, said in (
         ({"repeat": 2}, "repeat: no key 'repeat' here; expected one of:"),
         ({"excite.3.signal": {}}, "excite.3.signal: no key '3' here; expected one of: 0 to 0"),
-        ({"excite.0.signal.amplitude": "1 kg"}, "unit 'kg' does not measure"),
+        ({"excite.0.signal.amplitude": "1 kg"}, "unit 'kg' is of another dimension"),
         ({"repeats": 0}, "repeats: expected greater than or equal to 1, found 0"),
     ):
         with pytest.raises(InputError) as caught:

@@ -391,7 +391,7 @@ def test_a_module_without_a_watchdog_is_refused_unless_accepted(
         (("piston_1: {function", "pistn_1: {function"), r"inputs.pistn_1: unknown; rig 'shin"),
         (("    spool_1:", "    drive_1:"), "inputs.drive_1: unknown"),
         (("scale: 0.01 mm", "scale: 0.01"), r"inputs.piston_1.scale: .*has no unit"),
-        (("scale: 0.01 mm", "scale: 1 bar"), r"inputs.piston_1.scale: unit 'bar' does not mea"),
+        (("scale: 0.01 mm", "scale: 1 bar"), r"inputs.piston_1.scale: unit 'bar' is of another"),
         (("scale: 0.01 mm", "scale: 0 mm"), r"inputs.piston_1.scale: is zero"),
         (("scale: 0.01 mm", "scal: 0.01 mm"), r"inputs.piston_1.scal: unknown key; expected: "),
         (("offset: 0 mm", "offset: 3 s"), r"inputs.piston_1.offset: unit 's'"),
@@ -431,7 +431,7 @@ def test_a_channel_without_a_register_is_named() -> None:
 
 
 def test_a_key_that_stands_twice_is_refused_with_its_line() -> None:
-    with pytest.raises(InputError, match=r"plain.yaml:\d+: key 'spool_1' stands here a second"):
+    with pytest.raises(InputError, match=r"plain.yaml:\d+: key 'spool_1' occurs twice"):
         rig_of(change=("    piston_1:", "    spool_1:"))
 
 

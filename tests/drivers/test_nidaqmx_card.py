@@ -216,7 +216,7 @@ def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("scale: 8 mm/V}", "scale: 8 mm}"), r"inputs.piston_1.scale: unit 'mm' does not"),
+        (("scale: 8 mm/V}", "scale: 8 mm}"), r"inputs.piston_1.scale: unit 'mm' is of another"),
         (("Dev1/ai1,", "ai1,"), r"inputs.piston_1.channel: "),
         (("Dev1/ai1,", "Dev1/ai1:3,"), r"inputs.piston_1.channel: "),
         (

@@ -69,7 +69,7 @@ def test_what_an_electric_joint_lacks_is_said_when_it_is_asked_for() -> None:
     ("old", "new", "said"),
     [
         ("35.15065 N/V", "35.15065", "mine.yaml:12: joints.0.drive: 35.15065 has no unit"),
-        ("35.15065 N/V", "35 N*m/V", "does not measure what is wanted here"),
+        ("35.15065 N/V", "35 N*m/V", "is of another dimension"),
         ("35.15065 N/V", "0 N/V", "drive gain 0 moves nothing"),
         ("[-20 mm, 280 mm]", "[-20 deg, 280 deg]", "joints.0.limits"),
         ("[-20 mm, 280 mm]", "[280 mm, -20 mm]", "lower 0.28 is not below upper -0.02"),

@@ -219,7 +219,7 @@ def test_yes_and_no_of_yaml_are_answers() -> None:
     ("step", "message"),
     [
         ("wait_until: oil_temperature > 40\n    timeout: 1 s", "has no unit"),
-        ("wait_until: oil_temperature > 40 bar\n    timeout: 1 s", "does not measure"),
+        ("wait_until: oil_temperature > 40 bar\n    timeout: 1 s", "is of another dimension"),
         ("wait_until: __import__('os')\n    timeout: 1 s", "is no comparison"),
         ("wait_until: piston_9 > 1 mm\n    timeout: 1 s", "has no channel 'piston_9'"),
         ("wait_until: R13 > 1 kg*m^2\n    timeout: 1 s", "has no parameter 'R13'"),

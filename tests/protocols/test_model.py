@@ -54,8 +54,8 @@ def test_units_become_si() -> None:
 REFUSED = [
     ("repeats: 3", "repeat: 3", "mine.yaml:12: steps.0.repeat: unknown key"),
     ("position_gain: 10 V/m", "position_gain: 10", "mine.yaml:3: .*has no unit"),
-    ("position_gain: 10 V/m", "position_gain: 10 V", "mine.yaml:3: .*does not measure"),
-    ("amplitude: 500 mV", "amplitude: 500 kg", "mine.yaml:10: .*does not measure"),
+    ("position_gain: 10 V/m", "position_gain: 10 V", "mine.yaml:3: .*is of another dimension"),
+    ("amplitude: 500 mV", "amplitude: 500 kg", "mine.yaml:10: .*is of another dimension"),
     ("frequency: 2 Hz", "frequency: 0 Hz", "mine.yaml:10: .*greater than 0"),
     ("at: closed", "at: open", "mine.yaml:7: .*'end_min'"),
     ("at: closed", "at: end_min", "mine.yaml:7: .*piston belongs to a lock at 'closed'"),

@@ -75,7 +75,7 @@ def test_single_outliers_of_the_residual_are_no_warning() -> None:
 
 def test_a_model_that_says_less_than_half_is_a_warning_from_the_start() -> None:
     (said,) = warnings_of(series([0.01] * 5, [0.8] * 5))
-    assert said.startswith("flow: 80% of it is left over")
+    assert said.startswith("flow: 80% remains as residual")
 
 
 def test_a_parameter_that_is_not_excited_now_is_not_judged() -> None:

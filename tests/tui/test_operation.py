@@ -75,11 +75,11 @@ async def test_a_prompt_is_seen_from_every_page_and_answered_in_the_screen() -> 
 
 async def test_a_refusal_is_a_sentence() -> None:
     record = running()
-    record.refusal = "a pause is asked for already; it comes at the end of the record"
+    record.refusal = "a pause is requested already; it comes at the end of the record"
     async with glass(Machine({HERE: record})) as shown:
         await shown.press("p")
         await shown.said("pause")
-        assert "pause: a pause is asked for already" in shown.text
+        assert "pause: a pause is requested already" in shown.text
 
 
 async def test_two_operators_one_is_in_command_and_the_other_must_take_over() -> None:

@@ -1,4 +1,4 @@
-"""Estimators beyond plain least squares, and intervals that mean what they say.
+"""Estimators beyond plain least squares, and intervals with the stated coverage.
 
 Glossary. All but output error solve estimating equations sum Z' w (y - X beta) = 0 over the same
 filtered rows; they differ in the instruments Z and the weights w (`equations`):
@@ -7,7 +7,7 @@ filtered rows; they differ in the instruments Z and the weights w (`equations`):
  iv            Z from the other repeats' rows: noise in X cannot bias it (`instruments`).
  robust        w falls for rows far outside the scatter (`robust`).
  output-error  simulates the model from free window starts and fits it to the samples
-               (`output_error`); noise is where it belongs, in the outputs.
+               (`output_error`); noise is in the outputs only.
 `choose` runs one of them, or prefers by the check on noise in the regressors.
 """
 

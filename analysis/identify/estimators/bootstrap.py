@@ -1,9 +1,10 @@
-"""Block bootstrap: whole repeats are drawn anew, step by step, and everything is solved again.
+"""Block bootstrap: whole repeats are drawn with replacement, step by step, and solved again.
 
-Within a record residuals are correlated, so single rows must not be drawn; whole repeats are
-independent. A step with one repeat has its parts of the period drawn instead. n repeats drawn
-with replacement scatter sqrt((n-1)/n) of what they should; deviations are stretched by as much,
-and by Student's t over the normal law for so few repeats.
+Residuals within a record are correlated, so single rows must not be drawn; whole repeats are
+independent. For a step with one repeat, parts of its period are drawn instead. n repeats drawn with
+replacement scatter by sqrt((n-1)/n) too little; deviations are scaled up by that factor and by the
+ratio of Student's t to the normal quantile.
+
 Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), sections 3.2, 8.2.
 """
 
@@ -50,7 +51,7 @@ def bootstrap(
 
 
 def _units(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str], list[tuple[int, int]]]:
-    """Return what may be drawn in each stratum: (repeat, -1), or (repeat, part) of the only one."""
+    """Return the units to draw in each stratum: (repeat, -1), or (only repeat, part)."""
     repeats: dict[tuple[int, str], set[int]] = {}
     for b in blocks:
         repeats.setdefault(b.stratum, set()).add(b.repeat)

@@ -1,10 +1,10 @@
-"""Covariance of an estimate: scatter between repeats, and lack of fit where it shows.
+"""Covariance of an estimate: scatter between repeats, plus significant lack of fit.
 
-Repeats show noise and whatever differs from one to the next, but not what the model gets wrong
-in every repeat alike. That shows in the scores g = Z'w e of groups of rows, all repeats together:
-were the model exact, they would differ from zero by noise only, and how much that is the repeats
-tell. Groups are the parts of the excitation's period, and the levels of the state that an
-equation's law depends on. For either grouping, with u = A^-1 g,
+Repeats show noise and other differences between them, but not a model error that is the same in
+every repeat. That error appears in the scores g = Z'w e of groups of rows, summed over repeats: for
+an exact model they differ from zero by noise only, whose size is known from the repeats. Groups are
+the parts of the excitation's period, and the levels of the state that an equation's law depends on.
+For either grouping, with u = A^-1 g,
  V_groups = sum u u',  V_noise = sum over groups of n/(n-1) sum_r (u_r - mean)(u_r - mean)',
 and where V_groups exceeds V_noise by an F test, the difference is added to the scatter between
 repeats as a systematic component: V = V_repeats + max(V_groups - V_noise). It is the square of a
@@ -41,9 +41,9 @@ class CovarianceParts:
 
 
 def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
-    """Return V_repeats + visible lack of fit; the first grouping is that of the period.
+    """Return V_repeats plus lack of fit (k, k); the first grouping is by parts of the period.
 
-    Where a step has one repeat only there is no scatter, and the parts of the period stand for it.
+    Where a step has only one repeat, the parts of the period take the place of repeats.
     """
     repeats = by_repeats(groupings[0], inverse)
     if repeats is None:
@@ -61,14 +61,14 @@ def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
 
 
 def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
-    """Return the scatter between repeats within their steps; None where a step has only one."""
+    """Return the scatter between repeats of a step (k, k); None where a step has only one."""
     stratum, score, _ = pieces.grouped(pieces.repeat)
     sandwich = stratified(stratum, score @ inverse.T)
     return None if sandwich is None else CovarianceParts(*sandwich, np.zeros(len(inverse)))
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
-    """Return V_groups - V_noise (k, k), positive, zero for parameters where it is not visible."""
+    """Return V_groups - V_noise (k, k), positive; zero for parameters without significance."""
     _, score, _ = pieces.grouped(pieces.part)
     u = score @ inverse.T
     noise = stratified(np.column_stack((pieces.stratum, pieces.part)), pieces.score @ inverse.T)
@@ -86,7 +86,7 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
 
 
 def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
-    """Return the jackknife over the parts of the period, all repeats of a part together.
+    """Return the jackknife covariance (k, k) over the parts of the period, all repeats together.
 
     A direction that the rows do not determine, zero in `inverse` (k, k), gets no variance.
     """
@@ -110,9 +110,9 @@ def _without(A: Array, inverse: Array, part: Array, score: Array) -> Array:
     """Return the change of beta when a part is left out: (A - A_c)^-1 g_c."""
     size = np.sqrt(np.abs(np.diag(A)))
     scale = np.where(size > 0.0, size, 1.0)
-    # A parameter that no row shows has a score of zero, and does not change.
+    # A parameter in no row has a score of zero and does not change.
     reduced = (A - part) / np.outer(scale, scale) + np.diag(np.where(size > 0.0, 0.0, 1.0))
     if np.linalg.cond(reduced) > 1e10:
-        # That part alone determines some direction, or none does: its influence to first order.
+        # A direction that this part alone determines, or that none does: first-order influence.
         return np.asarray(inverse @ score)
     return np.asarray(np.linalg.solve(reduced, score / scale) / scale)

@@ -25,10 +25,10 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class RepeatBlock:
-    """One equation of one record: X (m, k), y (m,), time (m,) [s], where each row lies (m,).
+    """Rows of one equation of one record: X (m, k), y (m,), time (m,) [s].
 
-    `segment` is the part of the excitation's period, `level` the bin of the equation's own state
-    (`levels`).
+    `segment` (m,) is the part of the excitation's period that each row lies in, `level` (m,) the
+    bin of the equation's own state (`levelled`).
     """
 
     run: int
@@ -44,7 +44,7 @@ class RepeatBlock:
 
     @property
     def stratum(self) -> tuple[int, str]:
-        """The (run, step) whose repeats are alike."""
+        """The (run, step) that the repeat belongs to."""
         return self.run, self.step
 
 
@@ -60,7 +60,7 @@ class FamilyBlocks:
 
 @dataclass(frozen=True)
 class EquationFit:
-    """A solution beta (k,) with A^-1 (k, k), and the instruments and weights that made it."""
+    """A solution beta (k,) with A^-1 (k, k), the instruments and the weights used."""
 
     blocks: tuple[RepeatBlock, ...]
     Z: tuple[Array, ...]
@@ -74,10 +74,10 @@ class EquationFit:
 
 
 def segments(time: Array, period: float) -> Indices:
-    """Return which part of the excitation's period each row (m,) lies in.
+    """Return the part of the excitation's period that each row (m,) lies in.
 
-    Without a period [s] (0) the record itself is cut. Rows of the same part of later periods
-    belong together: what the model lacks comes back there.
+    Without a period [s] (0) the record itself is divided. Rows of the same part of later periods
+    belong together, because an error of the model repeats with the excitation.
     """
     span = period if period > 0 else float(time[-1] - time[0]) + 1e-9 if len(time) else 1.0
     count = int(np.clip(span / IDENTIFY.shortest_segment, 1, IDENTIFY.period_segments))
@@ -135,7 +135,7 @@ class Pieces:
     information: Array
 
     def grouped(self, key: Indices) -> tuple[Indices, Array, Array]:
-        """Sum pieces alike in stratum and `key`: (stratum (g,), scores, information)."""
+        """Sum pieces of equal stratum and `key`: (stratum (g,), scores, information)."""
         table = np.column_stack((self.stratum, key))
         unique, place = np.unique(table, axis=0, return_inverse=True)
         score = np.zeros((len(unique), self.score.shape[1]))
@@ -152,7 +152,7 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
     for b, z, weight, e in zip(fit.blocks, fit.Z, fit.w, fit.residuals(), strict=True):
         weighted = z * weight[:, None]
         labels = b.segment if by == "segment" else b.level
-        # Rows of one part side by side: a product over each stretch, no row looked at twice.
+        # Rows sorted by part: one product for each contiguous stretch.
         order = np.argsort(labels, kind="stable")
         parts, first = np.unique(labels[order], return_index=True)
         weighted, error, X = weighted[order], e[order], b.X[order]
@@ -172,7 +172,7 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
 
 
 def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
-    """Return the blocks cut to the rows that every repeat of their step and equation kept."""
+    """Return the blocks reduced to rows that every repeat of their step and equation has."""
     shared = shared_ticks(blocks)
     out = []
     for b in blocks:
@@ -182,7 +182,7 @@ def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
 
 
 def shared_ticks(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], Array]:
-    """Return, by (run, step, equation), the times [s] whose rows every repeat kept."""
+    """Return, by (run, step, equation), the times [s] of rows that every repeat has."""
     shared: dict[tuple[int, str, str], Array] = {}
     for b in blocks:
         key = (*b.stratum, b.equation)
@@ -195,7 +195,7 @@ def _ticks(b: RepeatBlock) -> Array:
 
 
 def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
-    """Return a block with the rows `here` (m,) alone."""
+    """Return a block with only the rows `here` (m,)."""
     return replace(
         b, X=b.X[here], y=b.y[here], time=b.time[here], segment=b.segment[here],
         level=b.level[here],
@@ -205,11 +205,11 @@ def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
 def levelled(
     blocks: Sequence[RepeatBlock], records: Mapping[tuple[int, str], Record]
 ) -> list[RepeatBlock]:
-    """Return the blocks with `level`: the bin of the state that the equation's law depends on.
+    """Return the blocks with `level`, the bin of the state that the equation's law depends on.
 
-    Flow rows are sorted by their chamber's pressure, torque rows by their piston's place, into
-    bins of equally many rows; time by time the mean over the repeats decides, so that noise does
-    not sort. A law that is wrong somewhere in the state leaves its misfit in few of the bins.
+    Flow rows are sorted by their chamber's pressure, torque rows by their piston's position, into
+    bins of equally many rows. The mean over the repeats is sorted, so that noise does not affect
+    the order. A law that is wrong at some states has its residual in few of the bins.
     """
     alike: dict[tuple[int, str, str], list[int]] = {}
     for k, b in enumerate(blocks):
@@ -241,10 +241,10 @@ def _state(b: RepeatBlock, record: Record) -> Array:
 
 
 def residual_scatter(blocks: Sequence[RepeatBlock], residuals: Sequence[Array]) -> list[Array]:
-    """Return each block's residuals less the mean over its repeats, scaled to the noise's size.
+    """Return each block's residuals minus the mean over its repeats, scaled to the noise.
 
-    The blocks must share their rows (`common`). With n repeats the deviations are sqrt((n-1)/n)
-    of the noise, which is undone.
+    The blocks must share their rows (`common`). With n repeats the deviations are sqrt((n-1)/n) of
+    the noise; this is corrected.
     """
     return [
         (e - total / n) * np.sqrt(n / max(n - 1, 1))
@@ -253,9 +253,9 @@ def residual_scatter(blocks: Sequence[RepeatBlock], residuals: Sequence[Array]) 
 
 
 def over_repeats(blocks: Sequence[RepeatBlock], arrays: Sequence[Array]) -> list[tuple[Array, int]]:
-    """Return, for each block, the sum of its repeats' arrays and how many repeats there are.
+    """Return, for each block, the sum of its repeats' arrays and the number of repeats.
 
-    `arrays` holds one array a block, alike in shape among the repeats of a step's equation.
+    `arrays` holds one array for each block, of equal shape among the repeats of a step's equation.
     """
     total: dict[tuple[int, str, str], Array] = {}
     count: dict[tuple[int, str, str], int] = {}

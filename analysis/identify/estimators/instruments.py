@@ -1,11 +1,11 @@
 """Instrumental variables across synchronised repeats, and the check on noise in the regressors.
 
-Repeats of a step had the same excitation started at the same sample, so the rows of the other
-repeats say what a repeat's regressor is without its noise: Z_r = mean of X over the others. Noise
-of r is independent of Z_r, and attenuation, the bias of least squares, is gone.
-Hausman's idea: both estimates agree unless noise in the regressors biases least squares; whether
-their difference is more than its own scatter is tested. Source: Hausman (1978), Econometrica 46;
-Soederstroem and Stoica, Instrumental Variable Methods for System Identification (1983).
+Repeats of a step had the same excitation started at the same sample, so the mean of the other
+repeats' rows is a repeat's regressor without its own noise: Z_r = mean of X over the others. Noise
+of r is independent of Z_r, which removes attenuation, the bias of least squares. Hausman's idea:
+both estimates agree unless noise in the regressors biases least squares; the test compares their
+difference with its own scatter. Source: Hausman (1978), Econometrica 46; Soederstroem and Stoica,
+Instrumental Variable Methods for System Identification (1983).
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class Hausman:
 
     @property
     def certain(self) -> NDArray[np.bool_]:
-        """Where (k,) the difference is more than chance."""
+        """Return where (k,) the difference is significant."""
         return np.asarray(self.p < IDENTIFY.instrument_level / len(self.p))
 
 
 def steps_without_instruments(blocks: Sequence[RepeatBlock]) -> set[str]:
     """Return the steps with an equation of which no two repeats share a row.
 
-    A repeat that was cut short may keep none behind the filters' edges.
+    A repeat that was cut short may have no rows outside the filters' edges.
     """
     repeats = Counter((*b.stratum, b.equation) for b in blocks)
     shared = shared_ticks(blocks)
@@ -68,10 +68,10 @@ def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
 
 
 def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
-    """Compare least squares with instruments on the same rows.
+    """Compare least squares with instrumental variables on the same rows.
 
-    The difference scatters by noise, which parts of the period show separately: its covariance is
-    that between repeats within each part (of which there are many more than repeats).
+    The difference scatters by noise: its covariance is that between repeats within each part of the
+    period, of which there are many more than repeats.
     """
     iv = instrumental_variables(blocks)
     ls = least_squares(iv.blocks)

@@ -1,11 +1,11 @@
 """Small effects that the model leaves out, fitted as additional columns of the fluid rows.
 
-They shift parameters by more than their scatter, so that without them no interval could be right;
-each is one column of the fluid rows, estimated with the rest, and none is a parameter.
+They shift parameters by more than their scatter, so that intervals without them would be wrong.
+Each is one column of the fluid rows, estimated with the parameters but not reported as one.
 
-Oil temperature. Between two records the oil warms or cools, and its bulk modulus with it; one b
-for all records lies where the temperatures happened to be, and the gains of the steps shift with
-it. Here b is that of the rig's nominal temperature T0:
+Oil temperature. The oil's temperature, and with it the bulk modulus, changes between records; one b
+for all records would be that of their mean temperature, and the gains of the steps would shift.
+Here b is that of the rig's nominal temperature T0:
  1/b becomes 1/b(T0) + kappa (T - T0), kappa = - alpha / b, alpha = d ln b / dT.
 Known beforehand: alpha lies between that of pure mineral oil, 10^(0.0023 (20 - T)) or -0.0053 per
 kelvin (Hodges, Hydraulic Fluids, 1996, ch. 7), and that of hoses and lines alone, about 0.
@@ -13,13 +13,14 @@ kelvin (Hodges, Hydraulic Fluids, 1996, ch. 7), and that of hoses and lines alon
 Laminar transition. An orifice's flow is C u dp / (dp^2 + dp_t^2)^(1/4) (as in Borutzky, Barnard
 and Thoma, 2002, and the orifices of common simulation libraries), to first order
  C u sqrt(dp) (1 - dp_t^2 / (4 dp^2)),
-and so a little less than the root everywhere: at drops of a few MPa this looks like a smaller C.
-C is then that of fully turbulent flow. Known beforehand: dp_t is of the order of 0.1 MPa or below.
+a little less than sqrt(dp) everywhere: at drops of a few MPa this looks like a smaller C. C is then
+that of fully turbulent flow. Known beforehand: dp_t is of the order of 0.1 MPa or below.
 
 Path between samples. A command that is held between samples makes the spool's path bend at every
 renewal: the path interpolated between samples leads or lags the true one by a part of the interval
-T, to first order C (u + f T du/dt) sqrt(dp), one f for each valve. A flow that follows du/dt looks
-like compression, and b takes it. Known beforehand: |f| is of the order of 0.05 or below.
+T, to first order C (u + f T du/dt) sqrt(dp), one f for each valve. A flow proportional to du/dt
+resembles compression, so that it would shift b. Known beforehand: |f| is of the order of 0.05 or
+below.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class SpoolPath(Term):
     joint: int = 0
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return f, in intervals of the samples."""
+        """Return f, in sample intervals."""
         return (Coefficient(f"{BETWEEN}{self.joint + 1}", "", "fluid"),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -136,7 +137,7 @@ def _lost(drop: Array) -> Array:
 
 @dataclass(frozen=True)
 class Belief:
-    """One observation beforehand, 0 = h'beta with standard deviation `std`, of column `name`."""
+    """A prior observation 0 = h'beta with standard deviation `std`, of column `name`."""
 
     name: str
     h: Array
@@ -148,8 +149,8 @@ def nuisance_terms(
 ) -> tuple[Used, ...]:
     """Return the nuisances that belong to the terms; `values` are first estimates by name.
 
-    The transition goes with the orifices alone: beside further terms of the flow it would take
-    from them what is theirs.
+    The transition belongs to a model with orifices alone: further flow terms would be correlated
+    with it.
     """
     names = {used.term.name for used in terms}
     nuisances: list[Used] = []
@@ -165,7 +166,7 @@ def nuisance_terms(
 
 
 def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
-    """Return what is known beforehand of the nuisances among the columns `names` (k,)."""
+    """Return the prior knowledge of the nuisances among the columns `names` (k,)."""
     out = []
     if KAPPA in names and "b" in names:
         h = np.zeros(len(names))
@@ -185,7 +186,7 @@ def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
 
 
 def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
-    """Return whether the data contradict what is known: something else is in that column."""
+    """Return whether the data contradict prior knowledge: another effect is in that column."""
     variance = belief.std**2 + float(belief.h @ covariance @ belief.h)
     return bool(abs(belief.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
 
@@ -193,13 +194,12 @@ def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
 def joined(
     beta: Array, spread: CovarianceParts, belief: Belief, inverse: Array
 ) -> tuple[Array, CovarianceParts, Array]:
-    """Join one observation into beta (k,), its spread and its A^-1 (k, k), which is `inverse`.
+    """Join a prior observation into beta (k,), its spread and `inverse`, A^-1 (k, k).
 
-    The gain g of Kalman's update is taken from A^-1, sized to the spread V:
-     g = P h / (h'P h + s^2),  P = A^-1 (h'V h) / (h'A^-1 h).
-    V itself rests on a few repeats: a gain from it would follow their noise and promise (1 - r^2)
-    of a variance with an r^2 that is too large. What an estimate with any gain scatters is
-     (I - g h') V (I - g h')' + g s^2 g'  (Joseph's form).
+    The gain g of Kalman's update is taken from A^-1 scaled to the spread V: g = P h / (h'P h +
+    s^2), P = A^-1 (h'V h) / (h'A^-1 h). V itself is based on few repeats: a gain from it would
+    follow their noise and promise too small a variance. An estimate with any gain has the
+    covariance (I - g h') V (I - g h')' + g s^2 g' (Joseph's form).
     """
     V, h = spread.covariance, belief.h
     if h @ inverse @ h <= 0.0:  # a column of zeros: the records hold nothing to join
@@ -212,7 +212,7 @@ def joined(
     after = scatter + belief.std**2 * np.outer(gain, gain)
     remaining = np.diag(scatter)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # What is known beforehand needs no repeats: its part of the variance counts as known.
+        # Prior knowledge needs no repeats: its part of the variance counts as known.
         grown = np.where(remaining > 0, np.minimum(np.diag(after) / remaining, 1e3), 1.0)
         systematic = np.minimum(spread.systematic, 1.0) / grown
     new = CovarianceParts(after, spread.dof * grown**2, systematic)

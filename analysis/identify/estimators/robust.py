@@ -1,9 +1,9 @@
 """Robust loss: rows far outside the scatter of the rest lose their weight.
 
 Iteratively reweighted least squares with Huber's loss to a start, then Tukey's biweight, scale by
-the median absolute residual of each step's equation. A spike in a channel also makes wild columns
-(a second derivative above all), and least squares bends to such rows; where a step has three
-repeats or more, rows that lie far from the median of the repeats are weighed down beforehand
+the median absolute residual of each step's equation. A spike in a channel also makes large entries
+in the columns (above all in a second derivative), and such rows pull least squares. Where a step
+has three repeats or more, rows far from the repeats' median get a smaller weight beforehand
 (Mallows). Source: Maronna, Martin, Yohai and Salibian-Barrera, Robust Statistics, 2nd ed. (2019),
 sections 4.4 and 5.
 """
@@ -85,7 +85,8 @@ def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
         for n, (i, at) in enumerate(zip(members, places, strict=True)):
             stack[n, at] = np.column_stack((blocks[i].X, blocks[i].y))
         off = np.abs(stack - np.nanmedian(stack, axis=0))
-        # Repeats differ a little throughout (drift, trim): a record is measured by its own usual.
+        # Repeats differ slightly throughout (drift, trim): scale by the record's own median
+        # distance.
         usual = IDENTIFY.mad_to_std * np.nanmedian(off, axis=1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.nanmax(np.where(usual > 0, off / usual, 0.0), axis=2)

@@ -1,10 +1,9 @@
-"""What noise in the regressors does to least squares: how certain it is, and whether it matters.
+"""Bias of least squares by noise in the regressors: its significance and its size.
 
-With enough data any shift becomes certain, one of a hundred-thousandth as well; what a person needs
-to know is whether it is large. Both are asked of every parameter, and only a shift that is certain
-and large makes another estimator the better one. A certain shift that is too small to matter stays
-in the value, and its size goes into the interval (GUM F.2.4.5: a known systematic effect that is
-not corrected is part of the uncertainty).
+With enough data any shift becomes significant, even one of 1e-5, so that its size is judged as
+well. Only a shift that is both significant and large makes another estimator preferable. A
+significant shift that is too small to matter stays in the value and is added to the interval (GUM
+F.2.4.5: a known systematic effect that is not corrected is part of the uncertainty).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shift:
-    """How far noise in the regressors moves one parameter from what instruments say of it.
+    """The difference of one parameter between least squares and instrumental variables.
 
     `relative` is signed, of the parameter itself; `t` its size in its own standard errors;
     `of_half_width` its size over the half width of the 95 % interval without it.
@@ -40,12 +39,12 @@ class Shift:
 
     @property
     def limit(self) -> float:
-        """The relative shift that always matters."""
+        """The relative shift beyond which it always matters."""
         return IDENTIFY.shift_limit_of_b if self.name == "b" else IDENTIFY.shift_limit
 
     @property
     def material(self) -> bool:
-        """Whether it is large enough to matter, were it certain."""
+        """Return whether it is large enough to matter if it is significant."""
         size = abs(self.relative)
         return size > self.limit or (
             self.of_half_width > IDENTIFY.shift_of_interval
@@ -65,7 +64,7 @@ def shifts_of(
         half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)
         for i, name in enumerate(p.names[: p.parameters]):
             size = abs(float(test.difference[i]))
-            # The rows hold 1/b: what makes 1/b larger makes b smaller.
+            # The rows contain 1/b: a larger 1/b is a smaller b.
             sign = -1.0 if name == "b" else 1.0
             shifts.append(
                 Shift(
@@ -79,13 +78,13 @@ def shifts_of(
     return shifts
 
 
-def certain_shift(test: Hausman, p: FamilyBlocks) -> Array:
-    """Return least squares minus instruments (k,) of the family's parameters, 0 where chance."""
+def significant_shift(test: Hausman, p: FamilyBlocks) -> Array:
+    """Return least squares minus instruments (k,) of the parameters, 0 where insignificant."""
     return np.where(test.certain, test.difference, 0.0)[: p.parameters]
 
 
 def including(error: CovarianceParts, shift: Array) -> CovarianceParts:
-    """Return the spread (k,) of least squares with every certain shift as a systematic part."""
+    """Return the spread (k,) of least squares with every significant shift as a systematic part."""
     before = np.diag(error.covariance)
     after = before + shift**2
     with np.errstate(divide="ignore", invalid="ignore"):

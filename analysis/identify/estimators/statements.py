@@ -1,4 +1,4 @@
-"""What an estimator has to say of itself: sentences with figures, as checks."""
+"""Checks with figures that describe an estimator's result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOISE_CHECK = "noise in regressors"
 def nuisance_statement(
     belief: nu.Belief, names: Sequence[str], beta: Array, error: CovarianceParts, wrong: bool
 ) -> Check:
-    """State what the records say of a nuisance, and whether that can be."""
+    """State the estimate of a nuisance, and whether it is physically possible."""
     i = list(names).index(belief.name)
     value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
     if belief.name == nu.KAPPA:
@@ -61,9 +61,9 @@ def nuisance_statement(
 
 
 def noise_statement(shifts: Sequence[Shift]) -> Check:
-    """State whether noise in the regressors biases least squares (Hausman's test), and if so much.
+    """State whether noise in the regressors biases least squares, and how much (Hausman's test).
 
-    Not ok is a shift that is certain and matters; of any other the figures are said.
+    The check is not ok if a shift is significant and matters; the figures are stated for any other.
     """
     if not shifts:
         return Check(NOISE_CHECK, False, "nothing identified to judge")
@@ -112,7 +112,7 @@ def _bounds(s: Shift) -> str:
 
 
 def outlier_statement(family: str, fit: EquationFit) -> Check:
-    """State the share of rows that the robust loss set aside, in the worst record."""
+    """State the share of rows that the robust loss left out, in the worst record."""
     shares = outlying(fit)
     record, share = max(shares.items(), key=lambda item: item[1])
     return Check(

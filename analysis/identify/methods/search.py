@@ -1,15 +1,17 @@
-"""What a search method asks of the model: the output error of a candidate, or that it has none.
+"""The output error of a candidate set of parameters, for the search methods.
 
 A candidate is a set of STEP1's parameters (the last joint's: inertia, friction, gravity, four
 gains, and b: 8). Its model runs free over windows of a record, from the measured state and driven
-by the measured spool; the other joints stand still, as the paper's STEP1 has it, so that their
-parameters play no part. Error of a candidate, over piston, cap and rod pressure and all windows:
- J = mean [ |y - yhat|^2 / |y - mean y|^2 ]          (FIT = 100 (1 - sqrt J) for one channel)
+by the measured spool. The other joints stand still, as in the paper's STEP1, so that their
+parameters have no influence. Error of a candidate, over piston, cap and rod pressure and all
+windows:
 
-Not every candidate has a state: where a chamber's pressure leaves [0, p_s] an orifice's root is
-complex, and where the state diverges there is nothing left to compare (the paper's section II.B).
-Such a candidate is counted by its fate, and its error is `dead_error` or more, worse than any with
-a state, and larger the more windows it lost, so that a search among such candidates has a slope.
+J = mean [ |y - yhat|^2 / |y - mean y|^2 ] (FIT = 100 (1 - sqrt J) for one channel)
+
+Some candidates cannot be simulated: where a chamber's pressure leaves [0, p_s] an orifice's root is
+complex, and a state may diverge (the paper's section II.B). They are counted by cause, and their
+error is `failed_error` or more, worse than any that can be simulated, and grows with the number of
+failed windows, so that the search still has a slope there.
 """
 
 from __future__ import annotations
@@ -48,10 +50,10 @@ COMPLEX, DIVERGED = "pressure outside 0..supply", "state diverged"
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How long a search may go on, where, and on how much data.
+    """Length, range and data of a search.
 
     `evaluations` candidates in generations of `population`; each parameter between its nominal
-    value divided and multiplied by `factor`, searched in the logarithm; `windows` stretches of
+    value divided and multiplied by `factor`, searched in the logarithm; `windows` windows of
     `seconds` of one record.
     """
 
@@ -65,7 +67,7 @@ class SearchOptions:
         if self.evaluations < 4 or self.population < 4:
             raise InputError(
                 f"a search of {self.evaluations} evaluations in generations of {self.population} "
-                "is none: expected at least 4 of each"
+                "is too short: expected at least 4 of each"
             )
         if not self.factor > 1.0 or self.windows < 1 or not self.seconds > 0.0:
             raise InputError("a search needs a factor above 1 and at least one window of data")
@@ -73,7 +75,7 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class SearchWindow:
-    """A stretch of the record: where it starts, the state there, what was measured by channel.
+    """A window of the record: first sample, state there, measured samples by channel.
 
     `valid` (samples,) is false where a sample was lost and nothing is compared.
     """
@@ -101,10 +103,10 @@ class SearchTask:
 
 @dataclass(frozen=True)
 class Score:
-    """A candidate's error, and why its state ceased to exist ('' if it did not)."""
+    """A candidate's error, and why its simulation failed ('' if it did not)."""
 
     error: float
-    fate: str
+    failure: str
 
 
 def searched_names(rig: Rig) -> tuple[str, ...]:
@@ -131,7 +133,7 @@ def single_joint_record(runs: Sequence[Run]) -> Record:
 def make_task(
     rig: Rig, record: Record, terms: Sequence[Used], filtering: Filtering, options: SearchOptions
 ) -> SearchTask:
-    """Lay out the search on one record; raises InputError for a rig without nominal values.
+    """Prepare the search on one record; raises InputError for a rig without nominal values.
 
     Also for a record with a gap of lost samples that a model cannot be simulated through.
     """
@@ -167,12 +169,12 @@ def make_task(
 
 
 def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
-    """Return a model whose searched parameters are nominal and whose others play no part."""
+    """Return a model with nominal searched parameters; the others have no influence."""
     missing = [name for name in names if not rig.nominal.get(name, 0.0) > 0.0]
     if missing:
         raise InputError(
             f"rig {rig.name!r} has no positive nominal {' '.join(missing)}: a search has to know "
-            "where to look; add them under 'nominal' in the rig file"
+            "where to start; add them under 'nominal' in the rig file"
         )
     known = [c.parameter for used in terms for c in used.term.coefficients(rig)]
     if set(names) - set(known):
@@ -198,25 +200,25 @@ def with_values(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def score(task: SearchTask, values: Mapping[str, float]) -> Score:
-    """Simulate a candidate over all windows and return its error and its status."""
+    """Simulate a candidate over all windows and return its error and cause of failure."""
     ready = compiled(with_values(task.model, values), Effort.FIT)
-    total, lost, samples, fate = 0.0, 0, 0, ""
+    total, lost, samples, failure = 0.0, 0, 0, ""
     for window in task.windows:
         samples += window.samples
-        if fate == DIVERGED:
+        if failure == DIVERGED:
             lost += window.samples
             continue
         simulated = simulate(ready, task.drive, window.start, window.first, window.samples)
         lost += simulated.outside + window.samples - simulated.filled
         if simulated.failure:
-            fate = DIVERGED
+            failure = DIVERGED
         elif simulated.outside:
-            fate = fate or COMPLEX
-        elif not fate:
+            failure = failure or COMPLEX
+        elif not failure:
             channels = simulated.channels()
             for name, y in window.measured.items():
                 off = (y - channels[name])[window.valid]
                 total += float(np.sum(off**2)) / window.spread[name]
-    if fate:
-        return Score(IDENTIFY.dead_error * (1.0 + lost / samples), fate)
+    if failure:
+        return Score(IDENTIFY.failed_error * (1.0 + lost / samples), failure)
     return Score(total / (len(task.windows) * len(task.windows[0].measured)), "")

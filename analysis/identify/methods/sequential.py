@@ -3,12 +3,11 @@
  E1  a parameter is identified at one step only and known in every step after it
  E2  every step identifies what it can by itself, and the steps' values are averaged
 
-A step alone may show only a combination (STEP2: M1 + 2 R12 cos q2). In E1 its rows then wait for
-the next step's; in E2 such parameters are solved from all rows with the averages known.
-
-Both give one list of numbers, and neither is unique: a parameter that several steps show (b in
-all of them) has as many values as steps. All of them are reported, with their disagreement in
-units of their own 95 % intervals: max |v_i - v_j| / sqrt(h_i^2 + h_j^2).
+A single step may determine only a combination (STEP2: M1 + 2 R12 cos q2). In E1 its rows are then
+solved with the next step's; in E2 such parameters are solved from all rows with the averages known.
+Neither result is unique: a parameter that several steps determine (b in all of them) has as many
+values as steps. All are reported, with their disagreement in units of their own 95 % intervals: max
+|v_i - v_j| / sqrt(h_i^2 + h_j^2).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The simultaneous method: every joint excited at once, and nothing else (the paper's section V.C).
 
-The rows and the solve are the coupled method's; only the choice of records differs. All the
-parameters share one excitation, so columns that lock-and-excite keeps apart lie close together:
-the condition number states by how much, the physical checks whether noise has used the room.
+The rows and the solve are the coupled method's; only the choice of records differs. All parameters
+share one excitation, so columns that lock-and-excite separates are nearly collinear: the condition
+number states how nearly, the physical checks whether noise made values impossible.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def simultaneous(
             f"once; in the steps {steps} a joint is locked (`bramah run validate` records some)"
         )
     chosen = [run for run in kept if run.records]
-    # Least squares as in the paper, whatever noise makes of it: that is what is compared.
+    # Least squares as in the paper, despite its bias by noise: that is what is compared.
     result = coupled(chosen, tuple(terms), filtering, reject_noise, estimator="ls")
     statements = (
         Check(
@@ -58,7 +58,7 @@ def simultaneous(
 def gravity_order(rig: Rig, estimates: dict[str, Estimate]) -> list[Check]:
     """State whether each W_i can belong to masses that lie within their links.
 
-    W_i = m_i lg_i + l_i (masses beyond) and 0 <= lg <= l give W_i/l_i >= W_(i+1)/l_(i+1) >= 0.
+    W_i = m_i lg_i + l_i (masses beyond) and 0 <= lg <= l imply W_i/l_i >= W_(i+1)/l_(i+1) >= 0.
     """
     names = [f"W{i}" for i in range(1, len(rig.joints) + 1)]
     if any(name not in estimates for name in names):

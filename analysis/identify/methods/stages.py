@@ -33,8 +33,8 @@ class StageValue:
         return float(half_width(np.array(self.std), np.array(self.dof)))
 
     @property
-    def sharp(self) -> bool:
-        """Whether the interval is narrow enough for the value to count."""
+    def precise(self) -> bool:
+        """Whether the interval is narrow enough for the value to be used."""
         return bool(
             np.isfinite(self.value) and self.half < IDENTIFY.stage_precision * abs(self.value)
         )
@@ -59,7 +59,7 @@ class StageOutcome:
     averaged: Mapping[str, StageValue]
     condition: Mapping[str, float]
     rows: int
-    everything: Array
+    all_rows: Array
     lost: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -73,7 +73,7 @@ def solve_stages(
         alone = solve(names, stage.clusters, stage.noise, reject_noise)
         condition[stage.step] = alone.condition_number
         for name, value in _values(stage.step, alone).items():
-            if value.sharp:
+            if value.precise:
                 own[name].append(value)
     first, lost = _use_first(names, stages, reject_noise)
     averaged = _average(names, stages, own, reject_noise)
@@ -96,7 +96,7 @@ def _values(step: str, solution: Solution) -> dict[str, StageValue]:
 def _use_first(
     names: tuple[str, ...], stages: Sequence[StepRows], reject_noise: bool
 ) -> tuple[dict[str, StageValue], dict[str, str]]:
-    """E1: let each step fix what it can, given what the steps before it fixed."""
+    """E1: solve each step with the parameters of the steps before it known."""
     known: dict[str, StageValue] = {}
     lost: dict[str, str] = {}
     waiting: list[StepRows] = []
@@ -105,18 +105,18 @@ def _use_first(
         unknown = tuple(name for name in names if name not in known)
         if not unknown:
             break
-        solution = _solve_rest(names, waiting, known, reject_noise)
+        solution = _solve_unknown(names, waiting, known, reject_noise)
         last = place == len(stages) - 1
         for name, value in _values(stage.step, solution).items():
-            if value.sharp or last:
+            if value.precise or last:
                 known[name] = value
         lost = solution.unidentifiable
-        waiting = [s for s in waiting if _shows(names, s, known)]
+        waiting = [s for s in waiting if _has_unknown(names, s, known)]
     return known, {name: why for name, why in lost.items() if name not in known}
 
 
-def _shows(names: tuple[str, ...], stage: StepRows, known: Mapping[str, StageValue]) -> bool:
-    """Return whether a stage's rows contain anything that is still unknown."""
+def _has_unknown(names: tuple[str, ...], stage: StepRows, known: Mapping[str, StageValue]) -> bool:
+    """Return whether a stage's rows contain any parameter that is still unknown."""
     columns = [i for i, name in enumerate(names) if name not in known]
     return any(np.any(c.triangle[:, columns] != 0.0) for c in stage.clusters)
 
@@ -127,7 +127,7 @@ def _average(
     own: Mapping[str, Sequence[StageValue]],
     reject_noise: bool,
 ) -> dict[str, StageValue]:
-    """E2: average the steps' own values; what no step has alone comes from all rows then."""
+    """E2: average the steps' own values; solve the others from all rows."""
     known = {}
     for name, values in own.items():
         if values:
@@ -138,17 +138,17 @@ def _average(
             known[name] = StageValue(steps, mean, std, float(sum(v.dof for v in values)))
     if len(known) == len(names):
         return known
-    rest = _values("all", _solve_rest(names, stages, known, reject_noise))
+    rest = _values("all", _solve_unknown(names, stages, known, reject_noise))
     return {name: known.get(name) or rest[name] for name in names if name in known or name in rest}
 
 
-def _solve_rest(
+def _solve_unknown(
     names: tuple[str, ...],
     stages: Sequence[StepRows],
     known: Mapping[str, StageValue],
     reject_noise: bool,
 ) -> Solution:
-    """Solve the stages' rows for what is not known; known values count as exact."""
+    """Solve the stages' rows for the unknown parameters; known values count as exact."""
     k = len(names)
     free = [i for i, name in enumerate(names) if name not in known]
     T = np.zeros((k + 1, len(free) + 1))
@@ -164,14 +164,14 @@ def _solve_rest(
 
 
 def as_solution(outcome: StageOutcome, values: Mapping[str, StageValue]) -> Solution:
-    """Return a list of values as a solution, with the residual it leaves in all rows together."""
+    """Return a list of values as a solution, with its residual over all rows."""
     k = len(outcome.names)
     value, std, dof = (np.full(k, np.nan) for _ in range(3))
     for i, name in enumerate(outcome.names):
         if name in values:
             estimate = values[name]
             value[i], std[i], dof[i] = estimate.value, estimate.std, estimate.dof
-    R = outcome.everything
+    R = outcome.all_rows
     there = np.nan_to_num(value)
     squares = float(np.sum((R[:k, k] - R[:k, :k] @ there) ** 2)) + float(R[k, k] ** 2)
     lost = {

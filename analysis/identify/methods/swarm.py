@@ -1,11 +1,9 @@
 """PSO and GA on STEP1's parameters: the search methods that the paper compares with.
 
 The algorithms are pymoo's (Blank and Deb, pymoo: Multi-objective optimization in Python, 2020):
-of the libraries looked at it is the one that has both, is maintained, takes a seed instead of
-numpy's global generator, and offers ask-and-tell, so that every candidate is simulated and counted
-here and nothing of the library reaches the physics. PSO is its adaptive form, GA its real-coded
-form (simulated binary crossover, polynomial mutation). Both search the decades of
-value / nominal.
+it has both, takes a seed instead of numpy's global generator, and offers ask-and-tell, so that
+every candidate is simulated and counted here. PSO is its adaptive form, GA its real-coded form
+(simulated binary crossover, polynomial mutation). Both search the decades of value / nominal.
 """
 
 from __future__ import annotations
@@ -55,11 +53,11 @@ _PYMOO = {
 
 
 @dataclass(frozen=True)
-class Trail:
-    """A finished search: the best values, and what became of every candidate.
+class SearchHistory:
+    """A finished search: the best values, and the number of candidates that failed, by cause.
 
     `errors` (generations,) is the best error so far after each generation, `first` the best of the
-    first one; `lost` counts candidates by fate, `lost_first` those of the first generation.
+    first one; `lost` counts candidates by cause, `lost_first` those of the first generation.
     """
 
     values: Mapping[str, float]
@@ -89,20 +87,20 @@ def search(
     """
     rig = ck.common_rig(runs)
     record = single_joint_record(runs)
-    ck.refuse_dead_channels(rig, record)
+    ck.refuse_constant_channels(rig, record)
     task = make_task(rig, record, terms, filtering(record), options)
     trail = run_search(method, task, options, rng)
-    if trail.error >= IDENTIFY.dead_error:
+    if trail.error >= IDENTIFY.failed_error:
         raise InputError(
             f"{method}: every one of {trail.evaluations} candidates lost its state "
-            f"({_fates(trail)}); try more --evaluations"
+            f"({_failures(trail)}); try more --evaluations"
         )
     return _identification(method, runs, task, trail, options)
 
 
 def run_search(
     method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
-) -> Trail:
+) -> SearchHistory:
     """Let the algorithm propose generations until the evaluations are spent."""
     started = time.perf_counter()
     algorithm, evaluator, wrap = _pymoo(method, task, options, rng)
@@ -121,10 +119,10 @@ def run_search(
         scores = [score(task, _values(task, x)) for x in points]
         scored = np.array([s.error for s in scores])
         sizes.append(len(scores))
-        gone.append(sum(bool(s.fate) for s in scores))
+        gone.append(sum(bool(s.failure) for s in scores))
         for s in scores:
-            if s.fate:
-                lost[s.fate] += 1
+            if s.failure:
+                lost[s.failure] += 1
         if scored.min() < best_error:
             best, best_error = points[int(scored.argmin())], float(scored.min())
         errors.append(best_error)
@@ -132,7 +130,7 @@ def run_search(
         algorithm.tell(infills=population)
     seconds = time.perf_counter() - started
     log.info("%s: %d candidates in %.1f s, %s lost", method, sum(sizes), seconds, lost)
-    return Trail(
+    return SearchHistory(
         _values(task, best), best_error, errors[0], sum(sizes), tuple(errors), tuple(sizes),
         lost, gone[0], tuple(gone), seconds,
     )  # fmt: skip
@@ -142,7 +140,7 @@ def _pymoo(
     method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
 ) -> tuple[Any, Any, Callable[[Array], Any]]:
     """Return pymoo's algorithm, its evaluator, and the wrapper of errors (n,) that it takes."""
-    # An extra: who never searches need not install it.
+    # An optional dependency, needed for searches only.
     try:
         core = {name: import_module(f"pymoo.{place}") for name, place in _PYMOO.items()}
     except ImportError as error:
@@ -170,7 +168,7 @@ def _values(task: SearchTask, point: Array) -> dict[str, float]:
 
 
 def _identification(
-    method: str, runs: Sequence[Run], task: SearchTask, trail: Trail, options: SearchOptions
+    method: str, runs: Sequence[Run], task: SearchTask, trail: SearchHistory, options: SearchOptions
 ) -> Identification:
     rig, used = task.model.rig, task.model.terms
     solutions = {family: _as_solution(method, task, trail, family) for family in FAMILIES}
@@ -191,7 +189,7 @@ def _identification(
     )
 
 
-def _as_solution(method: str, task: SearchTask, trail: Trail, family: str) -> Solution:
+def _as_solution(method: str, task: SearchTask, trail: SearchHistory, family: str) -> Solution:
     """Return a family's values as a solution of no rows: no interval, no condition number."""
     best_values = inverted(task.model.rig, task.model.terms, trail.values)
     names = parameters_of(task.model.rig, task.model.terms, family)
@@ -201,12 +199,12 @@ def _as_solution(method: str, task: SearchTask, trail: Trail, family: str) -> So
     return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
 
 
-def _fates(trail: Trail) -> str:
-    return ", ".join(f"{count} {fate}" for fate, count in trail.lost.items())
+def _failures(trail: SearchHistory) -> str:
+    return ", ".join(f"{count} {failure}" for failure, count in trail.lost.items())
 
 
 def _statements(
-    method: str, runs: Sequence[Run], task: SearchTask, trail: Trail
+    method: str, runs: Sequence[Run], task: SearchTask, trail: SearchHistory
 ) -> tuple[Check, ...]:
     gone = sum(trail.lost.values())
     share = 100.0 * gone / trail.evaluations
@@ -224,7 +222,7 @@ def _statements(
             "state exists",
             gone == 0,
             f"{gone} of {trail.evaluations} candidates ({share:.1f} %) lost their state: "
-            f"{_fates(trail)}; of the first {trail.sizes[0]}, {trail.lost_first}",
+            f"{_failures(trail)}; of the first {trail.sizes[0]}, {trail.lost_first}",
         ),
         Check(
             "all parameters",
@@ -243,12 +241,12 @@ def _statements(
             "output error",
             True,
             f"best relative output error {trail.error:.4g} (the first generation's best: "
-            f"{trail.first:.4g}); nothing says that another search would end at the same values",
+            f"{trail.first:.4g}); another search may end at other values",
         ),
     )
 
 
-def trail_json(task: SearchTask, trail: Trail, options: SearchOptions) -> dict[str, Any]:
+def trail_json(task: SearchTask, trail: SearchHistory, options: SearchOptions) -> dict[str, Any]:
     """Return the search as plain data."""
     return {
         "record": task.record,
@@ -259,9 +257,9 @@ def trail_json(task: SearchTask, trail: Trail, options: SearchOptions) -> dict[s
         "lost_first_generation": trail.lost_first,
         "lost_by_generation": list(trail.lost_by_generation),
         "generation_sizes": list(trail.sizes),
-        "error_first_generation": trail.first if trail.first < IDENTIFY.dead_error else None,
+        "error_first_generation": trail.first if trail.first < IDENTIFY.failed_error else None,
         "error": trail.error,
-        "error_by_generation": [e if e < IDENTIFY.dead_error else None for e in trail.errors],
+        "error_by_generation": [e if e < IDENTIFY.failed_error else None for e in trail.errors],
         "bounds": {
             name: [float(a), float(b)]
             for name, a, b in zip(task.names, task.low, task.high, strict=True)

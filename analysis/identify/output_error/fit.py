@@ -2,12 +2,11 @@
 
 Multiple shooting: each record is cut into windows, the state at each window's start is unknown
 too, and sum |measured - simulated|^2 / sigma^2 over piston and chamber pressures of the excited
-joints is least. Noise in the outputs then biases nothing, for no measured output is in a
-regressor. Windows are not tied to each other: a tie would add little to the parameters,
-and it would turn what the model gets slowly wrong into bias.
-Gauss and Newton with halved steps, the windows' states eliminated (Schur's complement) each time.
-Intervals: as for the other estimators, with the windows as parts. Source: Bock (1981) and
-Schloeder; Ljung, System Identification (1999), section 3.6.
+joints is minimised. Noise in the outputs causes no bias, because no measured output is in a
+regressor. Continuity between windows is not required: it would add little information and turn slow
+model errors into bias. Gauss-Newton with step halving, the windows' states eliminated (Schur's
+complement) each time. Intervals: as for the other estimators, with the windows as parts. Source:
+Bock (1981) and Schloeder; Ljung, System Identification (1999), section 3.6.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OutputErrorFit:
-    """Rows' coefficients (k,) by name with their spread, and how the search ended."""
+    """Rows' coefficients (k,) by name with their spread, and the check on convergence."""
 
     names: tuple[str, ...]
     value: Array
@@ -78,7 +77,7 @@ def refuse_undetermined(missing: Sequence[str]) -> None:
 
 
 class Search:
-    """The steps of one fit; `low` and `high` (k,) bound the parameters where they are given."""
+    """Gauss-Newton iterations of one fit; `low` and `high` (k,) bound the parameters if given."""
 
     def __init__(
         self, windows: Windows, low: Array | None = None, high: Array | None = None
@@ -139,7 +138,7 @@ class Search:
             )
         A = np.sum([r.information for r in good], axis=0)
         g = np.sum([r.score for r in good], axis=0)
-        # What is known beforehand is one more observation each, in the same units of one sigma.
+        # Each prior is one more observation, in the same units of one sigma.
         for belief in nu.beliefs(self.names, theta):
             A = A + np.outer(belief.h, belief.h) / belief.std**2
             g = g - belief.h * float(belief.h @ theta) / belief.std**2
@@ -149,7 +148,7 @@ class Search:
     def _refined(
         self, reduced: Sequence[ReducedWindow | None], sigma: dict[int, Array]
     ) -> dict[int, Array]:
-        """Return each step's scatter of the outputs as the first fit left it."""
+        """Return each step's scatter of the outputs around the first fit."""
         out = {}
         for stratum, old in sigma.items():
             residuals = [

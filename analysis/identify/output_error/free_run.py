@@ -1,14 +1,15 @@
-"""Output error of an electric robot: the free run of whole records, as `validate` judges it.
+"""Output error of an electric robot: free runs of whole records, as in `validate`.
 
 The least sum over records and joints of |measured - simulated position|^2, the model driven by the
-measured drive alone from each record's measured first state. A position sensor's noise is far
-below what a free run is off, so the first state needs no fitting (fitted, it takes the constant
-torque's place); what is off is friction that wanders, and a free run weighs that by what it does to
-the position. The rows weigh it at every instant alike, reversals and all.
+measured drive alone from each record's measured first state. A position sensor's noise is far below
+the error of a free run, so the first state is not fitted (it would be correlated with the constant
+torque). That error comes from friction that varies; a free run weighs it by its effect on the
+position, the rows weigh every instant alike, reversals included.
 
-Where dry friction holds a joint the simulated position has kinks, so slopes are taken over steps of
-one per cent; shorter ones see the kink and the search stops too early. Source: Ljung, System
-Identification (1999), section 3.6; Janot, Vandanjon and Gautier (2014), DIDIM, for robots.
+Where dry friction holds a joint the simulated position has kinks, so derivatives are taken over
+steps of one per cent; shorter steps resolve the kink, and the search stops too early. Source:
+Ljung, System Identification (1999), section 3.6; Janot, Vandanjon and Gautier (2014), DIDIM, for
+robots.
 """
 
 from __future__ import annotations
@@ -83,9 +84,9 @@ class FreeRuns:
 def free_run_fit(
     rig: Rig, runs: Sequence[Run], terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Solution], Check]:
-    """Return the solutions with values of least free-run error, begun at theirs.
+    """Return the solutions with values of least free-run error, starting from their own.
 
-    Intervals are from repeats, or of a step with one repeat from ten parts of the record. Raises
+    Intervals are from repeats, or for a step with one repeat from ten parts of the record. Raises
     InputError where least squares left a parameter undetermined or terms keep parameters that are
     not linear in the rows.
     """

@@ -1,11 +1,11 @@
-"""Shapes of effects with a hidden state, by multiple shooting from what the rows found.
+"""Shapes of effects with a hidden state, by multiple shooting from the rows' estimates.
 
 The rows have a lagging spool or a contact's deflection along the *measured* path, through filters
 that round every reversal; a simulation has it along its own. So the shapes of such an effect are
 searched again with the model run freely over short windows (`analysis.identify.output_error.fit`),
 beside the coefficients of the equations that the effect acts in; the others stay as the rows have
-them. It is one more estimate, not the better one by nature: what the measured spool's noise moves
-in a window is error here and noise in the rows. `rest_of` says which does better on other records.
+them. This estimate is not always the better one: the measured spool's noise causes an error here
+that is only noise in the rows. `window_error` compares both on other records.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Shot:
-    """One effect by multiple shooting: estimates of its shapes by name, from so many windows.
+    """Shapes of one effect estimated by multiple shooting: estimates by name, number of windows.
 
-    `before` and `after` are what windows of other records leave with the rows' shapes and with
-    these [sigma] (see `rest_of`), `taken` whether these took the rows' place.
+    `before` and `after` are the window errors on other records with the rows' shapes and with these
+    [sigma] (see `window_error`), `taken` whether these replaced the rows' shapes.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Shot:
 
 
 def hidden_effects(model: Model) -> list[Effect]:
-    """Return the effects of a model that carry a state of their own in the form they have."""
+    """Return the effects of a model that have hidden states in their present form."""
     return [
         u.term
         for u in model.terms
@@ -63,7 +63,7 @@ def hidden_effects(model: Model) -> list[Effect]:
 
 
 def completed(runs: Sequence[Run], model: Model) -> Model | None:
-    """Return a model that can be run: what no record moves is taken from the rig's nominal values.
+    """Return a model that can be simulated, unexcited parameters taken from nominal values.
 
     None where a parameter of a moving joint was not identified, or there is no nominal value.
     """
@@ -83,9 +83,9 @@ def completed(runs: Sequence[Run], model: Model) -> Model | None:
 
 
 def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
-    """Search an effect's shapes by multiple shooting; None where no window can be simulated."""
+    """Estimate an effect's shapes by multiple shooting; None where no window can be simulated."""
     bounds = {s.parameter: s for s in _shapes(model, effect)}
-    try:  # there may be no window without a lost sample or a sensor at its end
+    try:  # perhaps every window has a lost sample or a sensor at the end of its range
         windows = _windows(runs, model, effect, _free(model, effect))
         theta = _theta(windows, model)
         low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
@@ -94,7 +94,7 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
             low[place], high[place] = shape.low, shape.high
         search = Search(windows, low, high).run(theta)
     except (InputError, np.linalg.LinAlgError) as error:
-        log.info("%s is not shot: %s", effect.name, error)
+        log.info("%s is not fitted by shooting: %s", effect.name, error)
         return None
     half = half_width(np.sqrt(np.diag(search.spread.covariance)), search.spread.dof)
     shapes = {}
@@ -106,10 +106,10 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
     return Shot(effect.name, effect.where, shapes, len(windows.placed), search.check.ok)
 
 
-def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:
-    """Return what windows of records leave under a model, each from its best start [sigma].
+def window_error(runs: Sequence[Run], model: Model, effect: Effect) -> float:
+    """Return the error of a model over windows of records, each from its best start [sigma].
 
-    The rms of measured less simulated piston and pressures over the sensors' noise; inf where a
+    The rms of measured minus simulated piston and pressures over the sensors' noise; inf where a
     window cannot be simulated, or the joint moves in none.
     """
     try:
@@ -149,7 +149,7 @@ def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:
 
 
 def _theta(windows: Windows, model: Model) -> Array:
-    """Return the windows' parameters (k,) as the model has them, 1/b for b."""
+    """Return the windows' parameters (k,) from the model, 1/b for b."""
     values = inverted(model.rig, model.terms, model.values)
     for used in model.terms:
         values |= shape_values(model.rig, used)
@@ -157,7 +157,7 @@ def _theta(windows: Windows, model: Model) -> Array:
 
 
 def _free(model: Model, effect: Effect) -> frozenset[str]:
-    """Return the effect's own parameters and its joint's part of the equations it acts in."""
+    """Return the effect's own parameters and its joint's parameters of the equations it acts in."""
     rig, joint = model.rig, effect.joint + 1
     own = {c.parameter for c in effect.coefficients(rig)}
     family = "mechanical" if own else "fluid"

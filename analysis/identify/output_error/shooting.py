@@ -1,7 +1,7 @@
 """Many trajectories of one window at once, all by the same fixed steps (RK4), compiled.
 
 Sensitivities are differences of neighbouring trajectories. An adaptive integrator would choose
-other steps for each, and that noise divided by a small difference is no derivative; with one grid
+different steps for each, and the resulting noise would spoil the small differences; with one grid
 for all the differences are smooth ("internal numerical differentiation", Bock 1981). A step spans
 two samples of the inputs, so that its midpoint is a sample and nothing is interpolated; it is cut
 into parts where a term's hidden state (a contact's deflection, a lagging spool) relaxes faster.
@@ -99,8 +99,8 @@ def shoot(
 ) -> Array | None:
     """Return the states (P, points, size) from `starts` (P, size) with `pars` (P, parameters).
 
-    A point every 2 x `every` samples, each two samples in `parts` steps. None where a state ceased
-    to exist.
+    A point every 2 x `every` samples, each two samples in `parts` steps. None where a simulation
+    failed.
     """
     out = np.zeros((len(starts), window.points, starts.shape[1]))
     good = _shoot(

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlacedWindow:
-    """One window ready to shoot: inputs, measured outputs (points, 3 F), its place in the data."""
+    """A window ready to simulate: inputs, measured outputs (points, 3 F), its record and part."""
 
     record: int
     stratum: int
@@ -28,9 +28,9 @@ class PlacedWindow:
 
 @dataclass(frozen=True)
 class WindowSource:
-    """One record: signals and inputs of the integrator, oil temperature less nominal [K].
+    """One record: signals and inputs of the integrator, oil temperature above nominal [K].
 
-    The signals are free of what the model says of sensors.
+    The signals are corrected for the model's sensor effects.
     """
 
     signals: Signals
@@ -41,9 +41,9 @@ class WindowSource:
 
 @dataclass(frozen=True)
 class ReducedWindow:
-    """A window after its start was eliminated: score, information, cost, and how to get back.
+    """A window after its start was eliminated: score, information, cost and back substitution.
 
-    `rest` is the cost that the best start leaves.
+    `rest` is the cost at the best start.
     """
 
     score: Array
@@ -57,9 +57,10 @@ class ReducedWindow:
 
 @dataclass(frozen=True)
 class PerturbedModel:
-    """The model of one record: as it is, and `pars` (1 + k, parameters) with every nudge.
+    """One record's model; `pars` (1 + k, parameters) as it is and with each parameter perturbed.
 
-    `sizes` (k,) are the nudges, `hidden` the terms' own states (n, h) along the record for each.
+    `sizes` (k,) are the perturbations, `hidden` the terms' hidden states (n, h) along the record
+    for each.
     """
 
     ready: Compiled

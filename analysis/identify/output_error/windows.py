@@ -1,4 +1,4 @@
-"""The windows of output error: cut from the records, simulated with every nudge, linearised."""
+"""Windows of the records for output error: cut, simulated with every perturbation, linearised."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
 from analysis.simulation.model import Model, as_loaded, model_of
-from analysis.simulation.simulate import Effort, compiled, drive_of, hidden_paths, put_right
+from analysis.simulation.simulate import Effort, compiled, drive_of, hidden_paths, sensor_corrected
 from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 
 class Windows:
-    """The data of one fit by windows, and the simulations of them.
+    """The data of one fit by windows, and their simulations.
 
     `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms. With
     `free` only those named there are free. At most `seconds` of data are used.
@@ -66,7 +66,7 @@ class Windows:
         self.names = (*names, nu.KAPPA) if self.warm else names
         self.sources: list[WindowSource] = []
         self.placed: list[PlacedWindow] = []
-        self._idle: dict[int, set[int]] = {}
+        self._without_influence: dict[int, set[int]] = {}
         self._cut(runs)
 
     def _cut(self, runs: Sequence[Run]) -> None:
@@ -74,7 +74,7 @@ class Windows:
         strata = {s: k for k, s in enumerate(sorted({one.group for one in records}))}
         most = max(1, round(self.seconds / IDENTIFY.window) // len(records))
         for one in records:
-            record, signals = one.record, put_right(self.rig, self.terms, one.signals)
+            record, signals = one.record, sensor_corrected(self.rig, self.terms, one.signals)
             drive = drive_of(signals)
             kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
             self.sources.append(WindowSource(signals, drive.inputs, drive.locked, kelvin))
@@ -156,13 +156,13 @@ class Windows:
         moved[self._state_places(window)] += change
         return moved
 
-    def _nudged(self, theta: Array, source: WindowSource) -> PerturbedModel:
-        """Compile the model with every parameter nudged, and find where its own states stand."""
-        nudges = IDENTIFY.sensitivity_step * np.where(theta == 0.0, 1.0, np.abs(theta))
+    def _perturbed(self, theta: Array, source: WindowSource) -> PerturbedModel:
+        """Compile the model with every parameter perturbed, and compute its hidden states."""
+        sizes = IDENTIFY.sensitivity_step * np.where(theta == 0.0, 1.0, np.abs(theta))
         if self.warm:
             b = abs(theta[self.names.index("b")])
-            nudges[-1] = IDENTIFY.sensitivity_step * b
-        rows = [theta, *(theta + n * e for n, e in zip(nudges, np.eye(len(theta)), strict=True))]
+            sizes[-1] = IDENTIFY.sensitivity_step * b
+        rows = [theta, *(theta + n * e for n, e in zip(sizes, np.eye(len(theta)), strict=True))]
         loaded = source.signals.loaded
         models = [as_loaded(self.model(row, source.kelvin), loaded) for row in rows]
         ready = [compiled(model, Effort.FIT) for model in models]
@@ -171,7 +171,7 @@ class Windows:
             hidden_paths(model, source.signals) if first.size and name in self.places else first
             for model, name in zip(models, ("", *self.names), strict=True)
         ]
-        return PerturbedModel(ready[0], np.array([r.par for r in ready]), nudges, tuple(hidden))
+        return PerturbedModel(ready[0], np.array([r.par for r in ready]), sizes, tuple(hidden))
 
     def model(self, theta: Array, kelvin: float = 0.0) -> Model:
         """Return the model of parameters theta (k,), the oil `kelvin` above nominal."""
@@ -188,44 +188,44 @@ class Windows:
     def linearised(
         self, theta: Array, starts: Sequence[Array], sigma: Mapping[int, Array]
     ) -> list[ReducedWindow | None]:
-        """Shoot every window with every nudge; None for one whose state ceased to exist."""
-        ready = [self._nudged(theta, source) for source in self.sources]
+        """Simulate every window with every perturbation; None for one that failed."""
+        ready = [self._perturbed(theta, source) for source in self.sources]
 
-        def shot(k: int) -> ReducedWindow | None:
+        def reduced(k: int) -> ReducedWindow | None:
             window = self.placed[k]
             return self._window(window, starts[k], sigma[window.stratum], ready[window.record])
 
-        # A record's first window shows which parameters move nothing in it; once that is known,
-        # windows need not wait for one another.
+        # A record's first window shows which parameters have no influence in it; its other windows
+        # then run in parallel.
         reductions = {}
         for k, window in enumerate(self.placed):
-            if window.record not in self._idle:
-                reductions[k] = shot(k)
+            if window.record not in self._without_influence:
+                reductions[k] = reduced(k)
         rest = [k for k in range(len(self.placed)) if k not in reductions]
         with ThreadPoolExecutor(IDENTIFY.window_workers) as pool:
-            reductions |= zip(rest, pool.map(shot, rest), strict=True)
+            reductions |= zip(rest, pool.map(reduced, rest), strict=True)
         return [reductions[k] for k in range(len(self.placed))]
 
     def _window(
-        self, window: PlacedWindow, start: Array, sigma: Array, nudged: PerturbedModel
+        self, window: PlacedWindow, start: Array, sigma: Array, perturbed: PerturbedModel
     ) -> ReducedWindow | None:
-        """Shoot one window with every nudge and eliminate its start."""
-        ready, nudges = nudged.ready, nudged.sizes
+        """Simulate one window with every perturbation and eliminate its start."""
+        ready, sizes = perturbed.ready, perturbed.sizes
         source = self.sources[window.record]
         places = self._state_places(window)
         free = len(places) // 4
-        state_nudges = np.repeat(IDENTIFY.start_steps, free)
+        state_sizes = np.repeat(IDENTIFY.start_steps, free)
         active = self._active(window.record)
         y0 = np.zeros((1 + len(places) + len(active), len(start) + ready.hidden))
         y0[:, : len(start)] = start
-        for row, (place, nudge) in enumerate(zip(places, state_nudges, strict=True), start=1):
-            y0[row, place] += nudge
+        for row, (place, size) in enumerate(zip(places, state_sizes, strict=True), start=1):
+            y0[row, place] += size
         chosen = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
         if y0.shape[1] > len(start):
             first = window.shooting.first
-            y0[:, len(start) :] = [nudged.hidden[k][first] for k in chosen]
+            y0[:, len(start) :] = [perturbed.hidden[k][first] for k in chosen]
         states = shoot(
-            ready, np.ascontiguousarray(nudged.pars[chosen]), y0, source.inputs,
+            ready, np.ascontiguousarray(perturbed.pars[chosen]), y0, source.inputs,
             source.signals.rate, source.locked, window.shooting, self.every, self.parts,
         )  # fmt: skip
         if states is None:
@@ -233,25 +233,25 @@ class Windows:
         outputs = self._outputs(states, source.locked) / sigma
         residual = window.measured / sigma - outputs[0]
         change = (outputs[1:] - outputs[0]).reshape(len(outputs) - 1, -1)
-        Js = (change[: len(places)] / state_nudges[:, None]).T
-        J = np.zeros((Js.shape[0], len(nudges)))
-        J[:, active] = (change[len(places) :] / nudges[active, None]).T
-        if window.record not in self._idle:
-            self._idle[window.record] = {int(k) for k in active if not J[:, k].any()}
+        Js = (change[: len(places)] / state_sizes[:, None]).T
+        J = np.zeros((Js.shape[0], len(sizes)))
+        J[:, active] = (change[len(places) :] / sizes[active, None]).T
+        if window.record not in self._without_influence:
+            self._without_influence[window.record] = {int(k) for k in active if not J[:, k].any()}
         r = residual.ravel()
         # Project the window's start out by QR of its sensitivities.
         Q, R = np.linalg.qr(Js)
         inner, outer = Q.T @ J, Q.T @ r
-        left_J, left_r = J - Q @ inner, r - Q @ outer
+        J_out, r_out = J - Q @ inner, r - Q @ outer
         return ReducedWindow(
-            left_J.T @ left_r, left_J.T @ left_J, float(r @ r), float(left_r @ left_r),
+            J_out.T @ r_out, J_out.T @ J_out, float(r @ r), float(r_out @ r_out),
             np.linalg.solve(R, inner), np.linalg.solve(R, outer), residual,
         )  # fmt: skip
 
     def _active(self, record: int) -> NDArray[np.int64]:
-        """Return the parameters that move anything in a record (what a first window showed)."""
+        """Return the parameters with an influence in a record, as found from its first window."""
         locked = {str(i + 1) for i in np.flatnonzero(self.sources[record].locked)}
-        idle = self._idle.get(record, set())
+        idle = self._without_influence.get(record, set())
         return np.array(
             [
                 k for k, name in enumerate(self.names)
@@ -273,5 +273,5 @@ class Windows:
 
 
 def noise_gain(rig: Rig) -> float:
-    """Return what the channels' filter leaves of white noise, as a share of its amplitude."""
+    """Return the rms gain of the channel filter for white noise."""
     return float(np.linalg.norm(channel_filter(rig.sample_rate).taps[0]))

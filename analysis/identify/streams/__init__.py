@@ -1,1 +1,1 @@
-"""Records that do not fit into memory, and those that still arrive."""
+"""Identification from records that do not fit into memory, and during recording."""

@@ -1,20 +1,19 @@
-"""Identification while the bench runs: a square-root information filter over rows as they come.
+"""Identification while the bench runs: a square-root information filter, updated row by row.
 
-The rows are the batch's own: samples are filtered in chunks with the overlap that zero-phase
-filters need, so a row comes out `Tracker.delay` seconds late and is exactly the row that
-`analysis.identify.identify` would make. A chunk's rows are folded into the triangle R of all
-before,
+The rows equal those of `analysis.identify.identify`: samples are filtered in chunks with the
+overlap that zero-phase filters need, so that a row is available `RowFeed.delay` seconds late. A
+chunk's rows are folded into the triangle R of all before,
 
     R'R  <-  w R'R + [X y]' W [X y],     w = exp(-dt/memory),
 
 (Bierman, Factorization Methods, ch. V; with memory infinite, w = 1, this is the batch solution).
-Forgetting goes by the device's clock, so a parameter that changes is followed whatever is excited.
-What is not excited fades, but never below `online_floor` of its column's best: there its value is
-held, and said to be held, in the place of numbers that come from rounding.
+Forgetting goes by the device's clock, so that a changing parameter is followed whatever is excited.
+Information on an unexcited parameter fades, but never below `online_floor` of its column's largest:
+from there its value is held and marked as held, to keep rounding errors out.
 
-By default the flow rows are followed (b and the gains), which do not depend on the locked joints.
-Torque rows can be followed as well; locked joints then count as moving as measured, whereas
-`identify` decides from all repeats of a step (`analysis.signals.locks`).
+By default the flow rows are used (b and the gains), which do not depend on the locked joints.
+Torque rows can be used as well; locked joints then count as moving as measured, whereas `identify`
+decides from all repeats of a step (`analysis.signals.locks`).
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ Array = NDArray[np.float64]
 
 
 class RowFeed:
-    """The rows of one record while its samples come in."""
+    """Rows of one record, built while its samples arrive."""
 
     def __init__(
         self,
@@ -67,18 +66,18 @@ class RowFeed:
 
     @property
     def delay(self) -> float:
-        """How late a row comes out at most [s]."""
+        """The largest delay of a row [s]."""
         return (self._spare + self._chunk) / self._head.sample_rate
 
     def feed(self, channels: Mapping[str, Array]) -> dict[str, Rows]:
-        """Take the next samples, NaN where lost; return the rows that they complete, if any."""
+        """Take the next samples, NaN where lost; return the completed rows, if any."""
         self._waiting.append(channels)
         self._total += len(next(iter(channels.values())))
         last = self._total - self._spare
         return self._work(last) if last - self._first >= self._chunk else {}
 
     def finish(self) -> dict[str, Rows]:
-        """Return the rows that were waiting for samples beyond the record's end."""
+        """Return the remaining rows, which needed samples beyond the record's end."""
         return self._work(self._total) if self._total else {}
 
     def _work(self, last: int) -> dict[str, Rows]:
@@ -99,10 +98,9 @@ class RowFeed:
 
 @dataclass(frozen=True)
 class OnlineResidual:
-    """How well the estimates before a chunk predict its rows: rms of y - X beta and of y.
+    """Prediction error of a chunk by the estimates before it: rms of y - X beta and of y.
 
-    Both are in the rows' unit. The rows were not in the estimates yet, so they judge as held-out
-    rows do.
+    Both are in the rows' unit. The rows were not yet in the estimates, as with held-out rows.
     """
 
     rms: float
@@ -111,7 +109,7 @@ class OnlineResidual:
 
 @dataclass(frozen=True)
 class _Segment:
-    """The rows of one chunk as a triangle, their weight being 1 at `time` [s]."""
+    """The rows of one chunk as a triangle, with weight 1 at `time` [s]."""
 
     step: str
     repeat: int
@@ -122,7 +120,7 @@ class _Segment:
 
 
 class _Filter:
-    """The square-root information filter of one family, and the pieces its intervals rest on."""
+    """The square-root information filter of one family, and the segments for its intervals."""
 
     def __init__(self, names: tuple[str, ...], memory: float) -> None:
         self.names = names
@@ -156,7 +154,7 @@ class _Filter:
         self._segments.append(_Segment(*here, piece.triangle, piece.rows, now))
 
     def _predicted(self, piece: Accumulator) -> OnlineResidual | None:
-        """Return what the estimates so far leave of a chunk; None where it has unknown columns.
+        """Return the prediction error of a chunk; None where it has unknown columns.
 
         With T'T = [X y]'[X y] of the chunk, |y - X beta| = |T [-beta; 1]|.
         """
@@ -172,7 +170,7 @@ class _Filter:
         return float(np.exp((segment.time - self._time) / self._memory))
 
     def _fade(self, seconds: float) -> None:
-        """Discount old rows, and keep a parameter with too little information at its value."""
+        """Reduce the weight of old rows, and hold a parameter that has too little information."""
         self._sum.fade(float(np.exp(-seconds / self._memory)))
         R = self._sum.triangle
         size, least = _norms(R), IDENTIFY.online_floor * self._peak
@@ -184,7 +182,7 @@ class _Filter:
             self._sum.merge(np.column_stack((lift, lift @ value)), 0)
 
     def condense(self) -> None:
-        """Make one piece of each finished repeat, if nothing is forgotten and it has company."""
+        """Merge each finished repeat into one segment, if nothing is forgotten and others exist."""
         if np.isfinite(self._memory):
             return
         pieces: dict[tuple[str, object], _Segment] = {}
@@ -208,10 +206,10 @@ class _Filter:
         ]
 
     def solution(self) -> Solution:
-        """Return the estimate of now; its errors are NaN while there is but one piece."""
+        """Return the current estimate; its errors are NaN while there is only one segment."""
         keys = self._keys()
         count = Counter(step for step, _ in set(keys))
-        # A step just begun has one piece, and no scatter of its own yet.
+        # A step just begun has one segment, and no scatter yet.
         others = [step for step, pieces in count.items() if pieces > 1]
         scatter = []
         for (step, key), segment in zip(keys, self._segments, strict=True):
@@ -242,7 +240,7 @@ class Tracker:
     ) -> None:
         if not memory > 0.0:
             raise InputError(f"a memory of {memory:g} s; expected more than 0")
-        if families is None:  # what needs nothing of the locked joints, where there is such
+        if families is None:  # the families that do not depend on locked joints, if any
             families = rig.families[-1:]
         self._rig, self._families = rig, tuple(families)
         used = map(Used, baseline_of(rig))
@@ -256,15 +254,15 @@ class Tracker:
         self._clock = -np.inf
 
     def _concerns(self, used: Used) -> bool:
-        """Return whether a term has to do with the families followed."""
+        """Return whether a term acts in the families followed."""
         prepares = type(used.term).prepare is not Term.prepare
         return prepares or any(
             c.family in self._families for c in used.term.coefficients(self._rig)
         )
 
     def begin(self, head: RecordHead) -> None:
-        """Begin a record, of which `samples` need not be known; `start` [s] is the device's."""
-        # Imported records all start at 0: then one follows the other.
+        """Begin a record, of which `samples` may be unknown; `start` [s] is the device's time."""
+        # Imported records all start at 0: they are then placed one after the other.
         self._start = max(head.start, self._clock)
         self._head = head
         filters = default_filtering(head.record({}))
@@ -272,7 +270,7 @@ class Tracker:
         self._running = copy.deepcopy(self._kept)
 
     def feed(self, channels: Mapping[str, Array]) -> bool:
-        """Take the record's next samples, NaN where lost; says whether the estimates are new."""
+        """Take the record's next samples, NaN where lost; return whether the estimates are new."""
         return self._feed is not None and self._fold(self._feed.feed(channels))
 
     def end(self) -> None:
@@ -298,7 +296,7 @@ class Tracker:
         return True
 
     def estimates(self) -> dict[str, Estimate]:
-        """Return every parameter followed; NaN until rows determine it; no interval while held."""
+        """Return every parameter followed; NaN until determined; without interval while held."""
         solutions = {family: running.solution() for family, running in self._running.items()}
         values, _ = estimates_of(self._rig, self._terms, solutions)
         nothing = (float("nan"), float("nan"))
@@ -309,13 +307,13 @@ class Tracker:
         return values
 
     def residuals(self) -> dict[str, OnlineResidual]:
-        """Return, by family of rows, what the estimates left of the newest chunk before it came."""
+        """Return, by family of rows, the prediction error of the newest chunk."""
         by_family = {family: solution.residual for family, solution in self._running.items()}
         return {family: left for family, left in by_family.items() if left is not None}
 
 
 def track(tracker: Tracker, record: Record, block: int = 10) -> None:
-    """Feed a record at hand to a tracker, `block` samples at a time, as a bench would."""
+    """Feed a stored record to a tracker, `block` samples at a time, as a bench would."""
     tracker.begin(head_of(record))
     for first in range(0, record.samples, block):
         part = slice(first, first + block)

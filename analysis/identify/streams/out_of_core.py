@@ -28,7 +28,7 @@ from rig.model.records import Record
 from rig.model.rig import Rig
 from rig.runs.stream import read_run_head
 
-RECORDS_TOGETHER = 6  # at most handed to a worker at once: progress is heard between them
+RECORDS_TOGETHER = 6  # most records given to a worker at once: progress is reported between them
 
 
 def identify_folders(
@@ -42,12 +42,12 @@ def identify_folders(
 ) -> Identification:
     """Identify from run folders, of which one record at a time is in memory.
 
-    This is `identify` by the coupled method with the estimator "plain", for the other methods and
-    estimators go over all rows again and again. The terms are those of the model `like`, or the
-    rig's baseline with `effects` (`analysis.terms.with_effects`). The records are read once more
-    for every number of the rig with a tolerance (`analysis.identify.geometry`). With a `pool` each
+    This is `identify` by the coupled method with the estimator "plain", because the other methods
+    and estimators need all rows repeatedly. The terms are those of the model `like`, or the rig's
+    baseline with `effects` (`analysis.terms.with_effects`). The records are read once more for
+    every number of the rig with a tolerance (`analysis.identify.geometry`). With a `pool` each
     record is reduced in one of its processes, where the folders are read; only triangles come back.
-    `progress` hears the share of the records that are reduced, 0 to 1. Raises InputError as
+    `progress` receives the share of the records that are reduced, 0 to 1. Raises InputError as
     `identify` and `load_run` do, for a model of another rig, and for an effect whose shape is open.
     """
     workers = pool or Serial()
@@ -99,8 +99,7 @@ def identify_folders(
 def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]:
     """Return the tasks in groups of one folder, at least four groups for each worker.
 
-    A cluster spends some milliseconds on each item that it hands out, which is as much as a short
-    record takes to be reduced.
+    A cluster needs some milliseconds to send an item, as much as the reduction of a short record.
     """
     most = max(1, min(RECORDS_TOGETHER, len(tasks) // (4 * workers)))
     groups: list[list[RecordTask]] = []
@@ -116,7 +115,7 @@ def _folder_of(group: Sequence[RecordTask]) -> str:
 
 
 def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:
-    """Raise InputError for an effect whose shape would have to be found in all rows at once."""
+    """Raise InputError for an effect whose shape must be searched with all rows in memory."""
     for used in terms:
         if open_shapes(rig, used):
             raise InputError(

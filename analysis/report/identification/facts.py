@@ -1,4 +1,4 @@
-"""What the report says first: what was done, how well, the checks in words, the parameters."""
+"""The first part of the report: summary, headline figures, checks, parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Tile:
-    """One figure of the headline: the number, what it is, what it refers to."""
+    """One figure of the headline: the number, its label, its reference."""
 
     number: str
     label: str
@@ -35,7 +35,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class CheckLine:
-    """All statements of one check: ok if every one is; the gravest first, the rest in `more`."""
+    """All statements of one check: ok if every one is; the gravest first, the others in `more`."""
 
     name: str
     ok: bool
@@ -44,7 +44,7 @@ class CheckLine:
 
 
 def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
-    """Gather checks by name, what is not ok before what is."""
+    """Group checks by name, those that are not ok first."""
     by_name: dict[str, list[Check]] = {}
     for check in checks:
         by_name.setdefault(check.name, []).append(check)
@@ -61,7 +61,10 @@ def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
 
 
 def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
-    """Say where a simulated bench's own truth is no rigid body's (R_ij = l_i W_j), '' otherwise."""
+    """State where a simulated bench's true parameters are not those of rigid bodies, '' otherwise.
+
+    Rigid bodies have R_ij = l_i W_j.
+    """
     remarks = []
     for i, j in itertools.combinations(range(1, len(rig.joints) + 1), 2):
         R, W = (truth or {}).get(f"R{i}{j}"), (truth or {}).get(f"W{j}")
@@ -80,7 +83,7 @@ def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One line of the parameter table, every field ready to be read."""
+    """One line of the parameter table, every field as text."""
 
     name: str
     meaning: str
@@ -103,12 +106,12 @@ def records_of(runs: Sequence[Run]) -> list[Record]:
 
 
 def duration(records: Sequence[Record]) -> float:
-    """Return the seconds of data in all records together."""
+    """Return the total duration of records [s]."""
     return sum(record.samples / record.sample_rate for record in records)
 
 
 def minutes(seconds: float) -> str:
-    """Write a duration as a person would: seconds below two minutes, else minutes."""
+    """Write a duration in seconds below two minutes, else in minutes."""
     if seconds < 120:
         return f"{seconds:.3g} seconds"
     return f"{seconds / 60:.3g} minutes"
@@ -136,7 +139,7 @@ def sentences(
     *,
     simulated: bool,
 ) -> list[str]:
-    """Say in plain sentences what was done and with what result."""
+    """Return a summary of the identification and its validation in sentences."""
     records = records_of(runs)
     joints = len(rig.joints)
     expected = tuple(identification.estimates) if rig.electric else parameter_names(joints)
@@ -217,7 +220,7 @@ def tiles(
 
 
 def covers(estimate: Estimate, truth: float) -> bool:
-    """Whether the 95 % interval holds the truth."""
+    """Return whether the 95 % interval contains the truth."""
     return bool(estimate.ci95[0] <= truth <= estimate.ci95[1])
 
 

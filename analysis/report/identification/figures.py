@@ -1,4 +1,4 @@
-"""Which figures a report shows, in which order, with captions; the page escapes the captions."""
+"""The figures of a report, in order, with captions; the page escapes the captions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Figures of one kind and how many more there would have been."""
+    """Figures of one kind, and the number left out."""
 
     figures: tuple[ReportFigure, ...]
     left_out: int = 0
@@ -41,7 +41,7 @@ class Gallery:
 def parameters(
     rig: Rig, identification: Identification, truth: Mapping[str, float] | None
 ) -> Gallery:
-    """Return the dots with whiskers: against truth or nominal where there is one, and widths."""
+    """Return plots of the parameters against truth or nominal values, and of interval widths."""
     estimates = identification.estimates
     figures = []
     reference, kind = (truth, "truth") if truth else (rig.nominal, "nominal")
@@ -62,7 +62,7 @@ def parameters(
 
 
 def arm(rig: Rig) -> ReportFigure | None:
-    """Return the drawing of the arm; None of an electric one, which has no linkage to draw."""
+    """Return the drawing of the arm; None for an electric one, which has no linkage to draw."""
     if rig.electric:
         return None
     return ReportFigure(
@@ -117,7 +117,7 @@ def residuals(all_residuals: Sequence[Residual]) -> Gallery:
 
 
 def equation_text(residual: Residual) -> str:
-    """Say in words which equation a residual belongs to."""
+    """Return the name of a residual's equation in words."""
     return EQUATIONS[residual.equation.rsplit("_", 1)[0]]
 
 
@@ -148,7 +148,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
 def paired(
     validation: Sequence[RecordValidation], runs: Sequence[Run]
 ) -> list[tuple[RecordValidation, Record | None]]:
-    """Put each validation beside its record: by order where it fits, else by name."""
+    """Pair each validation with its record, by order if that fits, else by name."""
     records = [record for run in runs for record in run.records]
     if [r.name for r in records] == [v.record for v in validation]:
         return list(zip(validation, records, strict=True))
@@ -174,7 +174,7 @@ class ResidualRow:
 
 
 def residual_rows(residuals: Sequence[Residual]) -> list[ResidualRow]:
-    """Return the residual table, ready to be read."""
+    """Return the residual table as text."""
     out = []
     for residual in residuals:
         unit = fm.display_unit(residual.unit)

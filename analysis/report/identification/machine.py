@@ -1,4 +1,4 @@
-"""The rig's constants in units people use, and what each step of the runs did."""
+"""The rig's constants in display units, and a summary of each step of the runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOCKS = {
 
 
 def bench_constants(rig: Rig) -> list[tuple[str, str]]:
-    """Return (what, value with unit) of the bench as a whole."""
+    """Return (quantity, value with unit) of the bench."""
     if isinstance(rig, ElectricRig):
         p, d = rig.sensors.position, rig.sensors.drive
         units = [rig.unit_of(ch.channel(kind, 1)) for kind in (ch.POSITION, ch.DRIVE)]
@@ -54,7 +54,7 @@ def bench_constants(rig: Rig) -> list[tuple[str, str]]:
 
 
 def joint_constants(rig: Rig) -> list[tuple[str, list[str]]]:
-    """Return (what and unit, one value per joint)."""
+    """Return (quantity and unit, one value per joint)."""
 
     if isinstance(rig, ElectricRig):
         each = rig.joints
@@ -129,7 +129,7 @@ def steps(rig: Rig, runs: Sequence[Run]) -> list[StepSummary]:
 
 @dataclass(frozen=True)
 class StepRow:
-    """One line of the protocol table, ready to be read."""
+    """One line of the protocol table, as text."""
 
     run: str
     name: str
@@ -140,7 +140,7 @@ class StepRow:
     period: str
     spool: str
     travel: str
-    give: str
+    yielding: str
     lost: str
     late: str
     jitter: str
@@ -148,14 +148,15 @@ class StepRow:
 
 
 def step_rows(rig: Rig, runs: Sequence[Run]) -> list[StepRow]:
-    """Return the protocol table; a dash stands for what the records do not state."""
+    """Return the protocol table; a dash stands for values missing in the records."""
     return [_step_row(runs, step) for step in steps(rig, runs)]
 
 
 def _step_row(runs: Sequence[Run], step: StepSummary) -> StepRow:
     first = step.records[0]
     attributes = [record.attributes for record in step.records]
-    gives = [g for i in step.locked if (g := _largest(attributes, f"lock_give_m_{i}")) is not None]
+    travels = (_largest(attributes, f"lock_give_m_{i}") for i in step.locked)
+    yielding = [travel for travel in travels if travel is not None]
     jitter = _largest(attributes, "jitter_max_s")
     period = "not periodic"
     if first.period:
@@ -174,7 +175,7 @@ def _step_row(runs: Sequence[Run], step: StepSummary) -> StepRow:
         period,
         _per_joint(step, ch.SPOOL, 1e3, np.std),
         _per_joint(step, ch.PISTON, 1e3, np.ptp),
-        fm.significant(max(gives) * 1e6) if gives else fm.DASH,
+        fm.significant(max(yielding) * 1e6) if yielding else fm.DASH,
         _total(attributes, "lost_samples"),
         _total(attributes, "late_blocks"),
         fm.DASH if jitter is None else fm.significant(jitter * 1e3),
@@ -191,7 +192,7 @@ Attributes = Sequence[Mapping[str, str | float | int]]
 
 
 def _numbers(attributes: Attributes, key: str) -> list[float]:
-    """Return the attribute of every record that states it as a number."""
+    """Return the attribute of every record that has it as a number."""
     return [
         float(value) for a in attributes
         if isinstance(value := a.get(key), int | float | np.number) and np.isfinite(value)

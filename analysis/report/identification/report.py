@@ -1,7 +1,7 @@
-"""The report: one self-contained HTML page that says what was done and how well, with figures.
+"""The report of an identification: one self-contained HTML page with results and figures.
 
 Every number is computed from the arguments. The page refers to nothing outside itself, needs no
-script, and the same arguments give the same bytes.
+script, and equal arguments result in equal bytes.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ TEMPLATE = "report.html"
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the report comes from, as the caller knows it: nothing here is read from the clock.
+    """The origin of the report, as the caller states it: nothing here is read from the clock.
 
     `versions` maps a package to its version, `seeds` a purpose to its seed, `commands` are the
-    lines that make the report again, `notes` free lines.
+    lines that reproduce the report, `notes` free lines.
     """
 
     date: str = ""
@@ -159,7 +159,7 @@ def _validated(
 
 
 def _run_lines(runs: Sequence[Run], validation_runs: Sequence[Run]) -> list[_RunLine]:
-    """Name the run folders without where they lie: a report may leave the house."""
+    """Name the run folders without their paths, because a report may be published."""
     return [
         _RunLine(fm.folder_name(run.source) or f"run {n}", role, run.state, len(run.records))
         for role, group in (("identification", runs), ("validation", validation_runs))

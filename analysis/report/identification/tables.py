@@ -21,7 +21,7 @@ ABOVE, BELOW, EQUAL = "▲", "▼", "="
 
 @dataclass(frozen=True)
 class Worst:
-    """The lowest FIT [%], and where."""
+    """The lowest FIT [%], with its channel and record."""
 
     fit: float
     channel: str
@@ -82,9 +82,9 @@ def fit_rows(validation: Sequence[RecordValidation]) -> list[FitRow]:
 
 @dataclass(frozen=True)
 class Cell:
-    """One comparison: ours, the paper's, and the mark between them ('' if nothing to compare)."""
+    """One comparison: own value, the paper's, and a mark between them ('' if there is none)."""
 
-    ours: str
+    own: str
     paper: str
     mark: str
 
@@ -102,7 +102,7 @@ class ComparedFit:
 
 @dataclass(frozen=True)
 class FitTable:
-    """The paper's Table IV: rows, how many cells were compared, how many lie above."""
+    """The paper's Table IV: rows, number of cells compared, number above the paper's."""
 
     rows: tuple[ComparedFit, ...]
     compared: int
@@ -110,7 +110,7 @@ class FitTable:
 
 
 def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
-    """Set the FIT of the records named as the paper's columns beside its numbers.
+    """Compare the FIT of records with the paper's columns of the same names.
 
     Repeats of a record are averaged; empty for another rig or without such records.
     """
@@ -126,26 +126,26 @@ def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
         for i, kind in enumerate(KINDS):
             name = ch.channel(kind, column.joint)
             fits = [r.fit[name] for r in results if name in r.fit]
-            ours = float(np.mean(fits)) if fits else float("nan")
-            theirs = column.fit[i] if column.fit else None
-            mark = "" if theirs is None or math.isnan(ours) else mark_of(ours, theirs)
-            compared += bool(theirs is not None)
+            own = float(np.mean(fits)) if fits else float("nan")
+            printed = column.fit[i] if column.fit else None
+            mark = "" if printed is None or math.isnan(own) else mark_of(own, printed)
+            compared += bool(printed is not None)
             above += mark == ABOVE
-            cells.append(Cell(fm.fit(ours), fm.fit(theirs), mark))
+            cells.append(Cell(fm.fit(own), fm.fit(printed), mark))
         rows.append(
             ComparedFit(column.step, column.joint, len(results), tuple(cells), column.figure)
         )
     return FitTable(tuple(rows), compared, above)
 
 
-def mark_of(ours: float, theirs: float) -> str:
-    """Mark whether a number lies above, below or at the other."""
-    return EQUAL if ours == theirs else ABOVE if ours > theirs else BELOW
+def mark_of(own: float, printed: float) -> str:
+    """Return a mark for a number above, below or equal to the other."""
+    return EQUAL if own == printed else ABOVE if own > printed else BELOW
 
 
 @dataclass(frozen=True)
 class ComparedParameter:
-    """One parameter against the paper's Table III, ready to be read."""
+    """One parameter against the paper's Table III, as text."""
 
     name: str
     unit: str
@@ -160,38 +160,38 @@ class ComparedParameter:
 def table_iii(
     rig_name: str, identification: Identification, scatter: Mapping[str, Scatter]
 ) -> list[ComparedParameter]:
-    """Set the parameters beside the paper's Table III; empty for another rig."""
+    """Compare the parameters with the paper's Table III; empty for another rig."""
     if rig_name != paper.RIG:
         return []
     out = []
     for name, estimate in identification.estimates.items():
-        theirs = paper.TABLE_III.get(name)
-        if theirs is None:
+        printed = paper.TABLE_III.get(name)
+        if printed is None:
             continue
         unit = fm.display_unit(estimate.unit)
-        ours = scatter.get(name)
-        spread = (ours.low, ours.mean, ours.high) if ours else (None, None, None)
-        deviation = 100 * (estimate.value / theirs.mean - 1)
-        mark = mark_of(ours.rsd, theirs.rsd) if ours and math.isfinite(ours.rsd) else ""
+        own = scatter.get(name)
+        spread = (own.low, own.mean, own.high) if own else (None, None, None)
+        deviation = 100 * (estimate.value / printed.mean - 1)
+        mark = mark_of(own.rsd, printed.rsd) if own and math.isfinite(own.rsd) else ""
         out.append(
             ComparedParameter(
                 name, unit.text, fm.significant(estimate.value, 4, unit.scale),
                 tuple(fm.significant(v, 4, unit.scale) for v in spread),
-                fm.column_percent(ours.rsd if ours else None),
+                fm.column_percent(own.rsd if own else None),
                 mark,
-                _printed(theirs, unit.scale, 0 if name == "b" else 2),
+                _printed(printed, unit.scale, 0 if name == "b" else 2),
                 fm.column_percent(deviation, signed=True),
             )
         )  # fmt: skip
     return out
 
 
-def _printed(theirs: paper.PaperParameter, scale: float, places: int) -> tuple[str, ...]:
+def _printed(printed: paper.PaperParameter, scale: float, places: int) -> tuple[str, ...]:
     """Write the paper's min, mean, max, RSD, PSO, GA, nominal with the decimals it prints."""
 
     return (
-        *(fm.fixed(v, places, scale) for v in (theirs.low, theirs.mean, theirs.high)),
-        f"{theirs.rsd:.2f}",
-        *(fm.fixed(v, places, scale) for v in (theirs.pso, theirs.ga)),
-        " to ".join(fm.fixed(v, places, scale) for v in theirs.nominal) or fm.DASH,
+        *(fm.fixed(v, places, scale) for v in (printed.low, printed.mean, printed.high)),
+        f"{printed.rsd:.2f}",
+        *(fm.fixed(v, places, scale) for v in (printed.pso, printed.ga)),
+        " to ".join(fm.fixed(v, places, scale) for v in printed.nominal) or fm.DASH,
     )  # fmt: skip

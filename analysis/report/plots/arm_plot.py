@@ -48,7 +48,7 @@ def _direction(theta: float) -> Array:
 
 
 def pose(rig: Rig, q: Array) -> Pose:
-    """Return where joints, tip and pins are at joint angles q (N,) [rad]."""
+    """Return the positions of joints, tip and pins at joint angles q (N,) [rad]."""
     theta = np.cumsum(q)
     points, inner, outer = [np.zeros(2)], [], []
     for k, joint in enumerate(rig.joints):
@@ -85,7 +85,7 @@ def reach(rig: Rig) -> Array:
 
 
 def arm(rig: Rig) -> Markup:
-    """Draw the arm at mid-stroke, each joint's two ends as ghosts, and where the tip can be."""
+    """Draw the arm at mid-stroke, each joint's two ends dashed, and the region of the tip."""
     q = middle(rig)
     with style():
         canvas = figure(4.2, CARD)
@@ -96,9 +96,9 @@ def arm(rig: Rig) -> Markup:
         _tip_region(axes, rig, tips)
         for k in range(len(rig.joints)):
             for end in angle_range(rig, k):
-                ghost = q.copy()
-                ghost[k] = end
-                points = pose(rig, ghost).joints[k : k + 2]
+                dashed = q.copy()
+                dashed[k] = end
+                points = pose(rig, dashed).joints[k : k + 2]
                 axes.plot(*points.T, color=JOINT_COLOURS[k % 5], linewidth=1.0, alpha=0.45,
                           linestyle=(0, (3, 2)))  # fmt: skip
         at = pose(rig, q)
@@ -113,7 +113,7 @@ def arm(rig: Rig) -> Markup:
 def _tip_region(axes: Any, rig: Rig, tips: Array) -> None:
     side = round(len(tips) ** 0.5)
     if len(rig.joints) == 2:
-        # The edge of the square of strokes, walked round, is the edge of the reach.
+        # The edge of the square of strokes maps to the edge of the region.
         grid = tips.reshape(side, side, 2)
         edge = np.vstack((grid[0], grid[:, -1], grid[-1, ::-1], grid[::-1, 0]))
         axes.add_patch(Polygon(edge, closed=True, facecolor="#eef1f4", edgecolor=PALE, zorder=0.4))

@@ -1,4 +1,4 @@
-"""Parameters as dots with whiskers: against a reference, and the interval's width on its own."""
+"""Parameters as dots with whiskers: against a reference, and the width of the interval."""
 
 from __future__ import annotations
 

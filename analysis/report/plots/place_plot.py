@@ -1,8 +1,8 @@
 """A schematic of the machine with the places of named effects marked.
 
-Per joint one column: cylinder with cap and rod chamber, valve, sensors (u spool, s piston, p
+For each joint one column: cylinder with cap and rod chamber, valve, sensors (u spool, s piston, p
 pressure), the joint that it moves; below all of them supply and return line. Electric: drive and
-joint, with their sensors. Marks carry the number of their line in the list beside.
+joint, with their sensors. Marks have the number of their line in the list.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Box = tuple[float, float, float, float]  # left, bottom, right, top in units of 
 WIDTH: Final = 10.5  # of a joint's column
 CHAMBERS: Final = ("cap", "rod")
 SENSORS: Final = ("cap sensor", "rod sensor", "piston sensor", "spool sensor")
-# Where in a column the elements are; names without a number belong to the bench.
+# Positions of the elements in a column; names without a number belong to the bench.
 HYDRAULIC: Final[dict[str, Box]] = {
     "cap": (1.2, 6.0, 3.6, 7.4), "piston": (3.6, 5.9, 4.1, 7.5), "rod": (4.1, 6.0, 7.0, 7.4),
     "joint": (8.2, 6.2, 9.2, 7.2), "valve": (2.6, 3.0, 5.6, 4.2),
@@ -44,11 +44,11 @@ LETTERS: Final = {
     "cap sensor": "p", "rod sensor": "p", "piston sensor": "s", "spool sensor": "u",
     "position sensor": "q", "drive sensor": "i", "supply sensor": "p",
 }  # fmt: skip
-OF_BENCH: Final = ("base", "load", "supply", "tank")  # elements that there is one of
+OF_BENCH: Final = ("base", "load", "supply", "tank")  # elements of the bench
 
 
 def elements(rig: Rig) -> dict[str, Box]:
-    """Return every element of the drawing that can be marked: name, with the joint's number."""
+    """Return the name of every element that can be marked, with the joint's number."""
     table = ELECTRIC if rig.electric else HYDRAULIC
     out = {
         f"{name} {i + 1}": (left + WIDTH * i, bottom, right + WIDTH * i, top)
@@ -65,7 +65,10 @@ def elements(rig: Rig) -> dict[str, Box]:
 
 
 def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) -> tuple[str, ...]:
-    """Return the elements at which an effect acts; `parameters` tell which sensor it means."""
+    """Return the elements at which an effect acts.
+
+    `parameters`, by name, tell which sensor a sensor effect acts on.
+    """
     kind = known().get(name)
     element = kind.element if kind is not None and issubclass(kind, Effect) else "joint"
     if element in OF_BENCH:
@@ -84,7 +87,7 @@ def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) ->
 def _sensors(
     rig: Rig, kind: type[Any], where: str, joints: Sequence[str], words: str
 ) -> tuple[str, ...]:
-    """Return the sensors that an effect of sensors can mean at a place, or those of `words`."""
+    """Return the sensors of a place that a sensor effect can act on, or those of `words`."""
     stated = [
         side for side in ("supply", *CHAMBERS, "piston", "spool", "pressure") if side in words
     ]
@@ -104,7 +107,7 @@ def places(result: Trace) -> Markup | None:
 
 
 def lines_of(result: Trace) -> list[Line]:
-    """Return what is marked: the effects, then what the records cannot tell from them."""
+    """Return the effects to mark, then those that the records cannot separate from them."""
     return [(e.name, e.at or e.where, tuple(e.parameters), MODEL) for e in result.effects] + [
         (name, where, (), ORANGE) for name, where in result.tied_at
     ]
@@ -233,7 +236,7 @@ def _rest(axes: Any, rig: Rig, boxes: dict[str, Box]) -> None:
 
 
 def _mark(axes: Any, box: Box, number: int, colour: str, before: int, element: str) -> None:
-    """Ring an element and put the number at its corner, beside those that stand there."""
+    """Outline an element and put the number at its corner, next to earlier numbers."""
     pad = 0.18 + 0.12 * before
     axes.add_patch(
         FancyBboxPatch(

@@ -1,4 +1,4 @@
-"""Figures of records: what was put in (time and lines) and what the regression left."""
+"""Figures of records: excitation (time and lines) and residual of the regression."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LineSpectrum:
-    """Amplitudes [V] at multiples of 1/period: frequency [Hz], amplitude, which were excited."""
+    """Amplitudes [V] at multiples of 1/period: frequency [Hz], amplitude, whether excited."""
 
     frequency: Array
     amplitude: Array
@@ -66,7 +66,7 @@ def line_spectrum(record: Record, x: Array) -> LineSpectrum | None:
 
 
 def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
-    """Draw command and spool of one joint in time, and the lines they hold."""
+    """Draw command and spool of one joint over time, and their lines."""
     gain = rig.joints[joint - 1].valve.spool_gain
     spool = bridged(np.asarray(record.channels[ch.channel(ch.SPOOL, joint)]))
     command = record.channels.get(ch.channel(ch.COMMAND, joint))
@@ -117,7 +117,7 @@ def _spectrum(axes: Any, record: Record, spool: Array) -> None:
     if lines is None:
         _unknown_lines(axes, record, spool)
         return
-    # A line that is exactly empty would stretch the axis to nothing.
+    # An amplitude of exactly zero would have no place on the logarithmic axis.
     amplitude = 1e3 * np.maximum(lines.amplitude, 1e-7 * lines.amplitude.max() + 1e-12)
     floor = amplitude.min() / 3
     kinds = (

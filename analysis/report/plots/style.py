@@ -1,7 +1,7 @@
-"""What all figures share: palette, type, thinning of traces, and clean inline SVG.
+"""Common parts of all figures: palette, fonts, thinning of traces, inline SVG.
 
-Figures carry no text of a user's (names stand in the page, escaped), no date, no reference to
-anything outside, and the same input gives the same bytes.
+Figures contain no text of a user's (names are in the page, escaped), no date, no reference to
+anything outside, and equal input results in equal bytes.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from analysis.report.settings import REPORT
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's palette, told apart by every common kind of colour vision; the model is a
-# vermillion somewhat brighter, near the paper's red and apart from black for all.
+# Okabe and Ito's palette, distinguishable with every common kind of colour vision; the model is a
+# brighter vermillion, near the paper's red and distinct from black.
 INK: Final = "#1c1f23"
 MODEL: Final = "#f0512c"
 BLUE: Final = "#0072b2"
@@ -37,7 +37,7 @@ GREY: Final = "#8a9099"
 PALE: Final = "#d5d9de"
 JOINT_COLOURS: Final = (BLUE, GREEN, ORANGE, "#cc79a7", SKY)
 
-CARD: Final = 4.6  # [in] width of a figure that stands two abreast on a desk, alone on a phone
+CARD: Final = 4.6  # [in] width of a figure: two side by side on a desktop, one on a phone
 
 _STYLE: Final[dict[str, Any]] = {
     "svg.fonttype": "none",
@@ -81,22 +81,22 @@ _STYLE: Final[dict[str, Any]] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Hold the figures' style for a block; what the caller had set returns afterwards."""
+    """Apply the figures' style within a block and restore the caller's afterwards."""
     with mpl.rc_context(_STYLE):
         yield
 
 
 def figure(height: float, width: float = CARD) -> Figure:
-    """Return an empty figure of the given size [in] that no global list knows."""
+    """Return an empty figure of the given size [in], not registered with pyplot."""
     canvas = Figure(figsize=(width, height))
     FigureCanvasSVG(canvas)
     return canvas
 
 
 def thin(x: Array, y: Array, points: int = REPORT.line_points) -> tuple[Array, Array]:
-    """Return at most about `points` of the trace (n,), (n,): each stretch's lowest and highest.
+    """Return at most about `points` of the trace (n,), (n,): minimum and maximum of each stretch.
 
-    Keeping both extremes in their order shows spikes and noise that a stride would lose.
+    Keeping both extremes in order shows spikes and noise that decimation would lose.
     """
     n = len(y)
     if n <= points:
@@ -120,7 +120,7 @@ _FONT = re.compile(r"font:\s*(?:(\d+)\s+)?([\d.]+)px '[^;\"]*'")
 
 
 def svg(canvas: Figure, key: str, label: str) -> Markup:
-    """Return the figure as an inline <svg>: `key` keeps its ids apart, `label` is read aloud."""
+    """Return the figure as inline <svg>: `key` makes ids unique, `label` is for screen readers."""
     buffer = io.StringIO()
     canvas.savefig(
         buffer, format="svg",
@@ -161,13 +161,13 @@ def gapped(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def plain_log(axis: Any) -> None:
-    """Mark the decades of a logarithmic axis with plain numbers; minor ticks cost half a figure."""
+    """Mark the decades of a logarithmic axis with plain numbers, without slow minor ticks."""
     axis.set_major_formatter(lambda v, _: f"{v:g}")
     axis.set_minor_locator(NullLocator())
 
 
 def note(axes: Any, x: float, y: float, text: str, colour: str = INK, **more: Any) -> None:
-    """Write a direct label at axes fractions, on a white ground so that lines do not cross it."""
+    """Write a label at axes fractions, on a white background over the lines."""
     more = {"ha": "right", "va": "top", "fontsize": 7.0} | more
     axes.text(
         x, y, text, color=colour, transform=axes.transAxes,

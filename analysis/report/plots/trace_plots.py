@@ -1,6 +1,6 @@
-"""The trace's pictures: residual before and after against what it moves with, in time, in figures.
+"""The trace's figures: residual before and after, against a variable and in time.
 
-All of held-out records. Grey is before, blue after; the pale band is the noise (± one rms).
+All are of held-out records. Grey is before, blue after; the pale band is the noise (± one rms).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def abscissae(
     equation: str,
     model: Model,
 ) -> Array:
-    """Return what one equation's residuals are drawn against: the effect's own variable or one."""
+    """Return the variable that an equation's residuals are plotted against, or the effect's."""
     joint = int(equation.rsplit("_", 1)[1]) - 1
     out = []
     for line in lines:
@@ -120,7 +120,7 @@ def against(
     key: str,
     after: bool,
 ) -> Markup:
-    """Draw the residual over a variable, before beside after on one scale, with binned means."""
+    """Draw the residual over a variable, before next to after on one scale, with binned means."""
     parts = [("before", np.concatenate([line.before for line in lines]))]
     if after:
         parts.append(("after", np.concatenate([line.after for line in lines])))
@@ -147,7 +147,7 @@ def against(
 
 
 def curves(effect: JudgedEffect, key: str) -> Markup:
-    """Draw the curves of an effect whose form the data draw, each with its band."""
+    """Draw the curves of a free form, each with its band."""
     with style():
         canvas = figure(2.4, CARD * 2)
         axes = canvas.add_subplot()
@@ -163,9 +163,9 @@ def curves(effect: JudgedEffect, key: str) -> Markup:
 
 
 def instead(effect: JudgedEffect, key: str) -> Markup | None:
-    """Draw what held-out records keep without an effect, with it, and with each rival instead.
+    """Draw the held-out error without an effect, with it, and with each rival in its place.
 
-    Sorted by what is left, each with the reason why it is named or not. None where nobody knows.
+    Sorted by error, each with the reason why it is named or not. None where errors are unknown.
     """
     if not (np.isfinite(effect.left_without) and np.isfinite(effect.left_with)):
         return None
@@ -211,7 +211,7 @@ def _called(name: str, where: str) -> str:
 
 
 def _verdict(effect: JudgedEffect) -> str:
-    """Say that an effect is named, or by which gates it is not."""
+    """Return that an effect is named, or the gates that it failed."""
     failed = [f"{g.name}: {g.detail}" for g in effect.gates if not g.ok]
     return f"not named ({'; '.join(failed)})".replace("_", " ") if failed else "named"
 
@@ -260,11 +260,11 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.axvline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xscale("log")
         low, high = axes.get_xlim()
-        # Less than an octave leaves no ticks to read, and noise would look like a difference.
+        # Less than an octave has no ticks, and noise would look like a difference.
         low, high = min(low, 0.8), max(high, 2.5)
         axes.set_xlim(low, high)
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
-        # Within one decade the ticks between are all there is.
+        # Within one decade there are minor ticks only.
         axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))
         axes.set_ylim(-0.6, len(names) - 0.4)
@@ -274,7 +274,7 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
 
 
 def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
-    """Draw the lines of a residual by kind, before beside after, over the noise of one repeat."""
+    """Draw the lines of a residual by kind, before next to after, and the noise of one repeat."""
     of = lines_by_kind(shown.excited)
     kinds = (
         ("excited", of[EXCITED], "o", INK, 4.0),
@@ -335,7 +335,7 @@ def unit_of_variable(rig: Rig, name: str) -> str:
 def equation_of(
     effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[ResidualSeries]]
 ) -> str:
-    """Return the equation whose residual shows an effect best: most over its noise before."""
+    """Return the equation with the largest ratio of residual to noise before an effect is added."""
     conditioned = next(iter(lines.values()))[0].conditioned
     own = [e for e in effect.abscissa(rig, conditioned.signals) if e in lines]
     if not own:

@@ -49,7 +49,7 @@ TARGETS = (LINUX, WINDOWS)
 
 
 class CompilationError(Exception):
-    """A library could not be compiled; says for which target and what the compiler printed."""
+    """A library could not be compiled; names the target and holds the compiler's output."""
 
 
 def compiler_missing() -> bool:
@@ -68,10 +68,9 @@ def write_fmus(
     """Write NAME-fmi2.fmu and NAME-fmi3.fmu of an identified model; return the files.
 
     Each holds a library for every target and the C sources; no Python is needed where it runs.
-    `about` says in a line what the model was identified from; `progress` is called with a line
-    before each library is compiled. Raises InputError where a parameter
-    is not identified or a term has no translation into C, CompilationError where the compiler
-    fails.
+    `about` states in a line what the model was identified from; `progress` is called with a line
+    before each library is compiled. Raises InputError where a parameter is not identified or a term
+    has no translation into C, CompilationError where the compiler fails.
     """
     identifier = re.sub(r"\W", "_", name, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"

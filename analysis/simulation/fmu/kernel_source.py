@@ -1,9 +1,9 @@
 """Translate terms' kernels, numba functions on scalars and arrays, into C.
 
-The translation covers what kernels are written in: numbers, arrays indexed by element, loops over
+The translation covers the language of kernels: numbers, arrays indexed by element, loops over
 `range`, branches, tuples returned or assigned, calls of `math` functions and of other compiled
 functions, which are translated for the kinds of their arguments. Anything else is refused by name,
-so that a kernel is never translated to something that it does not say.
+so that no kernel is translated wrongly.
 
 Kinds of values: `int`, `double`, a vector (`double *`), a matrix (`double *` with the number of
 joints `N` as its row length), a tuple of numbers (a C struct).
@@ -39,12 +39,12 @@ _COMPARE: Final = {
 
 
 class UntranslatableKernelError(Exception):
-    """A kernel uses something that has no translation into C; says what and in which function."""
+    """A kernel has a construct without translation into C; names it and the function."""
 
 
 @dataclass(frozen=True)
 class CValue:
-    """A C expression and the kind of what it evaluates to; `size` is a tuple's length."""
+    """A C expression and the kind of its value; `size` is a tuple's length."""
 
     text: str
     kind: str
@@ -312,7 +312,7 @@ class _Translation:
         if array.kind == MATRIX and isinstance(node.slice, ast.Tuple):
             row, column = (self._value(index).text for index in node.slice.elts)
             return CValue(f"{array.text}[({row}) * N + ({column})]", DOUBLE)
-        raise self._refusal(node, "an element of what is no array")
+        raise self._refusal(node, "an element of something that is no array")
 
     def _binary(self, operator: ast.operator, left: CValue, right: CValue, node: ast.AST) -> CValue:
         if isinstance(operator, ast.Pow):

@@ -68,7 +68,7 @@ def conditioned_records(
     families: tuple[str, ...] = tuple(FAMILIES),
 ) -> list[ConditionedRecord]:
     """Condition every record of the runs; raises InputError for a record that cannot be used."""
-    ck.refuse_dead_records(rig, runs)
+    ck.refuse_constant_records(rig, runs)
     return condition_runs(rig, runs, filtering, families)
 
 

@@ -195,7 +195,9 @@ def stated_noise(
 ) -> dict[str, float]:
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
-    again = model_rows(rig, terms, conditioned.again(rig, disturbed(rig, conditioned.record, rng)))
+    again = model_rows(
+        rig, terms, conditioned.condition_alike(rig, disturbed(rig, conditioned.record, rng))
+    )
     out = {}
     for name, before in rows.items():
         a, b = in_common(before, again[name])

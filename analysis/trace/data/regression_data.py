@@ -134,7 +134,7 @@ def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecor
         name: np.mean([np.asarray(s.record.channels[name])[:n] for s in repeats], axis=0)
         for name in names
     }
-    average = first.again(rig, replace(first.record, channels=channels))
+    average = first.condition_alike(rig, replace(first.record, channels=channels))
     valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
     weights = [s.signals.weight[:n] for s in repeats if s.signals.weight is not None]
     signals = replace(

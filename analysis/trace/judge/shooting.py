@@ -19,8 +19,8 @@ from analysis.identify.output_error.hidden_states import (
     Shot,
     completed,
     hidden_effects,
-    rest_of,
     shot,
+    window_error,
 )
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
@@ -68,7 +68,7 @@ def shoot_hidden_states(
             continue
         other = _with_shapes_of(after.rig, after.terms, effect, shot_effect)
         before, now = (
-            rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
+            window_error(holdout, model, effect) for model in (after, replace(after, terms=other))
         )
         fitted = fit_coefficients(
             train_data, _with_shapes_of(after.rig, winner.fit.terms, effect, shot_effect)

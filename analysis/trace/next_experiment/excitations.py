@@ -201,7 +201,7 @@ def _step(
         biases={},
         samples=period,
         repeats=EXPERIMENT.repeats,
-        gives=dict.fromkeys(setting.closed, EXPERIMENT.closed_travel),
+        yields=dict.fromkeys(setting.closed, EXPERIMENT.closed_travel),
         offsets=dict.fromkeys(tones, EXPERIMENT.centring_offset),
         loops=dict.fromkeys(tones, EXPERIMENT.position_gain),
     )

@@ -1,1 +1,1 @@
-"""The simulated bench on a CAN bus: its side of the messages, and the adapters to the bus."""
+"""The simulated bench on a CAN bus: its side of the messages, and adapters to the bus."""

@@ -1,8 +1,8 @@
-"""How programs reach the simulated bus: adapters whose other end python-can has the client of.
+"""Adapters through which programs reach the simulated bus, with clients in python-can.
 
-`SocketcandServer` speaks socketcand's text over TCP, to any number of programs, which also hear
-each other, as nodes of one bus do. `SlcanLine` is an adapter with the LAWICEL text protocol on a
-pseudo terminal, CAN FD by the letters of the CANable 2.0.
+`SocketcandServer` speaks socketcand's text over TCP, to any number of programs, which also receive
+each other's frames, as nodes of one bus do. `SlcanLine` is an adapter with the LAWICEL text
+protocol on a pseudo terminal, CAN FD by the letters of the CANable 2.0.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ logger = logging.getLogger(__name__)
 
 CHANNEL: Final = "can0"  # the bus's name behind socketcand
 _CHUNK = 65_536
-_MOST_UNSENT = 1 << 20  # [bytes] for a program that does not read; then frames are lost to it
-_MOST_PARTIAL = 256  # [bytes] of a text that does not end
+_MOST_UNSENT = 1 << 20  # [bytes] buffered for a program that does not read; further frames are lost
+_MOST_PARTIAL = 256  # [bytes] of a text without an end
 _CLASSIC_RATES = {
     b"S0": 10_000,
     b"S1": 20_000,
@@ -40,22 +40,22 @@ _CLASSIC_RATES = {
 
 
 class Adapter(Protocol):
-    """The bench's way to the bus."""
+    """The bench's connection to the bus."""
 
     @property
     def endpoint(self) -> str:
-        """Where a program reaches the bus: ``can://...``."""
+        """The endpoint for programs: ``can://...``."""
 
     @property
     def free(self) -> bool:
-        """Whether a program listens and what was sent so far has left."""
+        """Whether a program listens and everything has been sent."""
 
     @property
     def attended(self) -> bool:
         """Whether a program has the bus open."""
 
     def receive(self, patience: float) -> list[CanFrame]:
-        """Return the frames that have come within `patience` [s], at once if there are any."""
+        """Return the frames that arrive within `patience` [s], at once if there are any."""
 
     def send(self, frames: list[CanFrame]) -> None:
         """Send frames in their order."""
@@ -74,7 +74,7 @@ class _Client:
         self._partial = b""
 
     def lines(self) -> list[bytes] | None:
-        """Return the texts between < and > that have come; None when the program has gone."""
+        """Return the texts between < and > that have arrived; None after a disconnection."""
         try:
             data = self.end.recv(_CHUNK)
         except BlockingIOError:
@@ -89,7 +89,7 @@ class _Client:
         return [line.partition(b"<")[2].strip() for line in ended]
 
     def say(self, data: bytes) -> None:
-        """Send, or keep for later what there is no room for."""
+        """Send, or buffer what cannot be sent now."""
         if len(self.unsent) < _MOST_UNSENT:
             self.unsent += data
         with suppress(BlockingIOError):
@@ -148,7 +148,7 @@ class SocketcandServer:
                     self._say(client, text)
 
     def close(self) -> None:
-        """End the server; programs see their connection end."""
+        """Close the server and its connections."""
         for client in self._clients:
             client.end.close()
         self._listener.close()
@@ -218,7 +218,7 @@ class SlcanLine:
 
     @property
     def free(self) -> bool:
-        """Whether a program has the bus open and everything sent is on its way."""
+        """Whether a program has the bus open and everything has been sent."""
         return self._on_bus and self._line.free
 
     @property
@@ -228,7 +228,7 @@ class SlcanLine:
 
     @property
     def _on_bus(self) -> bool:
-        # At another rate an adapter receives and causes errors only.
+        # At another rate an adapter only receives and causes errors.
         return self._opened and self._rate == self._bitrate
 
     def receive(self, patience: float) -> list[CanFrame]:
@@ -249,7 +249,7 @@ class SlcanLine:
             self._line.send(b"".join(map(_slcan_text, frames)))
 
     def close(self) -> None:
-        """Take the terminal away."""
+        """Remove the terminal."""
         self._line.close()
 
     def _executed(self, line: bytes) -> CanFrame | None:

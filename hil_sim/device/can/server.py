@@ -1,6 +1,6 @@
-"""The simulated bench on a CAN bus: a `Device` behind an adapter, until told to end.
+"""The simulated bench on a CAN bus: a `Device` behind an adapter, until a signal.
 
-A node of a bus does not see a program end; its watchdog is what zeroes the outputs then.
+A node of a bus cannot detect the end of a program; its watchdog zeroes the outputs then.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 def layout_of(rig: Rig, *, fd: bool = False) -> CanLayout:
-    """Return the messages of the DBC file that is made for a rig without one."""
+    """Return the messages of the default DBC file of a rig."""
     return read_layout(database_text(rig, fd=fd), f"the DBC made for {rig.name}", rig)
 
 
@@ -61,7 +61,7 @@ def run_device(
 ) -> None:
     """Serve a device until `ended` is not empty, or process `parent` has ended.
 
-    Whoever else has the device takes `lock`, which is held here but while waiting for frames.
+    `lock` is held except while waiting for frames, for other users of the device.
     """
     lock = lock or nullcontext()
     session = CanSession(device, layout)

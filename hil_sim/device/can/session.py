@@ -15,7 +15,7 @@ from rig.model.wire.can_layout import EXTENDED, CanLayout
 
 
 class CanSession:
-    """A `MessageSession` behind the frames of a bus; frames of other identifiers mean nothing."""
+    """A `MessageSession` with frames of a bus; frames with other identifiers are ignored."""
 
     def __init__(self, device: Device, layout: CanLayout) -> None:
         self._device, self._layout = device, layout
@@ -23,7 +23,7 @@ class CanSession:
         self._requests = PartCollector()
 
     def receive(self, frame: CanFrame) -> list[CanFrame]:
-        """Carry out what a frame completes; returns the frames of the answer."""
+        """Execute the message that a frame completes; return the frames of the answer."""
         key = frame.identifier | (EXTENDED if frame.extended else 0)
         if key == self._layout.zero.key:
             self._device.zero()
@@ -40,6 +40,6 @@ class CanSession:
         return []
 
     def push(self) -> list[CanFrame]:
-        """Return the frames of the next block that may be sent, none if none may."""
+        """Return the frames of the next block if it may be sent, else none."""
         block = self._session.push()
         return [] if block is None else block_frames(self._layout, self._device.layout, block)

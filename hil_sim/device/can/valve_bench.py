@@ -1,8 +1,7 @@
 """Simulated valves of CiA 408 on one bus: a node for each joint, in real time.
 
-A node puts out what its set point says in state ACTIVE and zero in every other. Without the
-heartbeat of its host for the time in object 0x1016 it goes to FAULT_DISABLED, and stays there until
-a reset.
+A node puts out its set point in state ACTIVE and zero in every other. Without the heartbeat of its
+host for the time in object 0x1016 it goes to FAULT_DISABLED, and stays there until a reset.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from rig.model.wire.codes import decode_input
 logger = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.01
-_MOST_SECONDS = 4.0  # that are caught up at once: a machine that slept goes on from there
+_MOST_SECONDS = 4.0  # simulated at once at most; after a longer pause the clock skips the rest
 
 
 class AdapterNetwork(canopen.Network):
@@ -46,7 +45,7 @@ class AdapterNetwork(canopen.Network):
 
 
 class ValveNode:
-    """One valve: its object dictionary, state and watch on the host's heartbeat."""
+    """One valve: its object dictionary, state and supervision of the host's heartbeat."""
 
     def __init__(self, network: canopen.Network, number: int, clock: Callable[[], float]) -> None:
         eds: Any = io.StringIO(cia408.shipped_eds())
@@ -55,7 +54,7 @@ class ValveNode:
         self._word = 0
         self._clock = clock
         self._heartbeat: float | None = None
-        # The library's types leave open what a variable holds; here every one is a whole number.
+        # Every variable here is an integer, which the library's types do not state.
         self.node: Any = canopen.LocalNode(number, eds)
         node: Any = self.node
         network.add_node(node)
@@ -68,19 +67,19 @@ class ValveNode:
 
     @property
     def set_point(self) -> float:
-        """What acts of the set point [1]; 0 in every state but ACTIVE."""
+        """The effective set point [1]; 0 in every state but ACTIVE."""
         if self.state != ValveState.ACTIVE or self.node.nmt.state != "OPERATIONAL":
             return 0.0
         value = self.node.rpdo[1][1].raw / cia408.FULL_SCALE
         return float(np.clip(value, -1.0, 1.0))
 
     def heartbeat(self, producer: int) -> None:
-        """Note a sign of life of node `producer`."""
+        """Note a heartbeat of node `producer`."""
         if producer == self._consumed()[0]:
             self._heartbeat = self._clock()
 
     def watch(self) -> bool:
-        """Go to FAULT_DISABLED where the host has been silent too long; returns whether it did."""
+        """Go to FAULT_DISABLED if the host's heartbeat is overdue; return whether it did."""
         allowed = self._consumed()[1]
         if self._heartbeat is None or not allowed or self._clock() - self._heartbeat <= allowed:
             return False
@@ -112,7 +111,7 @@ class ValveNode:
         if index == cia408.CONTROL_WORD:
             self._follow(int.from_bytes(data, "little"))
         elif index == cia408.CONSUMER_HEARTBEAT:
-            self._heartbeat = None  # CiA 301: the watch begins with the first heartbeat after that
+            self._heartbeat = None  # CiA 301: supervision begins with the next heartbeat
 
     def _follow(self, word: int) -> None:
         self.state = cia408.next_state(self.state, self._word, word)
@@ -120,7 +119,7 @@ class ValveNode:
 
 
 class ValveBench:
-    """All valves of a rig and the plant behind them; `volts` are what the valves put out."""
+    """All valves of a rig with the plant; `volts` are the valves' outputs."""
 
     def __init__(
         self,
@@ -143,7 +142,7 @@ class ValveBench:
         return [valve.set_point * joint.valve.command_range for valve, joint in pairs]
 
     def poll(self, patience: float) -> None:
-        """Take in frames for `patience` [s] at most, run the plant, watch the heartbeat."""
+        """Receive frames for `patience` [s] at most, run the plant, supervise the heartbeat."""
         for frame in self._adapter.receive(patience):
             self._catch_up()
             if frame.identifier == cia408.SYNC_ID:

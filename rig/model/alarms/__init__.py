@@ -1,1 +1,1 @@
-"""Alarms: the bands a rig file sets, and the states an alarm goes through."""
+"""Alarms: the bands of a rig file, and the states of an alarm."""

@@ -1,4 +1,4 @@
-"""The section `alarms` of a rig file: warning and trip bands per channel, what each check does.
+"""The section `alarms` of a rig file: warning and trip bands per channel, action of each check.
 
 Glossary: a *band* is the allowed range of a channel; a *warning* is reported and recorded, a *trip*
 zeroes the outputs and latches; the *dead band* is how far a value must be back inside before a
@@ -23,9 +23,9 @@ _OPEN = (-math.inf, math.inf)
 
 
 class AlarmBand(Part):
-    """Bands of one channel, in the channel's SI unit; what is not given keeps its default.
+    """Bands of one channel, in the channel's SI unit; omitted values keep their defaults.
 
-    An end of a band may be null: then that side is not watched.
+    An end of a band may be null: that side is then not monitored.
     """
 
     warning: tuple[float | None, float | None] | None = None
@@ -49,7 +49,7 @@ class AlarmBand(Part):
 
 
 class CheckActions(Part):
-    """What each plausibility check does when it finds something."""
+    """The action of each plausibility check."""
 
     frozen_sensor: Action = "trip"
     spool_not_following: Action = "trip"
@@ -64,7 +64,7 @@ class CheckActions(Part):
 
 
 class Alarms(Part):
-    """The section `alarms`: `warning_share` of each limit warns, where no band is given."""
+    """The section `alarms`; `warning_share` of each limit is the warning level without a band."""
 
     warning_share: float = Field(default=0.9, gt=0.5, le=1.0)
     channels: dict[str, AlarmBand] = Field(default_factory=dict)
@@ -73,7 +73,7 @@ class Alarms(Part):
     @field_validator("channels", mode="before")
     @classmethod
     def _units(cls, value: Any, info: ValidationInfo) -> Any:
-        """Read the ends of bands in their channel's unit, as only the channel's name says it."""
+        """Read the ends of bands in their channel's unit, which follows from the channel's name."""
         if not isinstance(value, dict) or not info.context:
             return value
         return {name: _in_si(name, band) for name, band in value.items()}
@@ -94,16 +94,16 @@ def _in_si(name: Any, band: Any) -> Any:
 
 
 def ends(band: tuple[float | None, float | None] | None) -> Range:
-    """Return the ends of a band; infinite where it is open, or not given."""
+    """Return the ends of a band; infinite where it is open or omitted."""
     low, high = band or (None, None)
     return -math.inf if low is None else low, math.inf if high is None else high
 
 
-def refuse_unseen(
+def refuse_unreachable(
     alarms: Alarms, recorded: tuple[str, ...], seen: Callable[[str], Range],
     limits: Mapping[str, Range],
 ) -> None:  # fmt: skip
-    """Raise ValueError, naming the key, for a band that cannot do what it says.
+    """Raise ValueError, naming the key, for a band that can never take effect.
 
     Each end must lie where its channel can read (`seen`), a trip band within the channel's
     `limits`, a warning band within the trip band.
@@ -128,5 +128,5 @@ def _inside(
         if end is not None and not outer[0] <= end <= outer[1]:
             raise ValueError(
                 f"{key}: {end:g} is outside {what} {outer[0]:g} to {outer[1]:g}; no sample "
-                "between them could be judged by it"
+                "can reach it"
             )

@@ -1,11 +1,11 @@
-"""Alarms as an operator meets them: states, first cause and consequences; data and functions.
+"""Alarms in operation: states, first cause and consequences; data and functions.
 
 The states are those of ISA-18.2 (2016, 5.6): an alarm is *active* until somebody acknowledges it
 (*acknowledged*) or the value comes back (*returned*); both together make it *normal* again, and it
-leaves the table. A trip is *latched*: it stays, whatever the value does, until it is reset with a
-reason, and it can be reset only after it was acknowledged. Acknowledging says "I have seen it";
-resetting says "its cause is removed". An alarm that begins while an earlier one of the same joint
-(or of the bench) stands is folded under it as a consequence.
+leaves the table. A trip is *latched*: it stays until it is reset with a reason, and it can be reset
+only after it was acknowledged. Acknowledging means "I have seen it"; resetting means "its cause is
+removed". An alarm that begins while an earlier one of the same joint (or of the bench) is in the
+table is shown under it as a consequence.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLD: Final = 5.0  # [s] after a first cause within which related alarms are its
 
 
 class AlarmState(StrEnum):
-    """Where an alarm is between its beginning and its end."""
+    """State of an alarm between its beginning and its end."""
 
     NORMAL = "normal"
     ACTIVE = "active"
@@ -29,11 +29,12 @@ class AlarmState(StrEnum):
 
 @dataclass(frozen=True)
 class Alarm:
-    """One alarm in SI: which check, where, how much, since when, what to do.
+    """One alarm in SI: check, place, value, start, remedy.
 
-    `joint` is 1-based, None for the bench; `limit` is what was allowed; `time` [s] is the device's
-    at the first offending sample `tick`; `value` is that sample's; `cause` is the key of the alarm
-    that it follows from, empty for a first cause; `count` says how often it came while it stood.
+    `joint` is 1-based, None for the bench; `limit` is the allowed range; `time` [s] is the device's
+    at the first offending sample `tick`, `value` that sample's; `cause` is the key of the alarm
+    that it follows from, empty for a first cause; `count` is the number of its occurrences while in
+    the table.
     """
 
     check: str
@@ -54,19 +55,19 @@ class Alarm:
 
     @property
     def key(self) -> str:
-        """What makes two occurrences the same alarm: its check and its channel or joint."""
+        """Identity of an alarm over its occurrences: its check and its channel or joint."""
         place = self.channel or (f"joint {self.joint}" if self.joint else "bench")
         return f"{self.check}: {place}"
 
 
 @dataclass(frozen=True)
 class AlarmTable:
-    """The alarms that stand, in the order in which they began."""
+    """The present alarms, in the order in which they began."""
 
     alarms: tuple[Alarm, ...] = field(default=())
 
     def get(self, key: str) -> Alarm | None:
-        """Return the standing alarm of a key."""
+        """Return the alarm of a key, None if it is not in the table."""
         return next((alarm for alarm in self.alarms if alarm.key == key), None)
 
     @property
@@ -78,7 +79,7 @@ class AlarmTable:
 def _put(table: AlarmTable, alarm: Alarm) -> AlarmTable:
     """Replace the alarm of the same key; one that is normal leaves the table.
 
-    Its consequences then stand for themselves: when it comes again it is no longer their cause.
+    Its consequences then become first causes: a later occurrence is no longer their cause.
     """
     if alarm.state is not AlarmState.NORMAL:
         return AlarmTable(tuple(alarm if old.key == alarm.key else old for old in table.alarms))
@@ -89,7 +90,7 @@ def _put(table: AlarmTable, alarm: Alarm) -> AlarmTable:
 
 
 def related(alarm: Alarm, other: Alarm) -> bool:
-    """Say whether two alarms can have to do with each other: one joint, or one of the bench."""
+    """Return whether two alarms may be related: of one joint, or one of them of the bench."""
     return alarm.joint is None or other.joint is None or alarm.joint == other.joint
 
 
@@ -102,10 +103,10 @@ def _first_cause(table: AlarmTable, alarm: Alarm) -> str:
 
 
 def raised(table: AlarmTable, alarm: Alarm) -> AlarmTable:
-    """Return the table with an alarm that has begun, or has come again.
+    """Return the table with an alarm that has begun or recurred.
 
-    One that comes again is active anew: an earlier acknowledgement no longer holds, unless it
-    still stands. A trip takes the place of the warning of its own key.
+    A recurring alarm is active again and needs a new acknowledgement, unless it was still present.
+    A trip replaces the warning of its key.
     """
     state = AlarmState.LATCHED if alarm.trips else AlarmState.ACTIVE
     old = table.get(alarm.key)
@@ -122,7 +123,7 @@ def raised(table: AlarmTable, alarm: Alarm) -> AlarmTable:
 
 
 def returned(table: AlarmTable, key: str) -> AlarmTable:
-    """Return the table after the value of an alarm has come back; a latched one stays."""
+    """Return the table after the value of an alarm has come back; a latched alarm stays."""
     old = table.get(key)
     if old is None or old.state not in (AlarmState.ACTIVE, AlarmState.ACKNOWLEDGED):
         return table
@@ -138,15 +139,15 @@ _AFTER_ACKNOWLEDGING: Final = {
 
 
 def acknowledged(table: AlarmTable, key: str | None = None) -> AlarmTable:
-    """Return the table after a person has seen an alarm, or all of them (None).
+    """Return the table after a person has acknowledged an alarm, or all of them (None).
 
-    Raises KeyError for an alarm that does not stand.
+    Raises KeyError for an alarm that is not in the table.
     """
     keys = [alarm.key for alarm in table.alarms] if key is None else [key]
     for alarm_key in keys:
         old = table.get(alarm_key)
         if old is None:
-            raise KeyError(f"no alarm {alarm_key!r} stands")
+            raise KeyError(f"there is no alarm {alarm_key!r}")
         state = _AFTER_ACKNOWLEDGING.get(old.state, old.state)
         table = _put(table, replace(old, state=state, acknowledged=True))
     return table
@@ -155,8 +156,8 @@ def acknowledged(table: AlarmTable, key: str | None = None) -> AlarmTable:
 def folded(table: AlarmTable) -> tuple[tuple[Alarm, tuple[Alarm, ...]], ...]:
     """Return (first cause, its consequences) in the order of urgency.
 
-    Above: what nobody has acknowledged, then what trips (or whose consequence does), then what is
-    older. A consequence whose first cause is not in the table stands for itself.
+    First unacknowledged alarms, then those that trip (or whose consequence does), then older ones.
+    A consequence whose first cause is not in the table is listed as a first cause.
     """
     standing = {alarm.key for alarm in table.alarms}
     groups = [

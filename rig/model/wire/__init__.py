@@ -1,1 +1,1 @@
-"""What both ends of a serial line or a CAN bus must agree on: frames and messages."""
+"""Definitions shared by both ends of a serial line or a CAN bus: frames and messages."""

@@ -1,4 +1,4 @@
-"""The DBC file of a rig that has none of its own: classic CAN, or CAN FD.
+"""The default DBC file of a rig: classic CAN, or CAN FD.
 
 A signal has the name of its channel and converts to its SI unit, 16 bits each, low byte first.
 """
@@ -19,7 +19,7 @@ HOST: Final = "host"
 BENCH: Final = "bench"
 FD_BYTES: Final = 64
 
-# Lower identifiers win the bus: zero and signs of life, requests, then samples.
+# Lower identifiers have priority: zero and heartbeats, requests, then samples.
 ZERO_ID: Final = 0x080
 ALIVE_ID: Final = 0x090
 REQUEST_ID: Final = 0x0A0
@@ -44,7 +44,7 @@ def database_text(rig: Rig, *, fd: bool = False) -> str:
         _message("bench_check", CHECK_ID, names.CHECK, BENCH, note="The block has ended."),
     ]
     database = Database(messages, [Node(HOST, None), Node(BENCH, None)], version="")
-    # Carriage returns are what the library writes; every reader takes lines without.
+    # The library writes carriage returns; readers accept lines without.
     return database.as_dbc_string().replace("\r\n", "\n")
 
 

@@ -1,9 +1,9 @@
 """Messages of a bench as frames on a CAN bus, and frames as messages (docs/wire-can.md).
 
-Glossary: requests and answers go in *parts*, a number in each frame's first byte and the next bytes
-of the message behind it; a sign of life is one frame; a block is a *sync* frame, its rows, and a
-*check* frame with the CRC-32 that the same block would have as a message, so that no frame of it
-can be lost, repeated, exchanged or of another stream unnoticed.
+Glossary: requests and answers are sent in *parts*, a number in each frame's first byte and the next
+bytes of the message behind it; a sign of life is one frame; a block is a *sync* frame, its rows,
+and a *check* frame with the CRC-32 that the same block would have as a message, so that a lost,
+repeated, exchanged or foreign frame is detected.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rig.model.wire.frames import MAX_BODY, WireFrame, decode_body, encode_body
 from rig.model.wire.registers import BlockHeader, BlockLayout, Status
 from rig.model.wire.serial_messages import Message
 
-ZERO_KEY: Final = 0x5A  # the same from every host: two may send it at once and disturb nothing
+ZERO_KEY: Final = 0x5A  # equal from every host, so that two may send it at once
 SESSION_MASK: Final = (1 << SESSION_BITS) - 1
 _LENGTH: Final = struct.Struct(">H")
 _CHECK: Final = struct.Struct(">I")
@@ -52,23 +52,23 @@ def frame_of(message: CanMessage, data: bytes) -> CanFrame:
 
 
 def part_frames(message: CanMessage, content: WireFrame) -> list[CanFrame]:
-    """Return the frames of a request or an answer; raises what `encode_body` does."""
+    """Return the frames of a request or an answer; raises as `encode_body`."""
     body = encode_body(content)
     stream = _LENGTH.pack(len(body)) + body
     room = message.size - 1
     frames = []
     for part, first in enumerate(range(0, len(stream), room)):
         piece = bytes([part]) + stream[first : first + room]
-        # CAN FD has frames of some sizes only; the length says where the message ends.
+        # CAN FD has certain frame sizes only; the length states where the message ends.
         size = next(size for size in FD_SIZES if size >= len(piece))
         frames.append(frame_of(message, piece.ljust(size, b"\0")))
     return frames
 
 
 class PartCollector:
-    """Puts the parts of one message after the other together; memory stays below one message.
+    """Joins the parts of messages; memory stays below one message.
 
-    `damaged` counts parts that fit nothing and messages of another length or checksum.
+    `damaged` counts parts that do not fit and messages with a wrong length or checksum.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class PartCollector:
         self._next = 0
 
     def feed(self, data: bytes) -> WireFrame | None:
-        """Return the message that a frame's bytes complete, None where they complete none."""
+        """Return the message that a frame completes, None if it is incomplete."""
         part = data[0] if data else -1
         if part == 0:
             self.damaged += self._next > 0  # the message before was not completed
@@ -180,10 +180,10 @@ def block_frames(layout: CanLayout, block: BlockLayout, message: WireFrame) -> l
 
 
 class BlockCollector:
-    """Puts the frames of a block together; `damaged` counts those that were not whole.
+    """Joins the frames of a block; `damaged` counts incomplete blocks.
 
-    `feed` takes the stream (number of the request that started it) and the session that the
-    block must be of.
+    `feed` takes the stream (number of the request that started it) and the session that the block
+    must have.
     """
 
     def __init__(self, layout: CanLayout, block: BlockLayout) -> None:
@@ -207,11 +207,11 @@ class BlockCollector:
         }
 
     def takes(self, key: int) -> bool:
-        """Whether a message of this key is part of a block."""
+        """Return whether a message of this key is part of a block."""
         return key in self._sizes
 
     def feed(self, key: int, data: bytes, number: int, session: int) -> WireFrame | None:
-        """Return the `BLOCK` that a frame completes, None where it completes none."""
+        """Return the `BLOCK` that a frame completes, None if it is incomplete."""
         if len(data) < self._sizes[key]:
             self._drop()
         elif key == self._layout.sync.key:
@@ -276,13 +276,13 @@ def _raw(signal: CanSignal, code: int) -> int:
 
 
 def frame_bits(frame: CanFrame | CanMessage) -> tuple[int, int]:
-    """Return the most bits of a frame: (at the nominal rate, at the data rate).
+    """Return the largest number of bits of a frame: (at the nominal rate, at the data rate).
 
-    ISO 11898-1: a classic frame of n bytes has 47 + 8 n bits (67 with 29 identifier bits), of
-    which 34 + 8 n (54) are stuffed: a bit after every four at worst. CAN FD with bit rate switch
-    sends 17 (36) bits before the switch, stuffed, and 13 after the checksum at the nominal rate;
-    in between ESI, length code and data, stuffed, 4 bits of stuff count and 17 or 21 of checksum
-    with a fixed stuff bit before every four.
+    ISO 11898-1: a classic frame of n bytes has 47 + 8 n bits (67 with 29 identifier bits), of which
+    34 + 8 n (54) are stuffed: at worst one bit after every four. CAN FD with bit rate switch sends
+    17 (36) bits before the switch, stuffed, and 13 after the checksum at the nominal rate; in
+    between ESI, length code and data, stuffed, 4 bits of stuff count and 17 or 21 of checksum with
+    a fixed stuff bit before every four.
     """
     n = frame.size
     if not frame.fd:
@@ -297,7 +297,7 @@ def frame_bits(frame: CanFrame | CanMessage) -> tuple[int, int]:
 def stream_seconds(
     layout: CanLayout, block: BlockLayout, bitrate: float, data_bitrate: float
 ) -> float:
-    """Return how long one block, with its acknowledgement, occupies the bus at worst [s]."""
+    """Return the longest time that a block with its acknowledgement occupies the bus [s]."""
 
     def seconds(messages: Sequence[CanMessage]) -> float:
         pairs = [frame_bits(message) for message in messages]

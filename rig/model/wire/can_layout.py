@@ -1,8 +1,9 @@
-"""What a DBC file must say about a bench on a CAN bus, and where each value then stands.
+"""The required content of a DBC file of a bench on a CAN bus, and the place of each value.
 
 Both ends find their values by the names of signals; messages, identifiers, places, sizes and byte
-orders are the file's own (docs/wire-can.md). Glossary: a *row* is one sample of every channel and
-command, in one or several frames; a signal's *raw* value is the whole number that its bits hold.
+orders are those of the file (docs/wire-can.md). Glossary: a *row* is one sample of every channel
+and command, in one or several frames; a signal's *raw* value is the whole number that its bits
+hold.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _TOLERANCE = 1e-6  # of a factor, and of a sensor's range
 
 @dataclass(frozen=True)
 class CanSignal:
-    """Where a raw value stands in a message's bytes, read as one number of either byte order."""
+    """Place of a raw value in a message's bytes, read as one number of either byte order."""
 
     name: str
     shift: int
@@ -60,7 +61,7 @@ class CanSignal:
 
 @dataclass(frozen=True)
 class CanMessage:
-    """One message of the file; `size` [bytes] is what every frame of it carries."""
+    """One message of the file; `size` [bytes] is that of each of its frames."""
 
     name: str
     identifier: int
@@ -71,7 +72,7 @@ class CanMessage:
 
     @property
     def key(self) -> int:
-        """The identifier, apart from the same number of the other length."""
+        """The identifier, distinct for 11 and 29 bits."""
         return self.identifier | (EXTENDED if self.extended else 0)
 
     def pack(self, values: Mapping[str, int]) -> bytes:
@@ -96,7 +97,7 @@ class CanMessage:
 
 @dataclass(frozen=True)
 class CanLayout:
-    """The messages of a bench by what they are for; `columns` names a row's signals in order."""
+    """The messages of a bench by purpose; `columns` names a row's signals in order."""
 
     source: str
     zero: CanMessage
@@ -110,25 +111,25 @@ class CanLayout:
 
     @property
     def from_bench(self) -> tuple[CanMessage, ...]:
-        """What the bench sends."""
+        """The messages that the bench sends."""
         return (self.answer, self.sync, *self.rows, self.check)
 
     @property
     def from_host(self) -> tuple[CanMessage, ...]:
-        """What the host sends."""
+        """The messages that the host sends."""
         return (self.zero, self.alive, self.request)
 
     @property
     def fd(self) -> bool:
-        """Whether some frame is one of CAN FD."""
+        """Whether there are frames of CAN FD."""
         return any(message.fd for message in (*self.from_bench, *self.from_host))
 
 
 def read_layout(text: str, source: str, rig: Rig) -> CanLayout:
     """Read a DBC file's text for a rig.
 
-    Raises InputError naming the file and the first signal that is missing, stands twice, is too
-    short, or converts otherwise than the rig's sensor or valve.
+    Raises InputError naming the file and the first signal that is missing, duplicated, too short,
+    or converted differently from the rig's sensor or valve.
     """
     reader = _Reader(_parsed(text, source), source)
     rows = reader.rows(rig)
@@ -167,7 +168,7 @@ def read_layout(text: str, source: str, rig: Rig) -> CanLayout:
 def _parsed(text: str, source: str) -> Database:
     try:
         database = load_string(text, "dbc")
-    # The parser raises whatever a damaged text makes of it.
+    # The parser raises exceptions of any class for a damaged text.
     except (Error, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{source}: not a DBC file: {reason[:200]}") from error
@@ -177,7 +178,7 @@ def _parsed(text: str, source: str) -> Database:
 
 
 class _Reader:
-    """Finds signals by name and refuses what cannot be used."""
+    """Finds signals by name and raises InputError for unusable ones."""
 
     def __init__(self, database: Database, source: str) -> None:
         self._source = source
@@ -187,7 +188,7 @@ class _Reader:
                 self._places.setdefault(signal.name, []).append((message, signal))
 
     def message_of(self, needed: Mapping[str, int]) -> CanMessage:
-        """Return the one message that carries all of these signals."""
+        """Return the one message that contains all of these signals."""
         signals = [(name, *self._signal(name, bits)) for name, bits in needed.items()]
         message = signals[0][1]
         for name, other, _ in signals:

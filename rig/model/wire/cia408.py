@@ -1,7 +1,7 @@
 """A proportional valve of CiA 408: its states, words and values (docs/wire-canopen-408.md).
 
-Source: CiA 408 (device profile fluid power technology), device state machine; the same numbers
-stand in the manuals of valves that follow it.
+Source: CiA 408 (device profile fluid power technology), device state machine; manuals of valves
+that follow it list the same numbers.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ class ValveState(IntEnum):
 
     @property
     def in_fault(self) -> bool:
-        """Whether only a reset leaves it."""
+        """Whether only a reset leaves the state."""
         return not self & 0b1000
 
 
 def next_state(state: ValveState, before: int, word: int) -> ValveState:
-    """Return the state after the control word `word`, whose last value was `before`.
+    """Return the state after control word `word`, the previous word being `before`.
 
-    A fault is left by a rising reset bit, to the state without an output; any other state is the
+    A rising reset bit leaves a fault, to the state without an output; any other state is the
     highest whose bits are all set.
     """
     if state.in_fault:

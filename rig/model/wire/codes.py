@@ -1,7 +1,7 @@
-"""Converter codes: what a 16-bit register holds for a voltage put out or a quantity measured.
+"""Converter codes: the value of a 16-bit register for a voltage put out or a quantity measured.
 
-Both ends of a wire and the documents of it use this one definition:
-inputs are offset binary over the sensor's range, outputs two's complement over +-range.
+Both ends of a wire and its documents use this definition: inputs are offset binary over the
+sensor's range, outputs two's complement over +-range.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Codes = NDArray[np.int64]
 
 
 def encode_input(value: ArrayLike, low: float, high: float, bits: int) -> Codes:
-    """Return AD codes 0 .. 2^bits - 1 of values in [low, high] (SI); outside they saturate."""
+    """Return AD codes 0 .. 2^bits - 1 of values in [low, high] (SI); others saturate."""
     top = (1 << bits) - 1
     scaled = (np.asarray(value, dtype=np.float64) - low) * (top / (high - low))
     return np.clip(np.rint(scaled), 0, top).astype(np.int64)

@@ -30,7 +30,7 @@ MAX_ENCODED: Final = MAX_BODY + -(-MAX_BODY // 254)  # between the zeros: 266 by
 
 @dataclass(frozen=True)
 class WireFrame:
-    """One message: what it is, which request it is or answers, whose session it belongs to."""
+    """One message: its type, the request that it is or answers, its session."""
 
     type: int
     number: int
@@ -53,7 +53,7 @@ def encode_body(frame: WireFrame) -> bytes:
 
 
 def decode_body(body: bytes) -> WireFrame | None:
-    """Return the message of a body, None where its size or checksum is none."""
+    """Return the message of a body, None if its size or checksum is wrong."""
     if not _MIN_BODY <= len(body) <= MAX_BODY:
         return None
     content, check = body[: -_CHECK.size], body[-_CHECK.size :]
@@ -70,9 +70,9 @@ def encode_frame(frame: WireFrame) -> bytes:
 
 
 class FrameDecoder:
-    """Finds the frames in a stream of bytes, however it is cut; memory stays below one frame.
+    """Finds the frames in a stream of bytes, however it is divided; memory stays below one frame.
 
-    `damaged` counts what stood between two zeros and was no frame, `received` all bytes.
+    `damaged` counts invalid content between two zeros, `received` all bytes.
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class FrameDecoder:
         self._skipping = False  # in something too long for a frame, up to the next zero
 
     def feed(self, data: bytes) -> list[WireFrame]:
-        """Return the frames that `data` completes; what is damaged is counted and left out."""
+        """Return the frames that `data` completes; damaged ones are counted and left out."""
         self.received += len(data)
         *ended, begun = (self._partial + data).split(DELIMITER)
         frames = []
@@ -102,7 +102,7 @@ class FrameDecoder:
         return frames
 
     def reset(self) -> None:
-        """Drop an incomplete frame: the line was opened anew."""
+        """Drop an incomplete frame, because the line was opened anew."""
         self._partial = b""
         self._skipping = False
 

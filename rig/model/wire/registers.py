@@ -1,7 +1,7 @@
-"""The register map of a bench behind Modbus: one definition for both ends of the wire.
+"""The register map of a bench on Modbus, for both ends (docs/wire-modbus-tcp.md).
 
-Documented for people in docs/wire-modbus-tcp.md. A register is 16 bits; wider values take
-consecutive registers, high word first. Addresses are those of the protocol (0-based).
+A register is 16 bits; wider values take consecutive registers, high word first. Addresses are those
+of the protocol (0-based).
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ HEADER_WORDS: Final = 5
 MAX_BLOCK_SAMPLES: Final = 10
 
 WAVE_CAPACITY: Final = 131_072  # samples of one joint's waveform
-WAVE_BITS: Final = 16  # waveforms are finer than the converter, so that a gain can scale them
+WAVE_BITS: Final = 16  # finer than the converter, so that a gain can scale the waveform
 PAGE_SAMPLES: Final = MAX_WRITE - 2  # samples of a waveform in one write
 
 LAW_FIELDS: Final = ("gain", "bias", "position_gain", "setpoint", "limit")
 LAW_WORDS: Final = 2 * len(LAW_FIELDS)
 
-# What single registers take.
+# Values of single registers.
 ZERO_NOW: Final = 1
 STREAM_STOP: Final = 0
 STREAM_START: Final = 1
 APPLY: Final = 1
 APPLY_AND_RESTART: Final = 3
-RESET_KEY: Final = 0x5253  # "RS": a stray write of 0 or 1 must not clear a trip
+RESET_KEY: Final = 0x5253  # "RS": an accidental write of 0 or 1 must not clear a trip
 
 
 @dataclass(frozen=True)
 class Register:
-    """One entry of the map: first address, width in registers, form and who may write it."""
+    """One entry of the map: first address, width in registers, form and writer."""
 
     name: str
     address: int
@@ -112,13 +112,13 @@ class Status(IntFlag):
 
     STREAMING = 1
     TRIPPED = 2
-    ARMED = 4  # some joint's law may put out a voltage
-    BLOCK = 8  # (header) samples follow; without it the rest of the answer means nothing
-    CONTROLLED = 16  # some client has control
+    ARMED = 4  # a joint's law may put out a voltage
+    BLOCK = 8  # (header) samples follow; otherwise the rest of the answer is undefined
+    CONTROLLED = 16  # a client has control
 
 
 class TripCause(IntEnum):
-    """Why the device zeroed its outputs by itself."""
+    """Why the device zeroed its outputs."""
 
     NONE = 0
     WATCHDOG = 1
@@ -141,7 +141,7 @@ class Refusal(IntEnum):
 
 TRIP_TEXT: Final = {
     TripCause.NONE: "not tripped",
-    TripCause.WATCHDOG: "watchdog: the host fell silent",
+    TripCause.WATCHDOG: "watchdog: no heartbeat from the host",
     TripCause.HOST_LOST: "the host's connection ended while outputs or stream were on",
     TripCause.FAULT: "fault inside the device",
 }
@@ -177,7 +177,7 @@ class BlockLayout:
 
 
 class BlockHeader(NamedTuple):
-    """What stands before a block's samples."""
+    """The header of a block."""
 
     sequence: int
     tick: int
@@ -189,7 +189,7 @@ _HEADER = struct.Struct(">HIHH")
 
 
 def block_layout(channels: int, joints: int) -> BlockLayout:
-    """Return the largest block, up to ten samples, that one answer of 125 registers carries."""
+    """Return the largest block, up to ten samples, that fits an answer of 125 registers."""
     samples = min(MAX_BLOCK_SAMPLES, (MAX_READ - HEADER_WORDS) // (channels + joints))
     return BlockLayout(samples, channels, joints)
 
@@ -224,7 +224,7 @@ def wave_checksum(codes: NDArray[np.int16]) -> int:
 
 
 def converter_checksum(rig: Rig) -> int:
-    """Return the CRC-32 over every converter's range and bits: both ends must decode alike."""
+    """Return the CRC-32 over every converter's range and bits, which both ends must share."""
     lines = []
     for name in rig.channels:
         sensor = rig.sensors.of(ch.kind_of(name)[0])

@@ -1,11 +1,8 @@
-"""Samples taken at uneven times, put onto the even grid of ticks by linear interpolation.
+"""Linear interpolation of unevenly timed samples onto the grid of ticks.
 
-Times are in sample periods since tick 0: tick k stands at k. The value at tick k between two
-samples (t0, x0) and (t1, x1), t0 < k <= t1, is
-
-    x(k) = x0 + (k - t0) / (t1 - t0) (x1 - x0),     as long as t1 - t0 <= LONGEST.
-
-Where two samples are further apart nothing is invented: the ticks between them are missing.
+Times are in sample periods since tick 0: tick k is at k. The value at tick k between two samples
+(t0, x0) and (t1, x1), t0 < k <= t1, is x(k) = x0 + (k - t0) / (t1 - t0) (x1 - x0), as long as t1 -
+t0 <= LONGEST. Ticks between samples that are further apart are missing.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ _SNAP: Final = 1e-6  # [periods] within which a sample counts as taken at its ti
 
 @dataclass(frozen=True)
 class Row:
-    """One tick of the grid: values in SI, and marks where a sample it rests on was saturated."""
+    """One tick of the grid: values in SI, and flags of saturated samples used for it."""
 
     tick: int
     values: Array
@@ -43,7 +40,7 @@ class Resampler:
         self._saturated: Marks = np.empty(0, dtype=np.bool_)
 
     def restart(self) -> None:
-        """Drop the last sample: the next one does not continue it, and none is missing."""
+        """Drop the last sample: the next one does not continue it, and no tick is missing."""
         self._at = None
 
     def add(self, at: float, values: Array, saturated: Marks) -> list[Row]:
@@ -64,7 +61,7 @@ class Resampler:
                 self.missing += math.floor(at) - math.floor(before) - exact
             return [Row(nearest, values, saturated)] if exact else []
         rows = []
-        with np.errstate(invalid="ignore"):  # a value that is no number stays one
+        with np.errstate(invalid="ignore"):  # NaN remains NaN
             for tick in range(math.floor(before) + 1, math.floor(at) + 1):
                 part = (tick - before) / (at - before)
                 between = values if part == 1.0 else first + part * (values - first)

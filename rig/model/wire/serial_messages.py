@@ -1,6 +1,6 @@
 """The messages of a bench on a serial line or a CAN bus: one definition for both ends.
 
-docs/wire-serial.md and docs/wire-can.md describe them for people.
+They are described in docs/wire-serial.md and docs/wire-can.md.
 
 Glossary: a *request* is answered, with its number and session; a *note* is not. A *session* is
 the time of one host, named by a number that it draws. Values and codes are those of
@@ -28,7 +28,7 @@ NOTHING_YET: Final = 0xFFFF  # acknowledged before a stream's first block
 
 
 class Message(IntEnum):
-    """Types of message; those that end in `_NOTE` or `BLOCK` are not answered."""
+    """Types of message; `BLOCK` and those that end in `_NOTE` have no answer."""
 
     IDENTIFY = 0x01
     STATUS = 0x02
@@ -47,7 +47,7 @@ class Message(IntEnum):
     REFUSED = 0xFF
 
 
-# Carried out for every session, and as often as they arrive: none moves anything.
+# Carried out for every session and every repetition, because none causes motion.
 FOR_ANYBODY: Final = frozenset({Message.IDENTIFY, Message.STATUS, Message.ZERO})
 
 
@@ -67,7 +67,7 @@ class Alive:
 
 @dataclass(frozen=True)
 class DeviceRefusal:
-    """Why the device did not carry a request out; `joint` is 1-based or 0."""
+    """Why the device refused a request; `joint` is 1-based or 0."""
 
     reason: int
     joint: int = 0
@@ -77,8 +77,8 @@ class DeviceRefusal:
 class PushedBlock:
     """A block as it is sent: `samples` are `BlockLayout.samples` rows of registers.
 
-    `oldest` is the number of the oldest block that the device still has: what lies before it and
-    was not received is lost.
+    `oldest` is the number of the oldest block that the device still has: earlier blocks that were
+    not received are lost.
     """
 
     oldest: int
@@ -113,9 +113,9 @@ def unpack_refusal(payload: bytes) -> DeviceRefusal:
 
 
 def pack_apply(flag: int, laws: Sequence[Sequence[float]]) -> bytes:
-    """Return the payload of `APPLY`: the flag, then five floats a joint.
+    """Return the payload of `APPLY`: the flag, then five floats per joint.
 
-    What single precision cannot hold becomes infinite, which the device refuses.
+    Values beyond single precision become infinite, which the device refuses.
     """
     values = np.array(laws)
     with np.errstate(over="ignore"):
@@ -149,6 +149,6 @@ def unpack_block(payload: bytes, layout: BlockLayout) -> PushedBlock:
 
 
 def line_rate(layout: BlockLayout, sample_rate: float) -> float:
-    """Return the bits per second that a stream takes on a line of 10 bits a byte, at most."""
+    """Return the largest bit rate [1/s] of a stream on a line of 10 bits a byte."""
     overhead = MAX_ENCODED - MAX_PAYLOAD + 2 + _OLDEST.size
     return 10.0 * sample_rate / layout.samples * (2 * layout.words + overhead)

@@ -1,1 +1,1 @@
-"""What the operator can do: command a run, start verbs, move a joint by hand."""
+"""The operator's actions: command a run, start verbs, move a joint by hand."""

@@ -1,4 +1,4 @@
-"""What the operator can do to a run: stop, command, acknowledge, reset."""
+"""The operator's actions on a run: stop, command, acknowledge, reset."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rig.tui.look import Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.words import Stop
 
-MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort does not ask first
+MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort needs no confirmation
 
 
 class Commands:
-    """The part of the screen that acts; each act leaves one line on what became of it."""
+    """The operator's actions on a run; each shows its result in one line."""
 
     ACTS: ClassVar = {
         "?": "help", "h": "hold", "z": "zoom", "+": "longer", "-": "shorter", "=": "automatic",
@@ -46,7 +46,7 @@ class Commands:
     alarms_of: Callable[[Frame], AlarmTable]
 
     def act_stop(self) -> None:
-        """Zero the outputs of the run on the screen, marked in the list, or else the only one."""
+        """Zero the outputs of the run shown, of the one marked in the list, or of the only one."""
         frame = self.link.frame
         choosing = frame.stage is LinkStage.CHOOSING
         endpoint = self.marked_session if choosing else frame.endpoint
@@ -58,14 +58,14 @@ class Commands:
     # Commands
 
     def command(self, word: str, value: str = "", done: str = "") -> None:
-        """Send a command to the run, or say why none can be sent."""
+        """Send a command to the run, or show why none can be sent."""
         endpoint = self.link.frame.endpoint
         if endpoint is not None and self._open_to(word):
             self.remark = f"{word}: asking ..."
             self.link.ask(endpoint, word, value, lambda no: self._show_answer(word, done, no))
 
     def _open_to(self, word: str) -> bool:
-        """Whether a run is attached that this screen may command; the remark says why not."""
+        """Return whether a run is attached that this screen may command; else show why not."""
         frame = self.link.frame
         if frame.endpoint is None or frame.snapshot is None:
             self.remark = f"{word}: no run is attached."
@@ -83,12 +83,12 @@ class Commands:
         self.redraw()
 
     def commanded(self, word: str, text: str) -> None:
-        """Send a command after a yes; without the question where it cannot be sent."""
+        """Send a command after confirmation; show why if it cannot be sent."""
         if self._open_to(word):
             self.confirmed(word, text, lambda: self.command(word))
 
     def confirmed(self, title: str, text: str, act: Callable[[], None]) -> None:
-        """Do something after a yes."""
+        """Run an action after confirmation."""
 
         def chosen(answer: str) -> None:
             if answer == "yes":
@@ -98,7 +98,7 @@ class Commands:
         self.ask(Dialog(title, (text,), choices=("no", "yes"), keys=keys), chosen)
 
     def act_command(self) -> None:
-        """Take the controls, or release them; from another screen only after a yes."""
+        """Take the controls, or release them; from another screen only after confirmation."""
         snapshot = self.link.frame.snapshot
         holder = snapshot.holder if snapshot is not None else ""
         if holder == self.me:
@@ -113,7 +113,7 @@ class Commands:
         self.command("take", done="this screen is in command")
 
     def act_pause(self) -> None:
-        """Pause at the next safe point, or resume after a yes: the bench will move."""
+        """Pause at the next safe point, or resume after confirmation, since the bench will move."""
         snapshot = self.link.frame.snapshot
         if snapshot is not None and snapshot.engine == "paused":
             text = "The bench will move: places and locks are made anew. Resume?"
@@ -122,14 +122,14 @@ class Commands:
             self.command("pause", done="taken; it comes at the end of the record")
 
     def act_skip(self) -> None:
-        """Skip the present step after a yes."""
+        """Skip the present step after confirmation."""
         snapshot = self.link.frame.snapshot
         step = snapshot.step if snapshot is not None else ""
         text = f"Leave step {step!r} and go on with the next one?"
         self.commanded("skip", text)
 
     def act_abort(self) -> None:
-        """End the run: at once where the bench moves, after a yes where it is at rest."""
+        """End the run: at once where the bench moves, after confirmation at rest."""
         snapshot = self.link.frame.snapshot
         if snapshot is None or snapshot.engine in MOVING:
             self.command("abort")
@@ -138,7 +138,7 @@ class Commands:
             self.commanded("abort", text)
 
     def act_answer(self) -> None:
-        """Answer what the protocol asks."""
+        """Answer the protocol's question."""
         snapshot = self.link.frame.snapshot
         if snapshot is None or not snapshot.prompt or self.link.frame.over:
             self.remark = "answer: nothing is asked now."
@@ -150,7 +150,7 @@ class Commands:
     # Alarms
 
     def _marked_alarm(self) -> Alarm | None:
-        """Return the alarm marked on its page; elsewhere the most urgent one."""
+        """Return the alarm marked on the alarm page; elsewhere the most urgent one."""
         listed = [alarm for alarm, _ in in_order(self.view())]
         if not listed:
             return None
@@ -158,7 +158,7 @@ class Commands:
         return listed[min(at, len(listed) - 1)]
 
     def act_acknowledge(self) -> None:
-        """Say that a person has seen an alarm."""
+        """Acknowledge an alarm."""
         alarm, frame = self._marked_alarm(), self.link.frame
         if alarm is None or frame.snapshot is None:
             self.remark = "acknowledge: no alarm stands."
@@ -167,7 +167,7 @@ class Commands:
         elif not frame.over:
             self.command("acknowledge", alarm.key, alarm.key)
         else:
-            # The run takes no more commands: this screen keeps it, and the run's log.
+            # The run takes no more commands: record it in this screen and in the run's log.
             self.seen_alarms |= {(frame.snapshot.pid, alarm.key)}
             self._note("alarm acknowledged", alarm)
             self.remark = f"acknowledge: {alarm.key}"
@@ -183,7 +183,7 @@ class Commands:
             log.close()
 
     def act_reset(self) -> None:
-        """Reset a latched alarm: another act than acknowledging it, and it needs a reason."""
+        """Reset a latched alarm, separately from its acknowledgement and with a reason."""
         alarm, frame = self._marked_alarm(), self.link.frame
         if alarm is None or alarm.state is not AlarmState.LATCHED:
             self.remark = "reset: the marked alarm is not latched; it ends by itself."
@@ -215,5 +215,5 @@ class Commands:
         self.start(("reset", "--rig", rig, "--reason", reason.strip()), changed)
 
     def start(self, words: tuple[str, ...], changed: Callable[[VerbJob], None]) -> None:
-        """Start a verb as a process of its own."""
+        """Start a verb in a separate process."""
         begin(words, changed)

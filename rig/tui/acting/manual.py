@@ -7,17 +7,17 @@ from typing import Final
 from rig.tui.acting.starts import Starts
 from rig.tui.pages.manual import MANUAL
 
-AGAIN: Final = 0.08  # a held key is sent on at most this often [s]
+AGAIN: Final = 0.08  # shortest time between two jogs of a held key [s]
 
 
 class ByHand(Starts):
-    """The part of the screen that moves joints by hand; a session of its own holds the device."""
+    """Manual operation of joints; a separate session holds the device."""
 
     ACTS = Starts.ACTS | {"l": "lock", "u": "unlock", "d": "depressurise"}
     jogged = -float("inf")  # when the newest jog was sent [monotonic s]
 
     def _manual(self, word: str) -> bool:
-        """Say whether the attached session takes jogs; the remark says why not."""
+        """Return whether the attached session takes jogs; else show why not."""
         frame = self.link.frame
         if frame.snapshot is None or frame.over:
             self.remark = f"{word}: no manual session; Enter on page 9 starts one."
@@ -30,7 +30,7 @@ class ByHand(Starts):
         return False
 
     def act_jog(self, key: str) -> None:
-        """Move the chosen joint for a moment; a held key repeats and so goes on."""
+        """Move the chosen joint for a short time; a held key repeats this."""
         now = self.clock()
         if key not in ("up", "down") or now - self.jogged < AGAIN or not self._manual("jog"):
             return
@@ -38,17 +38,17 @@ class ByHand(Starts):
         self.command("jog", f"{self.look.joint} {'+' if key == 'up' else '-'}")
 
     def act_lock(self) -> None:
-        """Hold the chosen joint where it stands."""
+        """Hold the chosen joint at its position."""
         if self._manual("lock"):
             self.command("lock", str(self.look.joint), f"joint {self.look.joint} is held")
 
     def act_unlock(self) -> None:
-        """Let the chosen joint be moved again."""
+        """Release the chosen joint."""
         if self._manual("unlock"):
             self.command("unlock", str(self.look.joint), f"joint {self.look.joint} is free")
 
     def act_enter(self) -> None:
-        """Start a manual session on its page; elsewhere open what is marked."""
+        """Start a manual session on its page; elsewhere open the marked line."""
         frame = self.link.frame
         if self.look.page != "manual":
             super().act_enter()
@@ -60,7 +60,7 @@ class ByHand(Starts):
         self.confirmed("manual", text, lambda: self._job(self._words("manual", rig)))
 
     def act_depressurise(self) -> None:
-        """Let the pressure out where the rig can, after a yes; not while a session holds it."""
+        """Let the pressure out where the rig can, after confirmation; not during a session."""
         frame = self.link.frame
         if frame.snapshot is not None and not frame.over:
             self.remark = "depressurise: end the session that holds the bench first."

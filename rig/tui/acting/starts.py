@@ -1,4 +1,4 @@
-"""Verbs that the operator starts from the page of runs: check, run, identify, trace, night page."""
+"""Verbs started from the page of runs: check, run, identify, trace, queue report."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
 
 
 def display_here() -> bool:
-    """Whether a browser has a display to open on; one for text would take the terminal."""
+    """Return whether a graphical display is present; a text browser would take the terminal."""
     other = sys.platform in ("darwin", "win32")
     return other or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 class Starts(Commands):
-    """The part of the screen that starts verbs; each is a process that outlives the screen."""
+    """Starting of verbs; each is a process that outlives the screen."""
 
     browsed: BrowserState
     open_page: Callable[[str], None]
     is_web: bool
     deliver_binary: Callable[..., str | None]
 
-    def look_around(self) -> None:
-        """Read what stands on the disk, beside the screen."""
+    def read_folder(self) -> None:
+        """Read the folder in the background."""
         if self.browsed.reading:
             return
         snapshot = self.link.frame.snapshot
@@ -48,7 +48,7 @@ class Starts(Commands):
 
         def read() -> None:
             browsed = read_disk(self.browsed)
-            # What was started or opened meanwhile stays.
+            # Keep what was started or opened meanwhile.
             now = self.browsed
             self.browsed = replace(
                 now, protocols=browsed.protocols, runs=browsed.runs, queue=browsed.queue,
@@ -64,7 +64,7 @@ class Starts(Commands):
         self.look = replace(self.look, marked=0, offset=0)
 
     def act_enter(self) -> None:
-        """Offer what can be done with the marked line."""
+        """Offer the actions on the marked line."""
         browsed = self.browsed
         if self.look.page != "runs" or not browsed.lines:
             return
@@ -125,7 +125,7 @@ class Starts(Commands):
         self._offer(run.path.name, acts)
 
     def _open_log(self, folder: Path) -> None:
-        """Show the log of a run, read beside the screen."""
+        """Show the log of a run, read in the background."""
         self.browsed = replace(self.browsed, log=RunLog(folder, reading=True))
         self.open_page("run log")
 
@@ -136,7 +136,7 @@ class Starts(Commands):
         threading.Thread(target=read, name="bramah-log", daemon=True).start()
 
     def _open_trace(self, folder: Path) -> None:
-        """Show what the trace of a run says, as it was stored."""
+        """Show the stored trace of a run."""
         self.browsed = replace(self.browsed, trace=RunTrace(folder, reading=True))
         self.open_page("run trace")
         self.look = replace(self.look, channel=0)
@@ -176,7 +176,7 @@ class Starts(Commands):
         self.remark = f"opened {page}" if opened else f"no browser here; open {page.absolute()}"
 
     def _with_rig(self, act: Callable[[str], None]) -> None:
-        """Do something with the rig that is known, or ask for one."""
+        """Run an action with the known rig, or ask for one."""
         if self.browsed.rig:
             act(self.browsed.rig)
             return
@@ -224,7 +224,7 @@ class Starts(Commands):
             self.browsed = replace(self.browsed, job=job)
             if job.code is not None:
                 self.remark = f"{job.words[0]}: {job.ended}"
-                self.look_around()
+                self.read_folder()
             self.redraw()
 
         begin(words, changed)

@@ -1,1 +1,1 @@
-"""Rows of styled text and what is drawn with them: plots, bars, boxes, large letters."""
+"""Rows of styled text and their elements: plots, bars, boxes, large letters."""

@@ -1,4 +1,4 @@
-"""A value on a bar between its limits, with the travel of the newest stretch drawn thick."""
+"""A value on a bar between its limits, with its recent travel drawn thick."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def bar(
 ) -> str:
     """Return a bar of `width` characters: ├ ┤ limits, ╎ warnings, ━ the travel, ● the value.
 
-    The scale is `reach` and a little beyond. A value off the scale is drawn as ◀ or ▶ at its end;
+    The scale is slightly wider than `reach`. A value off the scale is drawn as ◀ or ▶ at its end;
     NaN is not drawn.
     """
     if width < 3:

@@ -1,7 +1,7 @@
 """Curves as braille characters: two dot columns and four dot rows in every character cell.
 
-A column of a curve is the range from its smallest to its largest sample, so that no spike is
-lost however many samples fall into one column. NaN is a gap and stays one.
+A column of a curve is the range from its smallest to its largest sample, so that no spike is lost
+at any number of samples per column. NaN is a gap.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Dots = NDArray[np.bool_]
 # Bit of each dot in U+2800 + bits, row by row (Unicode, "Braille Patterns").
 _BITS: Final = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 _BLANK: Final = 0x2800
-DASH: Final = 4  # a limit line is on for one dot column in four: no curve looks like it
+DASH: Final = 4  # a limit line has one dot column in four, unlike any curve
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def scale_around(values: Sequence[float | None], margin: float = 0.05) -> Scale:
     if not finite:
         return Scale(0.0, 1.0)
     low, high = min(finite), max(finite)
-    # A constant still gets a scale wide enough for float64 to tell its ends apart.
+    # A constant has a scale wide enough for float64 to separate its ends.
     pad = margin * (high - low) or 0.05 * max(abs(low), abs(high)) or 1.0
     return Scale(low - pad, high + pad)
 
@@ -52,7 +52,7 @@ def decimate(
     """Return (low, high), shape (columns,), of buckets over the time from `start` to `stop`.
 
     Bucket k spans time[k-1] to time[k] (rising) and has low[k] <= high[k] or NaN; a column without
-    an end of a bucket takes the one that spans its centre, or NaN where nothing was measured.
+    an end of a bucket takes the one that spans its centre, or NaN without samples.
     """
     out_low, out_high = np.full(columns, np.nan), np.full(columns, np.nan)
     if columns == 0 or len(time) == 0 or not stop > start:

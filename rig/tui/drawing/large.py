@@ -1,4 +1,4 @@
-"""Large letters of half blocks, three rows high: read from two metres."""
+"""Large letters of half blocks, three rows high, legible from two metres."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _bitmap(text: str) -> list[str]:
 
 
 def large_width(text: str, scale: int = 1) -> int:
-    """Return how many cells a text takes in large letters."""
+    """Return the width of a text in large letters [cells]."""
     return scale * len(_bitmap(text)[0]) if text else 0
 
 

@@ -1,4 +1,4 @@
-"""A live plot in braille: one channel over the newest stretch of device time, with its bands."""
+"""A live plot in braille: one channel over recent device time, with its bands."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ _WIDE: Final = 5  # a warning's line is on for one dot column in so many charact
 
 @dataclass(frozen=True)
 class PlotTrace:
-    """What a plot draws: buckets in SI (see `braille.decimate`), bands [SI], how to show it.
+    """Data of a plot: buckets in SI (see `braille.decimate`), bands [SI], display.
 
-    `time`, `start` and `stop` are device times [s]; beyond `limits` trips, beyond `warnings` warns.
+    `time`, `start` and `stop` are device times [s]; values beyond `limits` trip, beyond `warnings`
+    warn.
     """
 
     time: Array
@@ -76,11 +77,11 @@ def draw(trace: PlotTrace, width: int, height: int) -> list[Row]:
     cells = braille.to_cells(curve)
     kinds = kinds.copy()
     kinds[cells] = (3 + np.broadcast_to(_beyond(low, high, trace.limits), cells.shape))[cells]
-    if columns:  # a blank takes the style before it: fewer pieces to send to the terminal
+    if columns:  # a blank takes the preceding style, so that fewer parts are sent to the terminal
         known = np.maximum.accumulate(np.where(kinds > 0, np.arange(columns), 0), axis=1)
         spread = np.take_along_axis(kinds, known, axis=1)
         kinds = np.where((kinds == 0) & (spread < _BEYOND), spread, kinds)
-    # What is beyond a limit is marked also when old: a tripped run is looked at for it.
+    # Values beyond a limit are marked even when old: they explain a trip.
     styles = (DIM, WARN_LINE, TRIP_LINE, PLAIN if trace.live else DIM, ALARM)
     axis = _axis(trace.limits, trace.warnings, trace.zoomed, trace.shown, scale, height)
     return [
@@ -123,7 +124,7 @@ def _lines(
     kinds = braille.to_cells(warn).astype(np.int64)
     kinds[braille.to_cells(trip)] = 2
     both = warn | trip
-    both.flags.writeable = kinds.flags.writeable = False  # kept for the next pictures
+    both.flags.writeable = kinds.flags.writeable = False  # cached for the next pictures
     return both, kinds
 
 
@@ -144,7 +145,7 @@ def _axis(
     scale: braille.Scale,
     height: int,
 ) -> tuple[tuple[Part, ...], ...]:
-    """Return the gutter, line by line: numbers of limits on the scale, else of the scale's ends."""
+    """Return the axis labels, line by line: limits on the scale, else the scale's ends."""
     labels: dict[int, Part] = {}
     marks = (*limits, *warnings)
     if zoomed or not any(m is not None and scale.low <= m <= scale.high for m in marks):

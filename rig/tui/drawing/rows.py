@@ -23,7 +23,7 @@ Row = tuple[Part, ...]
 
 BLANK: Row = ()
 
-# Characters of two cells, and of none. Only text that has one is measured character by character.
+# Characters of two cells, and of none. Only text with one is measured by characters.
 _ODD = re.compile(
     "[\u0300-\u036f\u1100-\u115f\u200b-\u200f\u2e80-\ua4cf\uac00-\ud7a3\uf900-\ufaff"
     "\ufe00-\ufe6f\uff00-\uff60\uffe0-\uffe6\U0001f000-\U0003fffd]"
@@ -31,7 +31,7 @@ _ODD = re.compile(
 
 
 def cell_len(text: str) -> int:
-    """Return how many cells a text takes."""
+    """Return the width of a text [cells]."""
     if text.isascii() or _ODD.search(text) is None:
         return len(text)
     return slow_cell_len(text)
@@ -43,20 +43,20 @@ def row(*parts: str | Part) -> Row:
 
 
 class Fitted(tuple[Part, ...]):
-    """A row whose width is known: it is not measured again on its way to the terminal."""
+    """A row of known width, which is not measured again when drawn."""
 
     cells: int
 
 
 def fitted(parts: Iterable[Part], cells: int) -> Row:
-    """Return parts that take `cells` cells as a row that knows it."""
+    """Return parts of a total width of `cells` cells as a row of known width."""
     made = Fitted(parts)
     made.cells = cells
     return made
 
 
 def width_of(line: Row) -> int:
-    """Return how many cells a row takes."""
+    """Return the width of a row [cells]."""
     if isinstance(line, Fitted):
         return line.cells
     total = 0
@@ -86,7 +86,7 @@ def fit(line: Row, width: int, style: str = PLAIN) -> Row:
 
 
 def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
-    """Return a row with one part at each end; the left one is cut where both do not fit."""
+    """Return a row with a part at either end; the left one is cut if they do not fit."""
     room = width - width_of(right)
     if room <= 0:
         return fit(right, width, style)
@@ -140,7 +140,7 @@ def box(
 
 
 def wrapped(text: str, width: int, style: str = PLAIN) -> list[Row]:
-    """Return a text as rows no wider than `width`; filled up where its style has a ground."""
+    """Return a text as rows up to `width` wide, filled up if its style has a background."""
     lines = [part for line in text.splitlines() for part in wrap(line, max(width, 8)) or [""]]
     rows = [row((line, style)) for line in lines]
     return [fit(line, width, style) for line in rows] if " on " in style else rows
@@ -167,6 +167,6 @@ def _style(text: str, ground: Style) -> Style:
 
 
 def to_strip(line: Row, width: int, ground: Style) -> Strip:
-    """Return a row as what the terminal's driver takes."""
+    """Return a row in the form of the terminal's driver."""
     segments = [Segment(text, _style(style, ground)) for text, style in fit(line, width)]
     return Strip(segments, width)

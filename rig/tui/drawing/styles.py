@@ -11,9 +11,9 @@ PLAIN: Final = ""
 STRONG: Final = "bold"
 DIM: Final = "bright_black"
 NORMAL: Final = "reverse"  # a state that needs no action
-ALARM: Final = "bold bright_white on red"  # a limit was passed, or the state is not known
+ALARM: Final = "bold bright_white on red"  # a limit was exceeded, or the state is unknown
 ALARM_TEXT: Final = "bold red"
-# Black is not bold: many terminals draw bold black as grey, which yellow and cyan swallow.
+# Black is not bold: many terminals draw bold black as grey, illegible on yellow and cyan.
 WARN: Final = "black on yellow"  # close to a limit, old, or ended early
 WARN_TEXT: Final = "bold yellow"
 ASK: Final = "black on cyan"  # waits for the operator

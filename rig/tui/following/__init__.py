@@ -1,1 +1,1 @@
-"""Following a run: what it publishes becomes frames, a history and a log."""
+"""Following a run: its published data become frames, a history and a log."""

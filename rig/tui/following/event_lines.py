@@ -1,4 +1,4 @@
-"""What happened, as lines for the log: turns of the protocol, messages, alarms, losses, trips."""
+"""Events as lines of the log: steps of the protocol, messages, alarms, losses, trips."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rig.bench.screens.display import LOST
 from rig.bench.screens.sockets import Snapshot
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, PLAIN, STRONG, WARN_TEXT
 
-KINDS: Final = ("all", "alarms", "protocol", "people")  # what the log can be filtered by
+KINDS: Final = ("all", "alarms", "protocol", "people")  # kinds that the log can be filtered by
 
 
 @dataclass(frozen=True)
 class EventLine:
-    """One thing that happened, at a time [s] since the run began; `kind` is one of KINDS."""
+    """One event at a time [s] since the run began; `kind` is one of KINDS."""
 
     time: float
     text: str
@@ -23,13 +23,13 @@ class EventLine:
     kind: str = "protocol"
 
 
-Said = tuple[str, str, str]  # text, style, kind
-_OWN: Final = ("event", "time", "tick", "t", "parameters")  # of an event, not said with it
+EventText = tuple[str, str, str]  # text, style, kind
+_OWN: Final = ("event", "time", "tick", "t", "parameters")  # fields of an event that are not shown
 
 
 def new_lines(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
-    """Return what is new in a snapshot after the one before it (None: it is a run's first)."""
-    said: list[Said] = []
+    """Return what is new in a snapshot compared with the previous one (None: a run's first)."""
+    said: list[EventText] = []
     if last is not None and (last.run, last.pid) != (snapshot.run, snapshot.pid):
         last = None
     if last is None:
@@ -53,10 +53,10 @@ def new_lines(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
     return [EventLine(snapshot.done_s, *parts) for parts in said if parts[0]]
 
 
-def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
+def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[EventText]:
     before = {alarm.key: alarm for alarm in last.alarms} if last is not None else {}
     now = {alarm.key: alarm for alarm in snapshot.alarms}
-    said: list[Said] = []
+    said: list[EventText] = []
     for key, alarm in now.items():
         old = before.get(key)
         if old is None and not alarm.trips:
@@ -67,8 +67,8 @@ def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
     return said
 
 
-def _people(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
-    said: list[Said] = []
+def _people(last: Snapshot | None, snapshot: Snapshot) -> list[EventText]:
+    said: list[EventText] = []
     if snapshot.prompt and (last is None or last.prompt != snapshot.prompt):
         said.append((f"asked: {snapshot.prompt}", STRONG, "people"))
     if last is not None and snapshot.holder != last.holder:
@@ -83,14 +83,14 @@ def _turn(snapshot: Snapshot) -> str:
 
 
 def trip_text(trip: str) -> str:
-    """Return a trip's message without its opening words, which the screen says larger."""
+    """Return a trip's message without its first words, which the screen shows larger."""
     return trip.removeprefix("safety trip: ")
 
 
 def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list[EventLine]:
     """Return the lines of a run's event log, for a screen that attached late.
 
-    Times come from the events' ticks: `snapshot` says how they relate to the run's beginning.
+    Times come from the events' ticks: `snapshot` relates them to the run's beginning.
     """
     if not snapshot.device_time > 0 or not snapshot.tick:
         return []
@@ -101,17 +101,17 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
         if not isinstance(tick, int):
             continue
         at = max(snapshot.done_s - (snapshot.tick - tick) / rate, 0.0)
-        lines.append(EventLine(at, *said_of_event(event)))
+        lines.append(EventLine(at, *event_text(event)))
     return lines
 
 
-def said_of_event(event: Mapping[str, Any]) -> Said:
-    """Return what an event of a run's log says; one of another kind is said by its fields."""
+def event_text(event: Mapping[str, Any]) -> EventText:
+    """Return the line of an event; an event of an unknown kind is shown by its fields."""
 
     def get(key: str) -> str:
         return str(event.get(key, ""))
 
-    texts: dict[str, Said] = {
+    texts: dict[str, EventText] = {
         "phase": (f"{get('step')} {get('phase')}  {get('message')}", PLAIN, "protocol"),
         "state": (f"{get('before')} → {get('state')}: {get('why')}", DIM, "protocol"),
         "mark": (f"mark: {get('text')}", PLAIN, "protocol"),

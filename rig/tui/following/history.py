@@ -15,16 +15,16 @@ from rig.tui.units import limit
 
 Array = NDArray[np.float64]
 
-BUCKETS: Final = 8  # kept of one snapshot: at 20 snapshots a second finer than the glass can show
+BUCKETS: Final = 8  # kept of one snapshot: at 20 a second finer than the screen's resolution
 CAPACITY: Final = 16384  # buckets: 100 s at 20 snapshots a second
 
 
 @dataclass(frozen=True)
 class HistoryWindow:
-    """The newest stretch of a run, read-only: bucket ends `time` (n,) [s] of device time.
+    """The newest part of a run, read-only: bucket ends `time` (n,) [s] of device time.
 
     `low` and `high`, shape (n, channels), are the buckets' smallest and largest samples in SI;
-    `reach` is the widest that each channel's limits have been in this run.
+    `reach` is the widest range of each channel's limits in this run.
     """
 
     time: Array
@@ -34,7 +34,7 @@ class HistoryWindow:
     reach: Mapping[str, tuple[float, float]]
 
     def of(self, channel: str) -> tuple[Array, Array]:
-        """Return (low, high), each (n,), of a channel; NaN throughout for one never seen."""
+        """Return (low, high), each (n,), of a channel; NaN throughout for an unknown one."""
         at = self.columns.get(channel)
         if at is None:
             nothing = np.full(len(self.time), np.nan)
@@ -71,7 +71,7 @@ def regroup(minimum: Array, maximum: Array, count: int) -> tuple[Array, Array]:
 
 
 class History:
-    """A ring of buckets filled from snapshots; starts anew with a new run or set of channels."""
+    """A ring of buckets filled from snapshots; cleared at a new run or set of channels."""
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         self._capacity = capacity
@@ -83,14 +83,14 @@ class History:
         self._reach: dict[str, tuple[float, float]] = {}
         self._time = np.empty(self._capacity)
         self._values = np.empty((2, self._capacity, len(names)))
-        self._count = 0  # buckets ever written; the ring holds the newest `capacity` of them
+        self._count = 0  # buckets written in all; the ring holds the newest `capacity` of them
         self._last = -np.inf  # device time of the newest bucket [s]
 
     def add(self, snapshot: Snapshot, *, after_gap: bool = False) -> None:
-        """Take in a snapshot's buckets; `after_gap` says that some before it did not arrive.
+        """Add a snapshot's buckets; `after_gap` states that earlier ones did not arrive.
 
-        The first snapshot of a run, or one after a gap, does not say how long a stretch its buckets
-        span: they become a single one at the snapshot's own time.
+        The first snapshot of a run, or one after a gap, does not state the time span of its
+        buckets: they become one bucket at the snapshot's time.
         """
         names = tuple(snapshot.channels)
         key = (snapshot.run, snapshot.pid, names)
@@ -111,7 +111,7 @@ class History:
         self._last = snapshot.device_time
 
     def begin_with(self, past: PastMinute) -> bool:
-        """Begin anew with what the run itself kept; False where it has other channels."""
+        """Fill the ring with the run's own history; False if that has other channels."""
         if set(past.names) != set(self._columns) or not len(past.time):
             return False
         reach = self._reach
@@ -156,9 +156,9 @@ def _stack(views: list[ChannelView], count: int) -> Array:
 def _widened(
     reach: Mapping[str, tuple[float, float]], snapshot: Snapshot
 ) -> dict[str, tuple[float, float]]:
-    """Return a new `reach` that holds the limits of this snapshot too.
+    """Return a new `reach` that includes the limits of this snapshot.
 
-    A piston's limits narrow while its joint is locked; its stroke is still the one seen before.
+    A piston's limits narrow while its joint is locked; its stroke is then that of before.
     """
     wider = dict(reach)
     for name, view in snapshot.channels.items():

@@ -1,7 +1,7 @@
 """The link to a run: a thread that receives snapshots and hands immutable frames to the screen.
 
-The screen never waits for the wire and the run never waits for the screen. A stop has a
-connection and a thread of its own, so that it leaves at once whatever the receiving side is doing.
+The screen never waits for the wire and the run never waits for the screen. A stop has a separate
+connection and thread, so that it is sent at once whatever the receiving side is doing.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ log = logging.getLogger(__name__)
 
 FRAME: Final = 1 / 10  # shortest time between two frames [s]
 POLL: Final = 0.1  # longest wait for a snapshot [s]
-LOOK: Final = 0.5  # between looks for a session while none is attached [s]
-QUIET: Final = 0.5  # a run silent for this long is stale, and it is asked whether it still is [s]
+LOOK: Final = 0.5  # between searches for a session while none is attached [s]
+QUIET: Final = 0.5  # a run silent for this long is stale, and its process is checked [s]
 KEPT_LINES: Final = 2000  # of the event log, and of estimates
-ANSWERED: Final = 1.0  # time for a run to say what it did lately [s]
+ANSWERED: Final = 1.0  # time for a run to send its recent history [s]
 ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
 
 
 class SnapshotSource(Protocol):
-    """One connection to a run; what `rig.bench.screens.sockets.Attachment` offers."""
+    """One connection to a run, as in `rig.bench.screens.sockets.Attachment`."""
 
     def receive(self, timeout: float) -> Snapshot | None:
         """Return the next snapshot, or None when none came within `timeout` seconds."""
@@ -45,27 +45,27 @@ class SnapshotSource(Protocol):
         ...
 
     def ask(self, command: Command) -> str | None:
-        """Send a command with a value; None when it was taken, else in one line why not."""
+        """Send a command with a value; return None if it was accepted, else why not."""
         ...
 
     def past(self, timeout: float) -> PastMinute | None:
-        """Return what the run did lately and its plan; None where it does not say."""
+        """Return the run's recent history and its plan; None if it has none."""
         ...
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         ...
 
 
 class Sessions(Protocol):
-    """Where running sessions are found and opened."""
+    """Finds and opens running sessions."""
 
     def find(self) -> Sequence[Endpoint]:
-        """Return the live sessions, those of a wanted rig only."""
+        """Return the live sessions, of a wanted rig only if one is named."""
         ...
 
     def open(self, endpoint: Endpoint) -> SnapshotSource:
-        """Connect to one of them; raises OSError when it has just gone."""
+        """Connect to one of them; raises OSError if it has just ended."""
         ...
 
 
@@ -85,17 +85,17 @@ class LocalSessions:
 
 
 class LinkStage(Enum):
-    """What the link is doing."""
+    """State of the link."""
 
     WAITING = "waiting"  # no session: looking for one
-    CHOOSING = "choosing"  # several: the operator says which
+    CHOOSING = "choosing"  # several: the operator chooses
     ATTACHED = "attached"
-    ENDED = "ended"  # the run is over or its process has gone; the last picture stays
+    ENDED = "ended"  # the run or its process has ended; the last picture stays
 
 
 @dataclass(frozen=True)
 class TrackedPoint:
-    """What is estimated at a time [s] since the run began.
+    """Estimates at a time [s] since the run began.
 
     `values` holds [value, low, high] in SI by parameter, `residuals` [rms, size] by family.
     """
@@ -107,9 +107,9 @@ class TrackedPoint:
 
 @dataclass(frozen=True)
 class Frame:
-    """Everything the screen draws from; `received` is when the newest samples came [monotonic s].
+    """All data of the screen; `received` is the arrival of the newest samples [monotonic s].
 
-    A snapshot without new samples does not make those before it any younger.
+    A snapshot without new samples does not change it.
     """
 
     stage: LinkStage = LinkStage.WAITING
@@ -120,12 +120,12 @@ class Frame:
     window: HistoryWindow = EMPTY
     speed: float = 1.0  # device seconds per wall second
     event_lines: tuple[EventLine, ...] = ()  # oldest first, the newest KEPT_LINES of them
-    total_lines: int = 0  # how many lines there have ever been
+    total_lines: int = 0  # number of lines so far
     plan: tuple[PlanLine, ...] = ()
     estimates: tuple[TrackedPoint, ...] = ()  # oldest first
     interval: float = 0.0  # between two snapshots, smoothed [s of wall time]
     worst_age: float = 0.0  # of a block since the screen attached [s]
-    trouble: str = ""  # why sessions cannot be looked for
+    trouble: str = ""  # why sessions cannot be searched
 
     def age(self, now: float) -> float:
         """Return how old the newest sample is [s]: its age when published plus the time since."""
@@ -139,13 +139,13 @@ class Frame:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended: it said so, or its process has gone."""
+        """Whether the run has ended: by its own message, or because its process has ended."""
         said = self.snapshot is not None and self.snapshot.state in ENDED_STATES
         return self.stage is LinkStage.ENDED or said
 
 
 class Link:
-    """Finds a session, follows it, and makes frames; `step` is one turn of its thread."""
+    """Finds a session, follows it, and makes frames; `step` is one cycle of its thread."""
 
     def __init__(self, sessions: Sessions, clock: Callable[[], float] = time.monotonic) -> None:
         self._sessions, self._clock = sessions, clock
@@ -161,7 +161,7 @@ class Link:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self.on_window: Callable[[], None] = lambda: None  # called by the thread of the link
-        self.window_seconds = 10.0  # set by the screen: how much of the past a frame carries
+        self.window_seconds = 10.0  # set by the screen: length of the history in a frame
 
     @property
     def frame(self) -> Frame:
@@ -169,12 +169,12 @@ class Link:
         return self._frame
 
     def start(self) -> None:
-        """Start the receiving thread; a daemon, for a hung wire must not keep the screen open."""
+        """Start the receiving thread; a daemon, so that a hung wire cannot keep the screen open."""
         self._thread = threading.Thread(target=self._run, name="bramah-link", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the receiving thread and let go of the run, which goes on."""
+        """End the receiving thread and detach from the run, which continues."""
         self._closing.set()
         if self._thread is None:
             self._detach()
@@ -188,10 +188,10 @@ class Link:
     def stop(
         self, endpoint: Endpoint | None, answered: Callable[[Endpoint | None, bool], None]
     ) -> None:
-        """Send "stop" at once on a connection and a thread of its own, then report the answer.
+        """Send "stop" at once on a separate connection and thread, then report the answer.
 
         Without an endpoint it goes to the only live session: a run that has just begun is not
-        attached yet. `answered` hears which session it went to, None where there is no such one.
+        attached yet. `answered` receives the session, None if there is none.
         """
 
         def send() -> None:
@@ -203,7 +203,7 @@ class Link:
     def ask(
         self, endpoint: Endpoint, word: str, value: str, answered: Callable[[str | None], None]
     ) -> None:
-        """Send a command on a thread of its own; `answered` gets the refusal, or None."""
+        """Send a command on a separate thread; `answered` receives the refusal, or None."""
 
         def send() -> None:
             try:
@@ -212,7 +212,7 @@ class Link:
                     refusal = source.ask(own_command(word, value))
                 finally:
                     source.close()
-            except Exception as error:  # the operator must read it, whatever it was
+            except Exception as error:  # the operator must see any failure
                 log.exception("asking %r of %s failed", word, endpoint)
                 refusal = str(error) or repr(error)
             answered(refusal)
@@ -234,7 +234,7 @@ class Link:
                 return source.send(command)
             finally:
                 source.close()
-        except Exception:  # whatever happened, the operator must read "no answer", not a traceback
+        except Exception:  # the operator must see "no answer", not a traceback
             log.exception("sending %r to %s failed", command, endpoint)
             return False
 
@@ -242,7 +242,7 @@ class Link:
         while not self._closing.is_set():
             try:
                 self.step(POLL)
-            except Exception as error:  # a broken link must be read on the screen, not kill it
+            except Exception as error:  # a broken link is shown on the screen and must not end it
                 log.exception("the link failed; looking for sessions again")
                 self._detach()
                 self._frame = replace(self._frame, trouble=str(error) or repr(error))
@@ -276,7 +276,7 @@ class Link:
         if snapshot.estimates and (not estimates or estimates[-1].values != snapshot.estimates):
             point = TrackedPoint(snapshot.done_s, snapshot.estimates, snapshot.residuals)
             estimates = (*estimates, point)[-KEPT_LINES:]
-        # The window follows at the frame rate; what is said in words follows every snapshot.
+        # The window is updated at the frame rate, the text at every snapshot.
         self._frame = replace(
             before,
             snapshot=snapshot,
@@ -343,7 +343,7 @@ class Link:
             self._frame = self._blank(LinkStage.WAITING)
 
     def _blank(self, stage: LinkStage, endpoint: Endpoint | None = None) -> Frame:
-        """Return a frame without a run's picture; what happened so far stays in the log."""
+        """Return a frame without a run's data; the log stays."""
         kept = self._frame
         return Frame(
             stage,
@@ -355,7 +355,7 @@ class Link:
         )
 
     def _drain(self) -> None:
-        """Take the last words of a run that has gone."""
+        """Receive the last messages of a run that has ended."""
         while self._source is not None and (last := self._source.receive(0.0)) is not None:
             self._take(last, self._clock())
         self._frame = replace(self._frame, window=self._history.window(self.window_seconds))
@@ -375,7 +375,7 @@ class Link:
 
 
 def _has_news(last: Snapshot | None, snapshot: Snapshot) -> bool:
-    """Whether a snapshot brings samples that the one before did not have."""
+    """Return whether a snapshot has samples that the previous one did not have."""
     return last is None or (last.run, last.tick) != (snapshot.run, snapshot.tick)
 
 

@@ -1,1 +1,1 @@
-"""The pages of the screen: plain functions from what is known to rows of text."""
+"""The pages of the screen: plain functions that return rows of text."""

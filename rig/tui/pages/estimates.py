@@ -16,7 +16,7 @@ from rig.tui.drawing.rows import Row, block, box, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
 from rig.tui.following.link import TrackedPoint
 from rig.tui.look import PlotView
-from rig.tui.pages.parts import said_of
+from rig.tui.pages.parts import freshness_label
 from rig.tui.units import clock_text, shown
 from rig.tui.words import Freshness
 
@@ -26,9 +26,10 @@ LEAST_PLOT: Final = 5  # rows of a box: its frame, its line, a row of curve, the
 
 @dataclass(frozen=True)
 class OnlineSettings:
-    """From when on an experiment is said to go badly; shares are of 1.
+    """Limits of the warnings about an experiment; shares are of 1.
 
-    All are judged by eye on simulated benches, where a good experiment leaves 0.003 of the flow.
+    All are judged by eye on simulated benches, where a good experiment has a residual of 0.003 of
+    the flow.
     """
 
     updates: int = 8  # that changed an interval, before it is judged: some 16 s
@@ -36,8 +37,8 @@ class OnlineSettings:
     shrunk: float = 0.95  # of the interval at half the updates; 0.71 where each brings as much
     few: int = 5  # newest residuals whose median counts
     grown: float = 2.0  # times the least median before
-    small: float = 0.02  # of the equations' size, below which a residual need not worry
-    large: float = 0.5  # of the equations' size: the model says less than half of it
+    small: float = 0.02  # of the equations' size, below which a residual is no reason for a warning
+    large: float = 0.5  # of the equations' size: the model explains less than half of it
 
 
 ONLINE: Final = OnlineSettings()
@@ -46,7 +47,7 @@ ONLINE: Final = OnlineSettings()
 def half_widths(series: Sequence[TrackedPoint], name: str) -> list[tuple[float, float]]:
     """Return (time [s], half the 95 % interval over the value) where either has changed.
 
-    A parameter that the present step does not excite stays as it is, and says nothing.
+    A parameter that the present step does not excite does not change.
     """
     widths: list[tuple[float, float]] = []
     before: Sequence[float | None] = ()
@@ -72,7 +73,7 @@ def shares(series: Sequence[TrackedPoint], family: str) -> list[tuple[float, flo
 
 
 def warnings_of(series: Sequence[TrackedPoint]) -> list[str]:
-    """Return in sentences what speaks against the experiment, the residual first."""
+    """Return warnings about the experiment in sentences, the residual first."""
     warnings = []
     for family in families(series):
         warnings += _about_residual(EQUATIONS.get(family, (family, ""))[0], shares(series, family))
@@ -102,8 +103,8 @@ def _about_residual(name: str, left: Sequence[tuple[float, float]]) -> list[str]
     least = min(range(len(medians)), key=lambda k: medians[k])
     if now > ONLINE.large:
         return [
-            f"{name}: {now:.0%} of it is left over: the model says less than half of what is "
-            "measured. Check signs, units and sensors before going on."
+            f"{name}: {now:.0%} remains as residual: the model explains less than half. "
+            "Check signs, units and sensors before continuing."
         ]
     if now > max(ONLINE.small, ONLINE.grown * medians[least]):
         when = clock_text(left[least + few - 1][0])
@@ -122,7 +123,7 @@ def families(series: Sequence[TrackedPoint]) -> list[str]:
 def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return residuals and parameters with their 95 % intervals over the run's time.
 
-    What speaks against the experiment stands above them, what is not known yet below.
+    Warnings are above them, parameters still unknown below.
     """
     series = view.newest.estimates
     newest = series[-1].values if series else {}
@@ -159,7 +160,7 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def _residual(view: PlotView, family: str, width: int, height: int) -> list[Row]:
-    """Return what the estimates leave of new rows before they take them in, as a share of them."""
+    """Return the residual of new rows by the estimates before them, as a share of the rows."""
     name, unit = EQUATIONS.get(family, (family, ""))
     left = shares(view.newest.estimates, family)
     rms = view.newest.estimates[-1].residuals.get(family, (float("nan"),))[0]
@@ -167,7 +168,7 @@ def _residual(view: PlotView, family: str, width: int, height: int) -> list[Row]
     bad = bool(_about_residual(name, left))
     line = row(
         (f"{1e2 * share[-1]:.2g} %" if len(share) else "–", STRONG),
-        (f" of it, rms {rms:.2g} {unit}  ", DIM),
+        (f", rms {rms:.2g} {unit}  ", DIM),
         ("▲", WARN_TEXT) if bad else ("", ""),
     )
     return _box(
@@ -217,4 +218,4 @@ def _box(
     trace = PlotTrace(time, low, high, start, stop, (None, None), shown(""), live, True)
     plot = draw(trace, inner, height - 4)
     rows = [fit(line, inner), *plot, time_axis(start, stop, inner)]
-    return box(name, rows, width, height, DIM, said_of(view))
+    return box(name, rows, width, height, DIM, freshness_label(view))

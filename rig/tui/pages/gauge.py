@@ -28,7 +28,7 @@ def gauge(
 ) -> Row:
     """Return a row of `width` characters: name, value, lower limit, bar, upper limit.
 
-    The bar reaches over `reach`; without it the line ends in the travel as numbers.
+    The bar covers `reach`; without it the line ends in the travel as numbers.
     """
     how = shown(view.unit)
     limits = (limit(view.low), limit(view.high))
@@ -36,7 +36,7 @@ def gauge(
     space = (" " * max(NUMBER - width_of(number), 0), "")
     line: Row = ((f"{label:<{LABEL}}", DIM), space, *number)
     if reach is None:
-        # Nothing says how wide a bar ought to be: the travel in numbers is all there is to show.
+        # The range of a bar is unknown: show the travel in numbers.
         numbers = [how.number(end, sign=how.signed) for end in travel or ()]
         return fit((*line, (f"  {' … '.join(numbers)}", DIM)), width)
     low, high = (f"{how.short(level):>{LIMIT}}" for level in limits)

@@ -9,20 +9,20 @@ from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
     curve,
     curves,
+    freshness_label,
     joint_channels,
     joint_title,
     joints_in,
-    said_of,
 )
 from rig.tui.units import age_text, clock_text, limit, shown
 from rig.tui.words import NEARNESS, band_of, run_time, value
 
-TWO = 110  # from this width on, curves stand in two columns
+TWO = 110  # from this width on, curves are in two columns
 LIST = 26  # width of the list of channels
 
 
 def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return one joint: every channel as a curve where there is room, and as a bar."""
+    """Return one joint: every channel as a curve if there is room, and as a bar."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
     joints = list(joints_in(snapshot.channels))
@@ -41,7 +41,7 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     else:
         above = curves(view, names, inner, room)
     title = f"{joint_title(view, joint)} of {len(joints)}  ← →"
-    remark = said_of(view)
+    remark = freshness_label(view)
     note = f"last {view.look.seconds:g} s  + − ="
     return box(
         f"{title} · {remark}" if remark else title, [*above, *bars], width, height, DIM, note
@@ -49,7 +49,7 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return every channel in a list, the marked one as a plot with its bands in words."""
+    """Return a list of all channels, the marked one as a plot with its bands in words."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
     names = list(snapshot.channels)
@@ -97,7 +97,10 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
         ("samples a second", f"{snapshot.sample_rate:g}" if snapshot.sample_rate else "–"),
         ("channels", str(len(snapshot.channels))),
         ("pictures a second", f"{1 / frame.interval:.1f}" if frame.interval > 0 else "–"),
-        ("what the numbers are", (view.fresh.value, "" if not said_of(view) else WARN_TEXT)),
+        (
+            "what the numbers are",
+            (view.fresh.value, "" if not freshness_label(view) else WARN_TEXT),
+        ),
         ("state of the run / engine", f"{snapshot.state} / {snapshot.engine or '–'}"),
         ("in command", snapshot.holder or "nobody"),
         ("wire", snapshot.wire or "–"),
@@ -122,4 +125,4 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def _state_of(view: PlotView, last: float) -> str:
-    return "INVALID" if last != last else said_of(view) or "live"  # noqa: PLR0124 - NaN
+    return "INVALID" if last != last else freshness_label(view) or "live"  # noqa: PLR0124 - NaN

@@ -7,11 +7,11 @@ from rig.tui.drawing.styles import ASK, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import bench_bars, joint_box, joints_in
 
-MANUAL = "manual"  # the kind of session that takes jogs
+MANUAL = "manual"  # the kind of session that accepts jogs
 
 
 def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return what can be done by hand now, and the joints."""
+    """Return the manual actions possible now, and the joints."""
     snapshot = view.newest.snapshot
     if snapshot is None or view.newest.over:
         lines = [

@@ -17,7 +17,7 @@ from rig.tui.words import run_time
 
 BEFORE = 2.0  # of an alarm's channel shown before its first offending sample [s]
 AFTER = 0.5  # and after it [s]
-WIDE = 110  # from this width on, details stand beside the list
+WIDE = 110  # from this width on, details are to the right of the list
 
 
 def in_order(view: PlotView) -> list[tuple[Alarm, bool]]:
@@ -30,7 +30,7 @@ def in_order(view: PlotView) -> list[tuple[Alarm, bool]]:
 
 
 def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return the alarms, first causes on top, and the marked one in full."""
+    """Return the alarms, first causes first, and the details of the marked one."""
     listed = in_order(view)
     if not listed:
         text = row(
@@ -84,7 +84,7 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
 
 
 def _curve_before(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
-    """Return the 2 s before an alarm as a plot; nothing where they are not known."""
+    """Return the 2 s before an alarm as a plot; nothing if they are unknown."""
     window = view.frame.window
     if height < 4 or alarm.channel not in window.columns:
         return []
@@ -100,7 +100,7 @@ def _curve_before(view: PlotView, alarm: Alarm, width: int, height: int) -> list
 
 
 def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return the steps with the present one, what is asked, and who is in command."""
+    """Return the steps with the present one, the open question, and who is in command."""
     snapshot = view.newest.snapshot
     assert snapshot is not None
     if view.in_command:
@@ -134,7 +134,7 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def filtered(lines: Sequence[EventLine], view: PlotView) -> list[EventLine]:
-    """Return the lines of a log that the operator's filter and search keep."""
+    """Return the lines of a log that match the operator's filter and search."""
     wanted = view.look.search.lower()
     return [
         line
@@ -149,7 +149,7 @@ def log_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return the log of a run on the disk, with what is damaged in it."""
+    """Return the log of a run on the disk, with damaged lines reported."""
     log = view.browsed.log
     if log is None:
         return block([row((" no run was opened", DIM))], width, height)
@@ -168,11 +168,11 @@ def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
 def log_rows(
     event_lines: Sequence[EventLine], view: PlotView, width: int, height: int
 ) -> list[Row]:
-    """Return lines of a log, wrapped, the newest below; scrolled by rows."""
+    """Return lines of a log, wrapped, the newest last; scrolled by rows."""
     lines = filtered(event_lines, view)
     room = height - 1
     wanted = view.look.offset
-    # A line has a row at least: what is scrolled away above the window need not be wrapped.
+    # A line has at least one row: lines above the window need not be wrapped.
     rows = [line for entry in lines[-(room + wanted) :] for line in _log_line(entry, width)]
     offset = min(wanted, max(len(rows) - room, 0))
     search = f"  search: {view.look.search}" if view.look.search else ""

@@ -1,4 +1,4 @@
-"""Overview: the state of the bench in one glance from two metres."""
+"""Overview: the state of the bench, legible from two metres."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def overview(view: PlotView, width: int, height: int) -> list[Row]:
 def _band(
     headline: Headline, margin: Margin | None, view: PlotView, width: int, scale: int
 ) -> list[Row]:
-    """Return the large letters; what is not normal fills the band with its colour."""
+    """Return the large letters; an abnormal state fills the band with its colour."""
     snapshot = view.newest.snapshot
     assert snapshot is not None
     ground = LEVELS[headline.level] if headline.level not in ("normal", "ended") else ""
@@ -123,7 +123,7 @@ def alarm_mark(view: PlotView, alarm: Alarm) -> Row:
 
 
 def _joints(view: PlotView, joints: list[int], width: int, height: int) -> list[Row]:
-    """Return the joints side by side; those that do not fit are reached by scrolling."""
+    """Return the joints side by side; others are reached by scrolling."""
     if not joints or height < 3:
         return block([], width, max(height, 0))
     across = max(min(width // WIDTH, len(joints)), 1)

@@ -1,4 +1,4 @@
-"""What several pages draw: a joint, a channel's curve, the bars of the bench."""
+"""Parts of several pages: a joint, a channel's curve, the bars of the bench."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rig.tui.words import Freshness, value
 
 _JOINT_CHANNEL = re.compile(r"^(?P<kind>.+)_(?P<joint>[1-9]\d*)$")
 NAMES: Final = {ch.CAP: "cap", ch.ROD: "rod", ch.SUPPLY: "supply", ch.TEMPERATURE: "oil"}
-# Drawn as curves in this order, as many as there is room for; all are gauges as well.
+# Drawn as curves in this order, as many as fit; all are gauges as well.
 CURVES: Final = (ch.CAP, ch.ROD, ch.PISTON, ch.COMMAND, ch.SPOOL, ch.POSITION, ch.DRIVE)
 GAUGES: Final = (ch.CAP, ch.ROD, ch.PISTON, ch.SPOOL, ch.COMMAND, ch.POSITION, ch.DRIVE)
 CURVE_HEIGHT: Final = 4  # least rows of a curve with its words
@@ -37,12 +37,12 @@ def joints_in(channels: Iterable[str]) -> dict[int, list[str]]:
 
 
 def short_name(kind: str) -> str:
-    """Return the name of a kind of channel in as few letters as a gauge has."""
+    """Return the name of a kind of channel, short enough for a gauge."""
     return NAMES.get(kind, kind)
 
 
-def said_of(view: PlotView) -> str:
-    """Return what stands beside a picture that is not live, empty where it is."""
+def freshness_label(view: PlotView) -> str:
+    """Return the label of a picture that is not live, '' for a live one."""
     return {
         Freshness.LIVE: "",
         Freshness.ENDED: "last picture",
@@ -63,7 +63,7 @@ def bar_of(view: PlotView, name: str, label: str, width: int) -> Row:
 
 
 def _warned(snapshot: Snapshot, name: str) -> tuple[float, float] | None:
-    """Return the width of a bar whose channel has no limits but warns."""
+    """Return the range of a bar whose channel has warnings but no limits."""
     view = snapshot.channels[name]
     low, high = limit(view.warn_low), limit(view.warn_high)
     if low is None or high is None or not high > low:
@@ -105,7 +105,7 @@ def curve(
 
 
 def curves(view: PlotView, names: dict[str, str], width: int, height: int) -> list[Row]:
-    """Return as many of the channels ({name: label}) as curves as there is room for."""
+    """Return as many of the channels ({name: label}) as curves as fit."""
     count = min(len(names), height // CURVE_HEIGHT)
     axis = height > CURVE_HEIGHT * count
     rows: list[Row] = []
@@ -117,7 +117,7 @@ def curves(view: PlotView, names: dict[str, str], width: int, height: int) -> li
 
 
 def joint_title(view: PlotView, joint: int) -> str:
-    """Return a joint's name with what it does now."""
+    """Return a joint's name with its present activity."""
     snapshot = view.frame.snapshot
     roles = snapshot.roles if snapshot is not None else []
     role = ROLES.get(roles[joint - 1], "") if joint <= len(roles) else ""
@@ -135,9 +135,9 @@ def joint_channels(view: PlotView, joint: int, width: int) -> tuple[list[Row], d
 
 
 def joint_box(view: PlotView, joint: int, width: int, height: int) -> list[Row]:
-    """Return one joint in a frame: curves where there is room, bars always."""
+    """Return one joint in a frame: curves if there is room, bars always."""
     title = joint_title(view, joint)
-    remark = said_of(view)
+    remark = freshness_label(view)
     style = DIM if not remark or remark in ("last picture", "held") else WARN_TEXT
     title = f"{title} · {remark}" if remark else title
     inner = width - 4
@@ -147,7 +147,7 @@ def joint_box(view: PlotView, joint: int, width: int, height: int) -> list[Row]:
 
 
 def bench_bars(view: PlotView, width: int) -> list[Row]:
-    """Return supply pressure and oil temperature as bars, side by side where there is room."""
+    """Return supply pressure and oil temperature as bars, side by side if there is room."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
     names = [name for name in (ch.SUPPLY, ch.TEMPERATURE) if name in snapshot.channels]

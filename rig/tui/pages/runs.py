@@ -1,4 +1,4 @@
-"""Runs, protocols and the queue: what can be started and what was found."""
+"""Runs, protocols and the queue: what can be started, and results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, ro
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 
-WIDE = 110  # from this width on, the verb's output stands beside the list
+WIDE = 110  # from this width on, the verb's output is to the right of the list
 STATES = {"tripped": "■", "unreadable": "✕", "interrupted": "▲", "aborted": "▲", "running": "●"}
 
 

@@ -19,14 +19,14 @@ from rig.tui.units import shown
 
 Array = NDArray[np.float64]
 
-WIDE: Final = 110  # from this width on, the free run stands beside the text
-PLOT: Final = 6  # rows of a plot that stands below it
+WIDE: Final = 110  # from this width on, the free run is to the right of the text
+PLOT: Final = 6  # rows of a plot below it
 UNITS: Final = {"torque": "N·m", "force": "N", "flow": "m³/s"}  # by the first word of an equation
 SYMBOLS: Final = {"clean": "●", "explained": "●", "confounded": "▲", "unexplained": "▲"}
 
 
 def run_trace_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return what the stored trace of a run says."""
+    """Return the stored trace of a run."""
     trace = view.browsed.trace
     if trace is None:
         return block([row((" no run was opened", DIM))], width, height)
@@ -90,7 +90,7 @@ def _refused(effect: StoredEffect, width: int) -> list[Row]:
 
 
 def estimate_text(estimate: StoredEstimate) -> str:
-    """Return a value with half its 95 % interval and its unit, as a person writes it."""
+    """Return a value with half its 95 % interval and its unit."""
     low, high = estimate.ci95
     if estimate.value is None:
         return "not identified"
@@ -151,7 +151,7 @@ def free_run_rows(stored: StoredTrace, chosen: int, width: int, height: int) -> 
 
 
 def errors_of(curves: StoredCurves) -> tuple[Array, Array]:
-    """Return (before, after), each (n,): the free runs' differences from what was measured, SI."""
+    """Return (before, after), each (n,): the free runs' deviations from the measurement, SI."""
     measured = _array(curves.measured)
     return _array(curves.before) - measured, _array(curves.after) - measured
 

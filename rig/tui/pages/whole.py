@@ -1,4 +1,4 @@
-"""The whole screen: header, what must not be missed, the page, the keys, a question above all."""
+"""The whole screen: header, notices, the page, the keys, a question above all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rig.tui.pages import estimates, levels, manual, operation, overview, runs, 
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
 
-LEAST: Final = (60, 16)  # a smaller terminal shows the state and the stop, nothing else
+LEAST: Final = (60, 16)  # a smaller terminal shows only the state and the stop key
 NOTICES: Final = 6  # rows they may take
 Page = Callable[[PlotView, int, int], list[Row]]
 OF_A_RUN: Final[Mapping[str, Page]] = {
@@ -26,7 +26,7 @@ OF_A_RUN: Final[Mapping[str, Page]] = {
     "log": operation.log_page,
     "estimates": estimates.estimates_page,
 }
-OF_THE_DISK: Final[Mapping[str, Page]] = {  # and what needs no run on the screen
+OF_THE_DISK: Final[Mapping[str, Page]] = {  # and pages that need no run
     "runs": runs.runs_page,
     "run log": operation.run_log_page,
     "run trace": trace.run_trace_page,
@@ -49,7 +49,7 @@ KEYS: Final = {
 
 
 def compose(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return `height` rows of `width` cells: the picture of everything."""
+    """Return `height` rows of `width` cells: the whole picture."""
     if width <= 0 or height <= 0:
         return []
     if width < LEAST[0] or height < LEAST[1]:
@@ -76,7 +76,7 @@ def _page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def too_small(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return what a terminal without room for a page still says: the state, and that keys stop."""
+    """Return the content of a terminal without room for a page: the state and the stop keys."""
     head = headline(view.newest, view.now)
     style = LEVELS[head.level]
     lines = [
@@ -146,7 +146,7 @@ def _tabs(view: PlotView, width: int) -> Row:
 
 
 def notice_rows(view: PlotView, width: int) -> list[Row]:
-    """Return what the operator must not miss, each on its own colour over the whole width."""
+    """Return the notices, each on its own colour over the whole width."""
     rows: list[Row] = []
     standing = notices(view.newest, view.stop, view.now, paused=view.held)
     if view.look.page == "overview":  # it lists the alarms itself
@@ -170,7 +170,7 @@ def _keys(view: PlotView, width: int) -> Row:
 
 
 def waiting(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return what stands where there is no run: how to start one."""
+    """Return the page without a run: how to start one."""
     rig = view.rig or "shinshu-2dof"
     which = f" on rig {view.rig}" if view.rig else ""
     lines = [
@@ -214,7 +214,7 @@ def _above(rows: list[Row], view: PlotView, width: int) -> list[Row]:
     high = min(len(body) + 2, len(rows))
     drawn = box(dialog.title, body, wide, high, STRONG)
     top, left = max((len(rows) - high) // 2, 0), (width - wide) // 2
-    # What stands beside the box is left out: the question is all there is to read on these rows.
+    # On these rows only the question is shown.
     blank = [row()] * high
     middle = hstack([(blank, left), (drawn, wide), (blank, width - wide - left)], high, gap=0)
     return [*rows[:top], *middle, *rows[top + high :]]

@@ -1,4 +1,4 @@
-"""A screen as a process of its own, for one page; it attaches to a run like any other screen."""
+"""A screen as a separate process, for one page; it attaches to a run like any other screen."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LONGEST = 4096  # of a beat's text or of an error, in characters
 
 
 class AttachedScreen(AppService):
-    """Starts `words` with a page for its terminal; `ended` gets one line on how it ended."""
+    """Starts `words` with a page for its terminal; `ended` receives one line on its end."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class AttachedScreen(AppService):
         return {**super()._build_environment(width, height), "TEXTUAL_DRIVER": NAME}
 
     async def _open_app_process(self, width: int = 80, height: int = 24) -> Process:
-        # Without a shell, and in a session of its own: a Ctrl-C at the terminal is for the server.
+        # Without a shell, and in a separate session: a Ctrl-C at the terminal is for the server.
         self._process = process = await asyncio.create_subprocess_exec(
             *self._words,
             stdin=PIPE,
@@ -62,14 +62,14 @@ class AttachedScreen(AppService):
             env=self._build_environment(width, height),
             start_new_session=True,
         )
-        # What it says on standard error is read at its end; until then nothing comes from there.
+        # Standard error is read at its end.
         process.stderr = asyncio.StreamReader()
         process.stderr.feed_eof()
         self._stdin = process.stdin
         return process
 
     async def run(self) -> None:
-        """Hand on what the process draws until it has ended, then say how."""
+        """Pass on the process's output until it ends, then report its end."""
         await super().run()
         assert self._process is not None
         await self._wait(self._process)
@@ -80,7 +80,7 @@ class AttachedScreen(AppService):
             await self._ended(f"The screen ended: {reason}" if reason else CLOSED)
 
     async def stop(self) -> None:
-        """Ask the process to end, wait for it, kill it where it does not; then nothing is left."""
+        """Ask the process to end, wait, and kill it if it does not."""
         self._stopping = True
         task, self._task = self._task, None
         if task is None:
@@ -107,7 +107,7 @@ class AttachedScreen(AppService):
         await self.send_meta({"type": BEAT, "mark": str(mark)[:_LONGEST]})
 
     async def on_meta(self, data: bytes) -> None:
-        """Hand a beat back to the page; everything else is textual-serve's."""
+        """Return a beat to the page; other messages are textual-serve's."""
         meta = json.loads(data)
         if meta.get("type") == BEAT:
             await self.remote_write_str(json.dumps([BEAT, meta["mark"]]))
@@ -115,7 +115,7 @@ class AttachedScreen(AppService):
             await super().on_meta(data)
 
     async def _leaving(self) -> None:
-        """Let a screen end that announces its end; the page is told when the process has ended."""
+        """Let a screen end that announces its end; the page is informed afterwards."""
         asyncio.get_running_loop().call_later(GRACE, self._kill)
 
     def _kill(self) -> None:
@@ -131,7 +131,7 @@ class AttachedScreen(AppService):
             await process.wait()
 
     def _end_reason(self) -> str:
-        """Return why the process ended, in the words of its last error."""
+        """Return why the process ended: its last error message."""
         if self._process is None or self._process.returncode == 0:
             return ""
         self._errors.seek(0)

@@ -12,7 +12,7 @@ from textual.drivers.web_driver import WebDriver
 from textual.geometry import Size
 
 NAME: Final = f"{__name__}:PageDriver"
-BEAT: Final = "beat"  # a message that the page sends and expects back behind the frames before it
+BEAT: Final = "beat"  # a message that the page sends and expects back after the frames before it
 # Black on yellow, grey on black: those of the page's terminal have contrasts of 5 and 2.6 only.
 PALETTE: Final = "0;#000000;8;#8a8a8a"
 GRACE: Final = 2.0  # time in which a screen that was asked to end does so by itself [s]
@@ -22,12 +22,12 @@ class PageDriver(WebDriver):
     """Reads keys from its server and writes frames to it, over two pipes."""
 
     def start_application_mode(self) -> None:
-        """Take the page over, with colours that are read from two metres."""
+        """Start drawing on the page, with colours legible from two metres."""
         super().start_application_mode()
         self.write(f"\x1b]4;{PALETTE}\x1b\\")
 
     def run_input_thread(self) -> None:
-        """Read until the server closes the pipe, which it also does by being killed; then end."""
+        """Read until the server closes the pipe or is killed; then end."""
         super().run_input_thread()
         if self.exit_event.is_set():
             return
@@ -38,7 +38,7 @@ class PageDriver(WebDriver):
         self._app.post_message(messages.ExitApp())
 
     def on_meta(self, packet_type: str, payload: dict[str, Any]) -> None:
-        """Send a beat back through the screen's loop: it is late where the screen is."""
+        """Send a beat back through the screen's loop, so that its delay includes the screen's."""
         if packet_type == BEAT:
             with suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self.write_meta, payload)

@@ -1,7 +1,7 @@
 """`bramah monitor --web`: pages for browsers on loopback, and a screen process for each page.
 
-The server never speaks with a run: what a page shows and commands goes through its own screen, a
-process that attaches as one in a terminal does. No page, script, style or font is of elsewhere.
+The server has no connection to a run: display and commands go through the page's own screen, a
+process that attaches like one in a terminal. No page, script, style or font is external.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from rig.tui.web.attached_screen import AttachedScreen
 
 log = logging.getLogger(__name__)
 
-MOST_SCREENS: Final = 4  # pages at a time: each is a process beside the acquisition
-HEARTBEAT: Final = 5.0  # a page that does not answer within half of it is gone [s]
+MOST_SCREENS: Final = 4  # pages at a time: each is a process on the acquisition's computer
+HEARTBEAT: Final = 5.0  # a page that does not answer within half of it counts as closed [s]
 LARGEST: Final = 1 << 16  # message of a page [bytes]
 SHUTDOWN: Final = 5.0  # longest wait for pages when the server ends [s]
 FONTS: Final = ("DejaVuSansMono.ttf", "DejaVuSansMono-Bold.ttf", "DejaVuSans.ttf")
@@ -45,7 +45,7 @@ PAGE_POLICY: Final = (
     "img-src 'self' data:; connect-src ws://{host}; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-# A report brings its own scripts and pictures: it may draw, and reach neither page nor network.
+# A report has its own scripts and pictures: it may draw, without access to page or network.
 REPORT_POLICY: Final = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data:; font-src data:"
@@ -53,7 +53,7 @@ REPORT_POLICY: Final = (
 
 
 class _InOneLine(logging.Filter):
-    """Leaves the traceback out of a line of the log, unless everything is logged."""
+    """Removes the traceback from a line of the log, unless everything is logged."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if not log.isEnabledFor(logging.DEBUG):
@@ -62,7 +62,7 @@ class _InOneLine(logging.Filter):
 
 
 class PageServer(Server):
-    """Serves the page and its files, and starts a screen for each page that is open."""
+    """Serves the page and its files, and starts a screen for each open page."""
 
     def __init__(self, words: Sequence[str], token: str) -> None:
         super().__init__(command=words[0], host=LOOPBACK, title="bramah monitor")
@@ -112,19 +112,19 @@ class PageServer(Server):
     async def _with_headers(self, request: web.Request, response: web.StreamResponse) -> None:
         report = request.path.startswith("/download/")
         policy = REPORT_POLICY if report else PAGE_POLICY.format(host=request.host)
-        # A host that was refused stands in no header.
+        # A refused host is in no header.
         response.headers["Content-Security-Policy"] = (
             policy if response.status != web.HTTPForbidden.status_code else "default-src 'none'"
         )
         response.headers.update(HEADERS)
 
     async def handle_index(self, request: web.Request) -> web.Response:
-        """Return the page, whose addresses all hold the token and lead back here."""
+        """Return the page, whose addresses all contain the token and lead to this server."""
         text = self._template.render(
             title=self.title,
             query=f"token={self._token}",
             # Where the browser reached it: the port may be a forwarded one. The terminal's script
-            # appends "?width=…", which ends in a key that nobody reads; the size follows anyway.
+            # appends "?width=…", which ends in an unused key; the size follows in a message.
             websocket=f"ws://{request.host}/ws?token={self._token}&terminal=",
         )
         return web.Response(text=text, content_type="text/html")
@@ -135,7 +135,7 @@ class PageServer(Server):
         return web.Response(text=text, content_type="text/javascript")
 
     async def handle_font(self, request: web.Request) -> web.FileResponse:
-        """Return one of the fonts that have every letter of the screen; matplotlib brings them."""
+        """Return one of the fonts with every letter of the screen, from matplotlib."""
         name = request.match_info["name"]
         if name not in FONTS:
             raise web.HTTPNotFound
@@ -170,7 +170,7 @@ class PageServer(Server):
     async def _process_messages(  # type: ignore[override]
         self, page: web.WebSocketResponse, screen: AttachedScreen
     ) -> None:
-        """Hand keys, sizes and beats to the screen until the page is closed."""
+        """Pass keys, sizes and beats to the screen until the page is closed."""
         async for message in page:
             if message.type is not WSMsgType.TEXT:
                 continue
@@ -187,14 +187,14 @@ class PageServer(Server):
                 await screen.blur()
 
     async def _send(self, page: web.WebSocketResponse, text: str) -> None:
-        """Send a page what a screen asks of it; the address of a download needs the token."""
+        """Send a screen's request to a page; the address of a download needs the token."""
         kind, mark = json.loads(text)
         if kind == "deliver_file_start":
             mark = f"{mark}?token={self._token}"
         await page.send_json([kind, mark])
 
     async def _end(self, page: web.WebSocketResponse, why: str) -> None:
-        """Say on a page why its screen is over, and close it."""
+        """Show on a page why its screen has ended, and close it."""
         if not page.closed:
             await page.send_json(["ended", why])
             await page.close()
@@ -211,10 +211,10 @@ def listen(port: int) -> socket.socket:
 
 
 def serve(words: Sequence[str], listening: socket.socket, ready: Callable[[str], None]) -> int:
-    """Serve screens that are started by `words` until a signal; returns the exit code.
+    """Serve screens started by `words` until a signal; return the exit code.
 
-    `ready` is called with the address, which holds the token. SIGINT ends with 130, SIGTERM and a
-    closed terminal with 0.
+    `ready` is called with the address, which contains the token. SIGINT ends with 130, SIGTERM and
+    a closed terminal with 0.
     """
     return asyncio.run(_serve(words, listening, ready))
 
@@ -230,9 +230,9 @@ async def _serve(
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, heard, number)
-    # Whatever another program sends to the port, the operator's terminal shows no traceback.
+    # Another program's requests must not cause tracebacks in the operator's terminal.
     logging.getLogger("aiohttp.server").addFilter(_InOneLine())
-    logging.getLogger("textual-serve").setLevel(logging.CRITICAL)  # a screen says why it ended
+    logging.getLogger("textual-serve").setLevel(logging.CRITICAL)  # a screen states why it ended
     token = new_token()
     app = await PageServer(words, token).make_app()
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN)

@@ -18,8 +18,8 @@ from analysis.simulation.validate import validate
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
-from analysis.trace.data.undeclared_loads import undeclared_load
 from analysis.trace.engine import trace
+from analysis.trace.search.undeclared_loads import undeclared_load
 from rig.model.records import LOADED, Record, Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH, default_excitations, experiment

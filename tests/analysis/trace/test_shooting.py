@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from analysis.effects.base import Effect
-from analysis.identify.output_error.hidden_states import hidden_effects, rest_of, shot
+from analysis.identify.output_error.hidden_states import hidden_effects, shot, window_error
 from analysis.simulation.model import Estimate, Model
 from analysis.terms import make
 from analysis.terms.base import Used
@@ -51,7 +51,7 @@ def test_shooting_finds_the_lag_from_a_start_that_is_half_of_it(
     (tau,) = found.shapes.values()
     assert tau.value == pytest.approx(TAU, rel=0.03)
     right, _ = lagging(rig, tau.value)
-    assert rest_of([runs[1]], right, effect) < 0.8 * rest_of([runs[1]], model, effect)
+    assert window_error([runs[1]], right, effect) < 0.8 * window_error([runs[1]], model, effect)
 
 
 def test_rows_and_shooting_agree_on_a_lag_and_both_are_told(result: Trace) -> None:
@@ -92,7 +92,7 @@ def test_held_out_records_in_which_the_joint_stands_judge_nothing(
 ) -> None:
     model, effect = lagging(rig, TAU)
     still = replace(runs[1], records=tuple(replace(r, locked=(1, 2)) for r in runs[1].records))
-    assert rest_of([still], model, effect) == float("inf")
+    assert window_error([still], model, effect) == float("inf")
     (found,) = result.effects
     assert found.shot is not None
     unjudged = replace(found.shot, before=float("inf"), after=float("inf"))
