@@ -53,8 +53,8 @@ class BlockDecoder:
         self._almost_top = self._rows([top - 1, 2 * most], np.uint16)
         self._scale = self._rows([step, volt], np.float64)
         self._offset = self._rows([low, -(most * volt)], np.float64)
-        self._sequence: int | None = None
         self.tick = 0  # of the next expected sample
+        self.restart()
 
     def _rows(self, parts: Sequence[Array], kind: type[np.generic]) -> NDArray[Any]:
         """Return one value per column, repeated for every sample.
@@ -63,14 +63,11 @@ class BlockDecoder:
         """
         return np.tile(np.concatenate(parts).astype(kind), (self.layout.samples, 1))
 
-    @property
-    def acknowledge(self) -> int:
-        """The number of the last decoded block; before the first one, an unused number."""
-        return 0xFFFF if self._sequence is None else self._sequence & 0xFFFF
-
     def restart(self, tick: int | None = None) -> None:
         """Expect a stream with new numbers; `tick` is the clock of another device."""
-        self._sequence = None
+        self._sequence: int | None = None
+        # The number of the last decoded block; before the first one, an unused number.
+        self.acknowledge = 0xFFFF
         if tick is not None:
             self.tick = tick
 
@@ -105,19 +102,24 @@ class BlockDecoder:
         data = codes.astype(np.float64)
         data *= self._scale
         data += self._offset
-        self._sequence, self.tick = sequence, tick + self.layout.samples
+        self._sequence, self.acknowledge = sequence, header.sequence
+        self.tick = tick + self.layout.samples
+        status = header.status
         return SampleBlock(
             sequence=sequence,
             tick=tick,
             data=data,
             saturated=ends[:, : self.layout.channels],
             backlog=header.backlog,
-            tripped=bool(header.status & _TRIPPED),
-            armed=bool(header.status & _ARMED),
+            tripped=status & _TRIPPED != 0,
+            armed=status & _ARMED != 0,
         )
 
     def _follow(self, header: BlockHeader) -> tuple[int, int]:
         """Return unwrapped (sequence, tick) if the numbers can be those of the next block."""
+        in_order = header.sequence == (self.acknowledge + 1) & 0xFFFF
+        if in_order and self._sequence is not None and header.tick == self.tick & 0xFFFFFFFF:
+            return self._sequence + 1, self.tick
         tick = unwrap(header.tick, self.tick, 32)
         last = -1 if self._sequence is None else self._sequence
         lost = (header.sequence - last - 1) & 0xFFFF

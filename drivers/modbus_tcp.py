@@ -36,6 +36,7 @@ from drivers.bench_protocol import (
     wave_codes,
 )
 from drivers.modbus_blocks import BlockDecoder, unwrap
+from drivers.modbus_frames import write_and_read_request
 from drivers.modbus_transport import ModbusConnection, TcpConnection
 from drivers.settings import DRIVER
 from rig.model.parts import LOCALHOST, PORT, Wire
@@ -47,6 +48,7 @@ logger = logging.getLogger(__name__)
 
 _BLOCK: Final = int(Status.BLOCK)
 _STREAMING: Final = int(Status.STREAMING)
+_ACKNOWLEDGEMENT: Final = struct.Struct(">HH")  # a block's number, the heartbeat
 
 
 class TcpSettings(WireSettings):
@@ -84,6 +86,10 @@ class ModbusTcpDriver:
         self._tries = math.ceil(wire.timeout / self._wait - 1e-9)
         self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
         self._decoder = BlockDecoder(rig)
+        # The request for a block, to which the acknowledgement is appended.
+        self._block_request = write_and_read_request(
+            reg.CONTROL_ACK.address, [0, 0], reg.BLOCK.address, self._layout.words
+        )[: -_ACKNOWLEDGEMENT.size]
         self._heartbeat = 0
         self._due: float | None = None  # when the next block can be ready [s], by time.monotonic
         self.info: DeviceInfo | None = None
@@ -212,10 +218,7 @@ class ModbusTcpDriver:
     def ask_ahead(self) -> None:
         """Request the next block of a device in virtual time, which computes it meanwhile."""
         if self.info is not None and self.info.virtual_time and self._link.pipelines:
-            words = self._acknowledgement()
-            self._link.ask_ahead(
-                reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words
-            )
+            self._link.ask_ahead(self._next_request(), self._layout.words)
 
     def read_block(self) -> SampleBlock:
         """Return the next block, waiting for it; also feeds the device's watchdog."""
@@ -273,7 +276,13 @@ class ModbusTcpDriver:
             try:
                 if number:
                     self._link.settle()
-                answer = self._exchange_once()
+                if self._link.asked_ahead:
+                    answer = self._link.answer_ahead(self._wait)
+                else:
+                    request = self._next_request()
+                    answer = self._link.registers(request, self._layout.words, self._wait)
+            except DeviceRefused as refused:
+                raise self._explained(refused, "block") from refused
             except DeviceSilent as silent:
                 # The block stays in the device until acknowledged, so that it is sent again.
                 last = silent
@@ -291,21 +300,12 @@ class ModbusTcpDriver:
             f"{damaged}"
         )
 
-    def _exchange_once(self) -> bytes:
-        try:
-            if self._link.asked_ahead:
-                return self._link.answer_ahead(self._wait)
-            words = self._acknowledgement()
-            return self._link.write_and_read(
-                reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words, self._wait
-            )
-        except DeviceRefused as refused:
-            raise self._explained(refused, "block") from refused
-
-    def _acknowledgement(self) -> list[int]:
-        """Return the words written with a block's request: last number, new heartbeat."""
+    def _next_request(self) -> bytes:
+        """Return the request for a block, which writes the last number and a new heartbeat."""
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF
-        return [self._decoder.acknowledge, self._heartbeat]
+        return self._block_request + _ACKNOWLEDGEMENT.pack(
+            self._decoder.acknowledge, self._heartbeat
+        )
 
     def _status(self) -> bytes:
         first, end = reg.STATUS_SPAN

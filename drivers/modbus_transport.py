@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-import select
 import socket
+import struct
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
@@ -26,6 +26,7 @@ from drivers.modbus_frames import (
 logger = logging.getLogger(__name__)
 
 _CHUNK = 4096
+_SHORTEST = 1e-3  # [s] of waiting for bytes
 
 
 class ModbusConnection(ABC):
@@ -97,47 +98,47 @@ class ModbusConnection(ABC):
         self, write_at: int, words: list[int], read_at: int, count: int, within: float | None = None
     ) -> bytes:
         """Write, then read, in one transaction (function 23) of at most `within` [s]."""
-        request = write_and_read_request(write_at, words, read_at, count)
-        return self._payload(request, self._ask(request, within), count)
+        return self.registers(
+            write_and_read_request(write_at, words, read_at, count), count, within
+        )
+
+    def registers(self, request: bytes, count: int, within: float | None = None) -> bytes:
+        """Return the `count` registers for which a request (a PDU) asks, within `within` [s]."""
+        return self._payload(request, self._end(self._begin(request), within), count)
 
     @property
     def asked_ahead(self) -> bool:
         """Whether `answer_ahead` has an answer to wait for."""
         return self._ahead is not None
 
-    def ask_ahead(self, write_at: int, words: list[int], read_at: int, count: int) -> None:
-        """Send the request of `write_and_read` for `answer_ahead`; never raises.
+    def ask_ahead(self, request: bytes, count: int) -> None:
+        """Send the request of `registers` for `answer_ahead`; never raises.
 
         A failed connection is reported at the next request.
         """
-        request = write_and_read_request(write_at, words, read_at, count)
         with suppress(DeviceError):
             self._ahead = self._begin(request), request, count
 
     def answer_ahead(self, within: float | None = None) -> bytes:
-        """Return the registers requested by `ask_ahead`; raises as `write_and_read`."""
+        """Return the registers requested by `ask_ahead`; raises as `registers`."""
         ahead, self._ahead = self._ahead, None
         if ahead is None:
             raise ValueError("nothing was asked ahead")
         number, request, count = ahead
         return self._payload(request, self._end(number, within), count)
 
-    def _ask(self, request: bytes, within: float | None = None) -> bytes:
+    def _ask(self, request: bytes) -> bytes:
         """Return the answer to a request; raises DeviceRefused for a refused one."""
-        return self._end(self._begin(request), within)
+        return self._end(self._begin(request), None)
 
     def _begin(self, request: bytes) -> int:
         """Send a request; returns its number."""
-        if not self.is_open:
-            raise DeviceLost(f"the connection to the device at {self.where} is closed")
         if self._ahead is not None:
             self._given_up, self._ahead = self._ahead[0], None
         return self._send(request)
 
     def _end(self, number: int, within: float | None) -> bytes:
         """Return the answer to a request by its number."""
-        if not self.is_open:
-            raise DeviceLost(f"the connection to the device at {self.where} is closed")
         patience = self._timeout if within is None else min(within, self._timeout)
         answer = self._receive(number, self._factor * patience)
         self._answered = True
@@ -150,13 +151,18 @@ class ModbusConnection(ABC):
 
     @abstractmethod
     def _send(self, request: bytes) -> int:
-        """Send a PDU; returns its number."""
+        """Send a PDU; returns its number. Raises DeviceLost where the connection is closed."""
 
     @abstractmethod
     def _receive(self, number: int, patience: float) -> bytes:
-        """Return the PDU that answers request `number` within `patience` [s]."""
+        """Return the PDU that answers request `number` within `patience` [s].
+
+        Raises DeviceLost where the connection is closed.
+        """
 
     def _payload(self, request: bytes, answer: bytes, count: int) -> bytes:
+        if answer[0] == request[0] and answer[1] == 2 * count == len(answer) - 2:
+            return answer[2:]
         try:
             payload = payload_of(answer)
         except ValueError:
@@ -201,6 +207,7 @@ class TcpConnection(ModbusConnection):
         self._address = host, port
         self._socket: socket.socket | None = None
         self._waiting = b""  # received and not yet read
+        self._limit = 0.0  # [s] for which the system waits for bytes
         self._transaction = 0
 
     @property
@@ -219,8 +226,9 @@ class TcpConnection(ModbusConnection):
                 f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setblocking(False)  # with a timeout every call needs two system calls
-        self._waiting = b""
+        # With Python's own timeout every call needs two system calls.
+        self._socket.setblocking(True)
+        self._waiting, self._limit = b"", 0.0
 
     def _disconnect(self) -> None:
         opened, self._socket = self._socket, None
@@ -228,11 +236,12 @@ class TcpConnection(ModbusConnection):
             opened.close()
 
     def _send(self, request: bytes) -> int:
-        assert self._socket is not None
+        if self._socket is None:
+            raise self._closed()
         self._transaction = self._transaction % 0xFFFF + 1
         frame = tcp_frame(self._transaction, self._unit, request)
         try:
-            sent = self._socket.send(frame)
+            sent = self._socket.send(frame, socket.MSG_DONTWAIT)
         except OSError as error:
             self._lost(error)
         if sent < len(frame):  # no request is that long: the device has stopped reading
@@ -241,13 +250,15 @@ class TcpConnection(ModbusConnection):
 
     def _receive(self, number: int, patience: float) -> bytes:
         until = time.monotonic() + patience
+        if not self._waiting:
+            self._waiting = self._more(patience)
         while True:
             try:
                 frame = read_tcp_frame(self._waiting)
             except ValueError:
                 raise self._no_answer(len(self._waiting)) from None
             if frame is None:
-                self._waiting += self._more(until)
+                self._waiting += self._more(until - time.monotonic())
                 continue
             self._waiting = self._waiting[frame.used :]
             if frame.transaction == number and frame.unit == self._unit:
@@ -255,19 +266,27 @@ class TcpConnection(ModbusConnection):
             if frame.transaction != self._given_up:
                 logger.warning("a late answer from %s is dropped", self.where)
 
-    def _more(self, until: float) -> bytes:
-        """Return the bytes that arrive before a time [s, monotonic]."""
-        assert self._socket is not None
+    def _more(self, patience: float) -> bytes:
+        """Return the bytes that arrive within `patience` [s]."""
+        if self._socket is None:
+            raise self._closed()
         try:
-            ready, _, _ = select.select([self._socket], [], [], max(until - time.monotonic(), 0.0))
-            data = self._socket.recv(_CHUNK) if ready else b""
+            if patience != self._limit:
+                # The system waits in the call that receives; zero would be for ever.
+                self._limit = max(patience, _SHORTEST)
+                limit = struct.pack("@ll", *divmod(round(self._limit * 1e6), 1_000_000))
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+            data = self._socket.recv(_CHUNK)
+        except BlockingIOError:
+            raise self._no_answer(len(self._waiting)) if self._waiting else self._silent() from None
         except OSError as error:
             self._lost(error)
-        if not ready:
-            raise self._no_answer(len(self._waiting)) if self._waiting else self._silent()
         if not data:
             self._lost(None)
         return data
+
+    def _closed(self) -> DeviceLost:
+        return DeviceLost(f"the connection to the device at {self.where} is closed")
 
     def _lost(self, error: OSError | None) -> NoReturn:
         self.close()

@@ -20,6 +20,7 @@ from rig.bench.checks import bands
 from rig.bench.checks.frozen import Frozen
 from rig.bench.checks.plausibility import Plausibility
 from rig.bench.checks.rates import rate_window, rates
+from rig.bench.checks.recent import Recent
 from rig.bench.checks.roles import EXCITED, FREE, JointRole, piston_bounds
 from rig.bench.checks.saturation import Saturation
 from rig.bench.checks.settings import GuardSettings
@@ -80,6 +81,7 @@ class Guard:
         bounds = [rate.bounds for rate in self._rates] or [np.full(len(rig.recorded), math.inf)]
         self._steady = rig.alarms.warning_share * np.minimum.reduce(bounds)
         self._keep = max(self._rate_window, self._window)
+        self._recent = Recent(len(rig.recorded), self._keep)
         self._saturation = Saturation(rig, self.settings)
         self._plausibility = Plausibility(rig, self.settings)
         warning, trip = bands.delays(rig, self.settings)
@@ -97,11 +99,16 @@ class Guard:
 
     def forget(self) -> None:
         """Reset: the next block does not continue the previous one."""
-        self._tail: Array = np.empty((0, len(self.rig.recorded)))
-        self._unbroken = 0  # rows at the end of the tail without a gap
-        for check in (self._saturation, self._outside_trip, self._outside_warning):
-            check.forget()
+        self._recent.forget()
+        self._unbroken = 0  # latest samples without a gap
+        self._forget_outside()
+        self._saturation.forget()
         self._plausibility.forget()
+
+    def _forget_outside(self) -> None:
+        self._outside_trip.forget()
+        self._outside_warning.forget()
+        self._calm = True  # no sample of the latest block was outside its band
 
     def set_roles(self, roles: Sequence[JointRole]) -> None:
         """Set the joints' roles from the next block on; raises ValueError for a wrong number."""
@@ -118,7 +125,7 @@ class Guard:
         excited = [
             frozen.judged for r, frozen in zip(roles, self._frozen, strict=True) if r.excited
         ]
-        self._may_freeze = np.any(excited or [np.zeros(len(self.rig.recorded), bool)], axis=0)
+        self._may_freeze = np.any(excited, axis=0) if excited else None
         self._plausibility.restart()
 
     def gap(self, lost: int, tick: int) -> Violation | None:
@@ -162,63 +169,68 @@ class Guard:
         Updates `warnings`.
         """
         data = block.data
-        last = block.tick + len(data) - 1
-        joined = np.concatenate((self._tail, data))
-        recent = joined[-(len(data) + self._rate_window) :]
+        new, last = len(data), block.tick + len(data) - 1
+        self._recent.add(data)
+        self._unbroken = min(self._unbroken, self._keep) + new
+        recent = self._recent.last(new + self._rate_window)
         least, most = np.minimum.reduce(recent, axis=0), np.maximum.reduce(recent, axis=0)
-        calm = self._tightest.contain(least, most)  # true for almost every block
-        trips = [self._band_trip(block, calm)]
-        self._unbroken = min(self._unbroken, len(self._tail)) + len(data)
+        trips: list[Violation] = []
+        was_calm, self._calm = self._calm, self._tightest.contain(least, most)
+        if not self._calm:  # few blocks
+            trips += self._band_trips(block)
+        elif not was_calm:
+            self._forget_outside()
         # The range of the samples bounds every difference.
-        if not (calm and np.count_nonzero(most - least <= self._steady) == len(self._steady)):
-            with np.errstate(invalid="ignore"):  # inf - inf; the check of bands reports the sample
-                trips += self._rate_trips(joined[-self._unbroken :], len(data), last)
-        measured = data[:, : block.saturated.shape[1]]
-        trips.append(self._saturation.find(block.saturated, measured, block.tick))
-        trips += self._act(self._frozen_sensors(joined[-self._window :], last), last)
-        trips += self._act(self._plausibility.look(block, self.roles) or (), last)
-        self._band_warnings(block, last, calm)
-        self._standing.expire(last)
-        self._tail = joined[-self._keep :]
-        violations = [violation for violation in trips if violation is not None]
-        return min(violations, key=lambda violation: violation.tick, default=None)
+        if not (self._calm and np.count_nonzero(most - least <= self._steady) == len(most)):
+            trips += self._rate_trips(new, last)
+        trips += self._saturation.find(block)
+        if self._may_freeze is not None:
+            trips += self._frozen_sensors(last)
+        findings = self._plausibility.look(block, self.roles)
+        if findings:
+            trips += self._act(findings, last)
+        if not self._calm:
+            self._band_warnings(block, last)
+        if self._standing.warnings:
+            self._end_warnings(block, last)
+        return min(trips, key=lambda violation: violation.tick) if trips else None
 
-    def _rate_trips(self, rows: Array, new: int, last: int) -> list[Violation | None]:
-        """Return the trips by rate in the last `new` of `rows`, which end at tick `last`."""
-        trips = []
-        for rate in self._rates:
-            first = last + 1 - len(rows)
-            trip, near = rate.find(self.rig, rows, first, new, self.rig.alarms.warning_share)
-            trips.append(trip)
-            self._standing.see(near, last)
+    def _rate_trips(self, new: int, last: int) -> list[Violation]:
+        """Return the trips by rate in the latest `new` samples, which end at tick `last`."""
+        rows, trips = self._recent.last(self._unbroken), []
+        with np.errstate(invalid="ignore"):  # inf - inf; the check of bands reports the sample
+            for rate in self._rates:
+                first = last + 1 - len(rows)
+                trip, near = rate.find(self.rig, rows, first, new, self.rig.alarms.warning_share)
+                if trip is not None:
+                    trips.append(trip)
+                self._standing.see(near, last)
         return trips
 
     def _act(self, violations: Sequence[Violation], last: int) -> list[Violation]:
         """Warn or trip as the rig file says; return the violations that trip."""
-        if not violations:
-            return []
         self._standing.see([v for v in violations if self._actions[v.limit] == "warn"], last)
         return [v for v in violations if self._actions[v.limit] == "trip"]
 
-    def _band_trip(self, block: SampleBlock, calm: bool) -> Violation | None:
-        over = self._outside_trip.over(None if calm else self._trip.outside(block.data))
-        if over is None:
-            return None
-        row, column = bands.first_of(over)
-        return self._of_band(block, row, column, self._trip)
+    def _band_trips(self, block: SampleBlock) -> list[Violation]:
+        over = self._outside_trip.over(self._trip.outside(block.data))
+        return [] if over is None else [self._of_band(block, *bands.first_of(over), self._trip)]
 
-    def _band_warnings(self, block: SampleBlock, last: int, calm: bool) -> None:
-        over = self._outside_warning.over(None if calm else self._warn.outside(block.data))
+    def _band_warnings(self, block: SampleBlock, last: int) -> None:
+        over = self._outside_warning.over(self._warn.outside(block.data))
         if over is not None:
             columns = np.flatnonzero(over.any(axis=0)).tolist()
             rows = [int(np.argmax(over[:, column])) for column in columns]
             pairs = zip(rows, columns, strict=True)
             self._standing.see([self._of_band(block, r, c, self._warn) for r, c in pairs], last)
-        if self._standing.warnings:
-            outside = self._inner.outside(block.data).any(axis=0)
-            for column in np.flatnonzero(outside).tolist():
-                name = self.rig.recorded[column]
-                self._standing.keep(name, self._band_of(name), last)
+
+    def _end_warnings(self, block: SampleBlock, last: int) -> None:
+        """End the warnings whose cause has been absent for long enough, with hysteresis."""
+        outside = self._inner.outside(block.data).any(axis=0)
+        for column in np.flatnonzero(outside).tolist():
+            name = self.rig.recorded[column]
+            self._standing.keep(name, self._band_of(name), last)
+        self._standing.expire(last)
 
     def _band_of(self, name: str) -> str:
         """Return the name of a channel's limit for its joint's role."""
@@ -238,8 +250,9 @@ class Guard:
         tick = block.tick + row
         return Violation(limit, value, bounds.of(column), ch.unit_of(name), joint, name, tick)
 
-    def _frozen_sensors(self, window: Array, last: int) -> list[Violation]:
-        """Return the violation of an excited joint's channel that kept one value in the window."""
+    def _frozen_sensors(self, last: int) -> list[Violation]:
+        """Return the trip of an excited joint's channel that kept one value in the window."""
+        window = self._recent.last(self._window)
         if len(window) < self._window:
             return []
         if not np.count_nonzero((window[0] == window[-1]) & self._may_freeze):
@@ -251,5 +264,6 @@ class Guard:
             name = self.rig.recorded[column]
             allowed = (-math.inf, self.settings.frozen_after)
             value = float(window[-1, column])
-            return [Violation(FROZEN, value, allowed, ch.unit_of(name), joint, name, last)]
+            frozen_sensor = Violation(FROZEN, value, allowed, ch.unit_of(name), joint, name, last)
+            return self._act([frozen_sensor], last)
         return []

@@ -278,6 +278,7 @@ class Bench:
         zeroed first; a block that trips is journalled as well.
         """
         self._heed()
+        trip = None
         with self._outputs:
             block = self._driver.read_block()
             if more:
@@ -285,11 +286,9 @@ class Bench:
             late = None if self._arrival is None else self._arrival.late(block, self._clock())
             lost = self._continue(block)
             violation = self._inspect(block, lost, late)
-        trip = None
-        if violation is not None:
-            self.zero_outputs()
-            trip = self._latch(violation)
-        with self._outputs:
+            if violation is not None:
+                self.zero_outputs()
+                trip = self._latch(violation)
             self._keep(block, late, lost)
             self._timing.add(block)
             self._note_alarms(violation)

@@ -163,7 +163,7 @@ class Recorder:
 
     def append(self, block: SampleBlock, late: float | None) -> None:
         """Write one block, which arrived `late` [s] (None in virtual time)."""
-        journal = self._open_journal()
+        journal = self._journal or self._open_journal()
         journal.append(self._stream, block, late)
         if self._clock is None:
             self._begin_clock(block, virtual=late is None)

@@ -77,13 +77,10 @@ class Delayed:
         """Reset: the next samples do not continue the previous ones."""
         self._runs: Counts = np.zeros(len(self._delay), dtype=np.int64)
 
-    def over(self, outside: Flags | None) -> Flags | None:
-        """Mark the samples outside for longer than the delay; None if there are none.
-
-        `outside` is None for a block entirely inside.
-        """
-        if outside is None or not outside.any():
-            self._runs[:] = 0
+    def over(self, outside: Flags) -> Flags | None:
+        """Mark the samples outside for longer than the delay; None if there are none."""
+        if not outside.any():
+            self.forget()
             return None
         runs = run_lengths(outside, self._runs)
         self._runs = runs[-1]

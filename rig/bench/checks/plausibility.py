@@ -1,15 +1,15 @@
 """Plausibility: checks of the channels of a joint against each other, over a window.
 
-Features are computed over overlapping windows of the latest samples, `hop` [s] apart. The window
-is stored by channel, (recorded, n), because numpy reduces rows much faster than columns. A finding
-is reported when it lasts for `confirm` [s]. A window never extends across a change of roles or
-across a gap that trips.
+Features are computed over overlapping windows of the latest samples, `hop` [s] apart. A finding is
+reported when it lasts for `confirm` [s]. A window never extends across a change of roles or across
+a gap that trips.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,34 @@ _SLOWEST_RATE = 400.0  # [Hz]; below it, the third difference of a motion is no 
 _FEWEST = 20  # samples in a window
 
 
+@dataclass(frozen=True)
+class _Window:
+    """Samples of a window, `data` (recorded, n) and `expected` spools (joints, n) [V].
+
+    By channel, because numpy reduces rows much faster than columns. `least`, `most` and `mean` of
+    each channel, (recorded,).
+    """
+
+    data: Array
+    expected: Array
+    least: list[float]
+    most: list[float]
+    mean: list[float]
+
+    @classmethod
+    def of(cls, data: Array, expected: Array) -> _Window:
+        least, most = np.minimum.reduce(data, axis=1), np.maximum.reduce(data, axis=1)
+        return cls(data, expected, least.tolist(), most.tolist(), _mean(data).tolist())
+
+    def swing(self, column: int) -> float:
+        """Return the peak-to-peak value of a channel."""
+        return self.most[column] - self.least[column]
+
+    def at_zero(self, column: int) -> bool:
+        """Return whether every sample of a channel is zero."""
+        return self.least[column] == 0.0 == self.most[column]
+
+
 class Plausibility:
     """Checks windows of consecutive blocks."""
 
@@ -62,6 +90,8 @@ class Plausibility:
         def columns(kind: str) -> list[int]:
             return [rig.recorded.index(ch.channel(kind, i)) for i in each]
 
+        self._spools_at = np.array(columns(ch.SPOOL))
+        self._commands_at = np.array(columns(ch.COMMAND))
         self._spool, self._piston = columns(ch.SPOOL), columns(ch.PISTON)
         self._cap, self._rod = columns(ch.CAP), columns(ch.ROD)
         self._command = columns(ch.COMMAND)
@@ -88,8 +118,8 @@ class Plausibility:
     def restart(self) -> None:
         """Begin a new window, because the joints' roles change."""
         self._follow()
-        self._parts: list[Array] = []
-        self._parts_expected: list[Array] = []
+        self._data: Array = np.empty((len(self._rig.recorded), 0))
+        self._spools_expected: Array = np.empty((len(self._rig.joints), 0))
         self._since_look = 0
         self._slow.forget()
         self._pending: dict[Key, Violation] = {}
@@ -102,13 +132,11 @@ class Plausibility:
             return None
         self._since_look = 0
         self._follow()
-        data = np.concatenate(self._parts, axis=1)[:, -self._window :]
-        expected = np.concatenate(self._parts_expected, axis=1)[:, -self._window :]
-        self._parts, self._parts_expected = [data], [expected]
-        if data.shape[1] < self._window:
+        if self._data.shape[1] < self._window:
             return None
+        window = _Window.of(self._data, self._spools_expected)
         tick = block.tick + len(block.data) - 1
-        violations = {key_of(v): v for v in self._findings(data, expected, roles, tick)}
+        violations = {key_of(v): v for v in self._findings(window, roles, tick)}
         self._pending = {key: self._pending.get(key, violations[key]) for key in violations}
         return [
             violations[key]
@@ -122,13 +150,11 @@ class Plausibility:
             data = np.concatenate(self._new)
             self._new = []
             self._slow.add(data[:, self._states])
-            rows = np.ascontiguousarray(data.T)
-            self._parts.append(rows)
-            self._parts_expected.append(self._expected.follow(rows[self._command]))
+            expected = self._expected.follow(data[:, self._commands_at].T)
+            self._data = _latest(self._window, self._data, data.T)
+            self._spools_expected = _latest(self._window, self._spools_expected, expected)
 
-    def _findings(
-        self, data: Array, expected: Array, roles: Roles, tick: int
-    ) -> Iterator[Violation]:
+    def _findings(self, window: _Window, roles: Roles, tick: int) -> Iterator[Violation]:
         def say(
             limit: str, column: int, value: float, allowed: tuple[float, float], unit: str = ""
         ) -> Violation:
@@ -136,62 +162,57 @@ class Plausibility:
             joint = ch.kind_of(name)[1]
             return Violation(limit, value, allowed, unit or ch.unit_of(name), joint, name, tick)
 
-        yield from self._spools(data, expected, say)
-        yield from self._pistons(data, roles, say)
-        yield from self._pressures(data, roles, say)
-        yield from self._sensors(data, roles, say)
-        yield from self._noisy(data, say)
+        yield from self._spools(window, say)
+        yield from self._pistons(window, roles, say)
+        yield from self._pressures(window, roles, say)
+        yield from self._sensors(window, roles, say)
+        yield from self._noisy(window.data, say)
 
-    def _spools(self, data: Array, expected: Array, say: Callable[..., Violation]) -> Iterator[
-        Violation
-    ]:  # fmt: skip
-        settings = self._settings
-        off = data[self._spool] - expected
-        constant = _mean(off)
-        moving = _mean(np.abs(off - constant[:, None]))
-        commanded = _mean(np.abs(expected - _mean(expected)[:, None]))
+    def _spools(self, window: _Window, say: Callable[..., Violation]) -> Iterator[Violation]:
+        settings, expected = self._settings, window.expected
+        off = window.data[self._spools_at] - expected
+        means = _mean(off)
+        constants = means.tolist()
+        moving = _mean(np.abs(off - means[:, None])).tolist()
+        commanded = _mean(np.abs(expected - _mean(expected)[:, None])).tolist()
         for j, joint in enumerate(self._rig.joints):
             stroke = joint.valve.spool_stroke
-            least = max(settings.spool_floor * stroke, 5.0 * self._noise[self._spool[j]])
-            bound = max(settings.spool_share * float(commanded[j]), least)
+            least = max(settings.spool_floor * stroke, 5.0 * float(self._noise[self._spool[j]]))
+            bound = max(settings.spool_share * commanded[j], least)
             if moving[j] > bound:
-                yield say(NOT_FOLLOWING, self._spool[j], float(moving[j]), (-math.inf, bound))
-            elif abs(constant[j]) > settings.spool_constant * stroke:
+                yield say(NOT_FOLLOWING, self._spool[j], moving[j], (-math.inf, bound))
+            elif abs(constants[j]) > settings.spool_constant * stroke:
                 bound = settings.spool_constant * stroke
-                yield say(NOT_FOLLOWING, self._spool[j], float(constant[j]), (-bound, bound))
+                yield say(NOT_FOLLOWING, self._spool[j], constants[j], (-bound, bound))
 
-    def _pistons(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
+    def _pistons(self, window: _Window, roles: Roles, say: Callable[..., Violation]) -> Iterator[
         Violation
     ]:  # fmt: skip
         settings = self._settings
-        half = data.shape[1] // 2
-        piston = data[self._piston]
-        swing = np.ptp(piston, axis=1)
-        opening = _mean(np.abs(data[self._spool]))
-        step = _mean(piston[:, half:]) - _mean(piston[:, :half])
-        speed = step * self._rig.sample_rate / (data.shape[1] - half)
-        at_rest = (data[self._command] == 0.0).all(axis=1)
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
             if role.locked:
                 continue  # the tolerance of the lock covers it
             column = self._piston[j]
-            inside = self._within_stroke(data, j)
+            swing = window.swing(column)
             still = settings.still_piston * float(self._noise[column])
-            if (
-                inside
-                and swing[j] < still
-                and opening[j] > settings.open_spool * joint.valve.spool_stroke
-            ):
-                yield say(NOTHING_MOVES, column, float(swing[j]), (still, math.inf))
-            drift = settings.drift * joint.limits.speed
-            if at_rest[j] and abs(speed[j]) > drift:
-                yield say(DRIFTS, column, float(speed[j]), (-drift, drift), "m/s")
+            if self._within_stroke(window, j) and swing < still:
+                opening = _mean(np.abs(window.data[self._spool[j]]))
+                if opening > settings.open_spool * joint.valve.spool_stroke:
+                    yield say(NOTHING_MOVES, column, swing, (still, math.inf))
+            if window.at_zero(self._command[j]):
+                piston = window.data[column]
+                half = len(piston) // 2
+                step = float(_mean(piston[half:]) - _mean(piston[:half]))
+                speed = step * self._rig.sample_rate / (len(piston) - half)
+                drift = settings.drift * joint.limits.speed
+                if abs(speed) > drift:
+                    yield say(DRIFTS, column, speed, (-drift, drift), "m/s")
 
-    def _pressures(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
+    def _pressures(self, window: _Window, roles: Roles, say: Callable[..., Violation]) -> Iterator[
         Violation
     ]:  # fmt: skip
         settings, nominal = self._settings, self._rig.supply.pressure
-        means, peaks = _mean(data).tolist(), np.maximum.reduce(data, axis=1).tolist()
+        means, peaks = window.mean, window.most
         supply = nominal if self._supply is None else means[self._supply]
         top = settings.above_supply * max(supply, nominal)
         least = settings.empty_chamber * nominal
@@ -199,9 +220,9 @@ class Plausibility:
         excited = any(role.excited for role in roles)
         if excited and self._supply is not None and peaks[self._supply] < lost:
             yield say(SUPPLY_LOST, self._supply, supply, (lost, math.inf))
-        swing = np.ptp(data[self._command], axis=1)
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
-            driven = role.excited and swing[j] > SWING * joint.limits.command
+            swing = window.swing(self._command[j])
+            driven = role.excited and swing > SWING * joint.limits.command
             for column in (self._cap[j], self._rod[j]):
                 mean, peak = means[column], peaks[column]
                 if mean > top:
@@ -209,7 +230,7 @@ class Plausibility:
                 if driven and peak < least:
                     yield say(EMPTY_CHAMBER, column, peak, (least, math.inf))
 
-    def _sensors(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
+    def _sensors(self, window: _Window, roles: Roles, say: Callable[..., Violation]) -> Iterator[
         Violation
     ]:  # fmt: skip
         def shown(limit: str, finding: PressureFinding) -> Violation:
@@ -230,14 +251,14 @@ class Plausibility:
         if rows is None:
             return
         shut = (rows[:, :, pressure_sensors.COMMAND] == 0.0).all(axis=0)
-        closed = [j for j in held if shut[j] and self._within_stroke(data, j)]
+        closed = [j for j in held if shut[j] and self._within_stroke(window, j)]
         noise = self._noise[[self._cap[0], self._rod[0]]] / math.sqrt(slow.each)
         for swap in pressure_sensors.swapped(rig, settings, closed, rows, noise):
             yield shown(SWAPPED, swap)
 
-    def _within_stroke(self, data: Array, j: int) -> bool:
+    def _within_stroke(self, window: _Window, j: int) -> bool:
         reach = self._rig.joints[j].cylinder.stroke * (0.5 - self._settings.stroke_end)
-        return bool((np.abs(data[self._piston[j]]) < reach).all())
+        return -reach < window.least[self._piston[j]] and window.most[self._piston[j]] < reach
 
     def _noisy(self, data: Array, say: Callable[..., Violation]) -> Iterator[Violation]:
         """Estimate each channel's noise from its third difference, in which motion is small.
@@ -246,24 +267,36 @@ class Plausibility:
         """
         if self._rig.sample_rate < _SLOWEST_RATE:
             return
-        steps = data[: len(self._noise)]
+        # All channels in one row, three times as fast; the last three samples of each are none.
+        steps = data[: len(self._noise)].ravel()
         for _ in range(3):
-            steps = steps[:, 1:] - steps[:, :-1]
-        size = np.abs(steps)
+            steps = steps[1:] - steps[:-1]
+        size = np.zeros((len(self._noise), data.shape[1]))
+        np.abs(steps, out=size.ravel()[:-3])
+        size[:, -3:] = 0.0
         allowed, scale = self._settings.noise * self._noise, _NORMAL_MEDIAN * _THIRD_DIFFERENCE
         # A median above a bound needs half of its samples there. Mostly all channels together have
         # fewer, so that no sorting is needed. NaN counts as above.
         bound = allowed * scale * (1.0 - 1e-9)
         above = size.size - np.count_nonzero(size <= bound[:, None])
-        if 2 * above < size.shape[1]:
+        if 2 * above < size.shape[1] - 3:
             return
-        seen = np.median(size, axis=1) / scale
+        seen = np.median(size[:, :-3], axis=1) / scale
         for column in np.flatnonzero(seen > allowed).tolist():
             bound = float(allowed[column])
             yield say(NOISY, column, float(seen[column]), (-math.inf, bound))
 
 
 def _mean(values: Array) -> Array:
-    """Return the mean of each row, three times as fast as numpy's for few rows."""
-    mean: Array = np.add.reduce(values, axis=1) / values.shape[1]
+    """Return the mean along the last axis, three times as fast as numpy's for few rows."""
+    mean: Array = np.add.reduce(values, axis=-1) / values.shape[-1]
     return mean
+
+
+def _latest(count: int, old: Array, new: Array) -> Array:
+    """Return the last `count` columns of `old` and `new`, (rows, n) each; fewer if there are."""
+    kept = max(0, min(old.shape[1], count - new.shape[1]))
+    joined = np.empty((len(old), kept + min(new.shape[1], count)))
+    joined[:, :kept] = old[:, old.shape[1] - kept :]
+    joined[:, kept:] = new[:, -count:]
+    return joined

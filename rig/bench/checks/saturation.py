@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drivers.base import SampleBlock
 from rig.bench.checks.bands import Counts, first_of, run_lengths
 from rig.bench.checks.settings import GuardSettings
 from rig.model import channels as ch
@@ -34,22 +34,24 @@ class Saturation:
     def forget(self) -> None:
         """Reset: the next samples do not continue the previous ones."""
         self._runs: Counts = np.zeros(len(self._middles), dtype=np.int64)
+        self._any = False  # a channel was at an end in the latest block
 
-    def find(
-        self, marks: NDArray[np.bool_], measured: NDArray[np.float64], tick: int
-    ) -> Violation | None:
-        """Return the first channel too long at an end; `marks` and `measured` are (n, channels)."""
-        if not np.count_nonzero(marks):
-            self._runs[:] = 0
-            return None
-        runs = run_lengths(marks, self._runs)
-        self._runs = runs[-1]
+    def find(self, block: SampleBlock) -> list[Violation]:
+        """Return the violation of the first channel too long at an end; empty if there is none."""
+        if not np.count_nonzero(block.saturated):
+            if self._any:
+                self.forget()
+            return []
+        runs = run_lengths(block.saturated, self._runs)
+        self._runs, self._any = runs[-1], True
+        measured = block.data[:, : runs.shape[1]]
         over = runs >= np.where(measured > self._middles, self._at_high, self._at_low)
         if not over.any():
-            return None
+            return []
         row, column = first_of(over)
         name = self._rig.channels[column]
         kind, joint = ch.kind_of(name)
         ends = self._rig.sensors.of(kind).range
         value = float(measured[row, column])
-        return Violation(SATURATED, value, ends, ch.unit_of(name), joint, name, tick + row)
+        tick = block.tick + row
+        return [Violation(SATURATED, value, ends, ch.unit_of(name), joint, name, tick)]

@@ -51,7 +51,8 @@ class PastKeeper:
     def add(self, device_time: float, samples: Array) -> None:
         """Add the samples (n, channels) of a snapshot as one bucket; n = 0 adds none."""
         if len(samples):
-            parts = ([device_time], samples.min(axis=0), samples.max(axis=0))
+            low, high = np.minimum.reduce(samples, axis=0), np.maximum.reduce(samples, axis=0)
+            parts = ([device_time], low, high)
             self._rows.append(np.concatenate(parts))
 
     def answer(self) -> tuple[dict[str, Any], bytes]:
