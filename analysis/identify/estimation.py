@@ -27,7 +27,12 @@ from analysis.identify.estimators.instruments import (
     steps_without_instruments,
 )
 from analysis.identify.estimators.robust import robust
-from analysis.identify.estimators.shifts import including, shifts_of, significant_shift
+from analysis.identify.estimators.shifts import (
+    including,
+    largest_move,
+    shifts_of,
+    significant_shift,
+)
 from analysis.identify.estimators.statements import (
     noise_statement,
     nuisance_statement,
@@ -189,7 +194,7 @@ def _prepare(
         beside = [n for n in beside if n in columns and n not in mine]
         prepared = _family(built, family, columns, mine, beside)
         for name in tuple(beside):
-            fit = least_squares(prepared.blocks)
+            fit, fit_names = least_squares(prepared.blocks), prepared.names
             # Rebuilt each time: leaving out a nuisance shifts the columns.
             beliefs = {b.name: b for b in nu.beliefs(prepared.names, fit.beta)}
             if name not in beliefs:
@@ -197,10 +202,12 @@ def _prepare(
             belief = beliefs[name]
             error = spread([pieces(fit)], fit.inverse)
             wrong = nu.implausible(belief, fit.beta, error.covariance)
-            checks.append(nuisance_statement(belief, prepared.names, fit.beta, error, wrong))
+            moved = None
             if wrong:
                 beside.remove(belief.name)
                 prepared = _family(built, family, columns, mine, beside)
+                moved = largest_move(mine, fit.beta, least_squares(prepared.blocks).beta, error)
+            checks.append(nuisance_statement(belief, fit_names, fit.beta, error, moved))
         out.append(prepared)
     return out, checks
 

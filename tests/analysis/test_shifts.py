@@ -11,9 +11,15 @@ from scipy.stats import t as student
 from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman
-from analysis.identify.estimators.nuisance import Belief, joined
-from analysis.identify.estimators.shifts import Shift, including, shifts_of, significant_shift
-from analysis.identify.estimators.statements import noise_statement
+from analysis.identify.estimators.nuisance import TAU, Belief, implausible, joined
+from analysis.identify.estimators.shifts import (
+    Shift,
+    including,
+    largest_move,
+    shifts_of,
+    significant_shift,
+)
+from analysis.identify.estimators.statements import noise_statement, nuisance_statement
 from tests.analysis.straight_line import line
 
 CASES = {
@@ -94,6 +100,35 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
         narrower.append(both.covariance[0, 0] / alone.covariance[0, 0])
     assert 0.92 < np.mean(hits) < 0.98
     assert np.median(narrower) < 0.3
+
+
+@pytest.mark.parametrize(("alike", "ok"), [(0.0, True), (0.9, False)])
+def test_an_impossible_law_of_flow_speaks_against_a_gain_that_it_moves_only(
+    alike: float, ok: bool
+) -> None:
+    """A transition known to be below 1e-3 is 0.02; it moves the gain if their columns are alike."""
+    rng = np.random.default_rng(5)
+    t = np.arange(200) / 100.0
+    x, other = np.sin(np.pi * t), np.cos(6 * np.pi * t)
+    X = np.column_stack((x, alike * x + np.sqrt(1.0 - alike**2) * other))
+    parts = np.arange(200) // 25
+    blocks = [
+        RepeatBlock(0, "a", r, f"a_r{r}", "flow_cap_1", X,
+                    X @ np.array([1.0, 0.02]) + 1e-3 * rng.standard_normal(200), t, parts, parts)
+        for r in range(4)
+    ]  # fmt: skip
+    fit = least_squares(blocks)
+    error = spread([pieces(fit)], fit.inverse)
+    belief = Belief(TAU, np.array([0.0, 1.0]), 1e-3)
+    assert implausible(belief, fit.beta, error.covariance)
+    without = least_squares([replace(b, X=b.X[:, :1]) for b in blocks])
+    names = ("C_pp_1", TAU)
+    moved = largest_move(names[:1], fit.beta, without.beta, error)
+    said = nuisance_statement(belief, names, fit.beta, error, moved)
+    assert said.ok is ok
+    assert ("moves no parameter by more than" in said.detail) is ok
+    # The gain takes up the share of the left-out column that is like its own.
+    assert moved == ("C_pp_1", pytest.approx(0.02 * alike, abs=1e-3))
 
 
 def test_what_records_hold_nothing_of_leaves_every_estimate_as_it_is() -> None:

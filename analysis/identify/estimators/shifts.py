@@ -23,6 +23,11 @@ from analysis.regression.solve import half_width
 Array = NDArray[np.float64]
 
 
+def shift_limit(name: str) -> float:
+    """Return the relative shift of a parameter beyond which it always matters."""
+    return IDENTIFY.shift_limit_of_b if name == "b" else IDENTIFY.shift_limit
+
+
 @dataclass(frozen=True)
 class Shift:
     """The difference of one parameter between least squares and instrumental variables.
@@ -40,7 +45,7 @@ class Shift:
     @property
     def limit(self) -> float:
         """The relative shift beyond which it always matters."""
-        return IDENTIFY.shift_limit_of_b if self.name == "b" else IDENTIFY.shift_limit
+        return shift_limit(self.name)
 
     @property
     def material(self) -> bool:
@@ -50,6 +55,26 @@ class Shift:
             self.of_half_width > IDENTIFY.shift_of_interval
             and size > IDENTIFY.shift_least * self.limit
         )
+
+
+def largest_move(
+    names: Sequence[str], value: Array, without: Array, error: CovarianceParts
+) -> tuple[str, float]:
+    """Return the parameter that moves most when a nuisance is left out, and how much (relative).
+
+    `value` (k,) are the parameters `names` and perhaps nuisances beside it, `without` the same
+    parameters without it, `error` the spread of `value`. Moves are compared by the limits beyond
+    which they matter; one within `IDENTIFY.shift_of_interval` of the 95 % half width counts as 0.
+    """
+    count = len(names)
+    move = np.abs(without[:count] - value[:count])
+    half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)[:count]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.where(
+            move > IDENTIFY.shift_of_interval * half, move / np.abs(value[:count]), 0.0
+        )
+    worst = int(np.argmax(relative / [shift_limit(name) for name in names]))
+    return names[worst], float(relative[worst])
 
 
 def shifts_of(

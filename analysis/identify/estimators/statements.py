@@ -12,7 +12,7 @@ from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.estimators.equations import EquationFit
 from analysis.identify.estimators.robust import outlying
-from analysis.identify.estimators.shifts import Shift
+from analysis.identify.estimators.shifts import Shift, shift_limit
 from analysis.identify.settings import IDENTIFY
 
 Array = NDArray[np.float64]
@@ -21,9 +21,27 @@ NOISE_CHECK = "noise in regressors"
 
 
 def nuisance_statement(
+    belief: nu.Belief,
+    names: Sequence[str],
+    beta: Array,
+    error: CovarianceParts,
+    moved: tuple[str, float] | None,
+) -> Check:
+    """State the estimate of a nuisance, and whether it is physically possible.
+
+    `moved` of an impossible one is the parameter that moves most without it, and how much
+    (relative); the check is ok if that is too little to matter.
+    """
+    check = _possible(belief, names, beta, error, moved is not None)
+    if moved is None or moved[1] > shift_limit(moved[0]):
+        return check
+    least = f"left out, which moves no parameter by more than {100 * moved[1]:.2g} %"
+    return Check(check.name, True, f"{check.detail} ({least})")
+
+
+def _possible(
     belief: nu.Belief, names: Sequence[str], beta: Array, error: CovarianceParts, wrong: bool
 ) -> Check:
-    """State the estimate of a nuisance, and whether it is physically possible."""
     i = list(names).index(belief.name)
     value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
     if belief.name == nu.KAPPA:
