@@ -133,8 +133,6 @@ class Journal:
             db.close()
             fresh.replace(path)
             db = sqlite3.connect(path, isolation_level=None)
-            # Locked once instead of three times per block; nobody reads it while the run lasts.
-            db.execute("PRAGMA locking_mode=EXCLUSIVE")
             # NORMAL: a kill loses nothing, a power cut at most the blocks since the last sync;
             # FULL would delay the acquisition by a disk sync per block.
             db.execute("PRAGMA synchronous=NORMAL")
@@ -170,8 +168,9 @@ class Journal:
 
     def append(self, stream: int, block: SampleBlock, late: float | None) -> None:
         """Write one block (samples as float64) safely; raises RecordingFailed."""
-        data = block.data.astype("<f8", copy=False).tobytes()
-        marks = np.packbits(block.saturated).tobytes() if np.count_nonzero(block.saturated) else b""
+        data = np.ascontiguousarray(block.data, dtype="<f8").tobytes()
+        marked = np.count_nonzero(block.saturated)
+        marks = np.packbits(block.saturated).tobytes() if marked else b""
         crc = _checksum(stream, block.sequence, block.tick, data, marks)
         values = (stream, block.sequence, block.tick, len(block.data), late, crc, data, marks)
         self._write("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)", values)

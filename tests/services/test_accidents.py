@@ -156,7 +156,8 @@ def test_a_run_copied_from_another_computer_is_recovered_by_force_only(interrupt
 
 
 def test_a_journal_that_is_none_is_refused(interrupted: Path) -> None:
-    (interrupted / "journal.sqlite-wal").unlink()
+    for name in ("journal.sqlite-wal", "journal.sqlite-shm"):
+        (interrupted / name).unlink()
     (interrupted / "journal.sqlite").write_bytes(b"rubbish" * 1000)
     with pytest.raises(RecordingFailed, match="not a readable journal"):
         recover(interrupted)
