@@ -1,8 +1,8 @@
 """Notes on scatter between repeats that is not sensor noise.
 
-A pump, a neighbouring machine or a fault that comes and goes acts with another phase in every
-repeat. It is then part of the noise floor and leaves no repeatable residual. Where it is a torque
-at one frequency, `judge.unlocked` names it.
+A pump, a neighbouring machine or an intermittent fault acts with another phase in every repeat.
+It is then part of the noise floor and leaves no repeatable residual. If it is a torque at one
+frequency, `judge.unlocked` names it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def unrepeated_notes(data: RegressionData) -> list[str]:
 
 
 def unrepeated_floors(data: RegressionData) -> dict[str, Floor]:
-    """Return the floor that is most above the stated noise, of each equation that is so noted."""
+    """Return the floor with the largest ratio to the stated noise, of each equation to be noted."""
     loudest: dict[str, Floor] = {}
     for floor in data.floors:
         measured = floor.source in (REPEATS, PERIODS)
@@ -74,7 +74,7 @@ def scatter(data: RegressionData, segment: Segment) -> tuple[Array, Array]:
 
 
 def dominant_frequency(parts: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
-    """Return the frequency [Hz] that most of the energy of series lies at, and its share of it.
+    """Return the frequency [Hz] with most of the energy of series, and its share of the energy.
 
     `parts` are instants (m,) [s] with series (n, m) of any phase.
     """

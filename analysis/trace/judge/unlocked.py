@@ -1,9 +1,8 @@
-"""Periodic torques that begin at another phase in every record.
+"""Periodic torques whose phase differs between records.
 
-They leave nothing in the average of the repeats that one phase could meet, and are all of the
-scatter between them. The scatter shows the frequency. One sine of free phase is then taken out of
-every record of that torque balance, and its amplitude, which must be the same in all records, is
-what is named.
+The average over repeats holds no such sine of one phase; the scatter between the repeats does, and
+shows the frequency. A sine of free amplitude and phase is fitted to every record of that torque
+balance and subtracted. The effect's size is the amplitude, which must be the same in all records.
 """
 
 from __future__ import annotations
@@ -42,9 +41,9 @@ def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
 
     The scatter between the repeats of the joint's torque balance is `DATA.line_ratio` times what
     the stated noise makes, and more than `DATA.unrepeated_share` of its energy is at one frequency.
-    Not meant are: a drift, of fewer than `DATA.least_turns` turns; a frequency at which the joint's
-    velocity has as large a share, since a load that varies with the motion scatters there; and one
-    at which another balance scatters too, as an error of a sensor makes them.
+    Excluded are a drift, of fewer than `DATA.least_turns` periods; a frequency at which the
+    joint's velocity has as large a share, since a load that varies with the motion scatters there;
+    and one at which another balance scatters too, as a sensor error would cause.
     """
     repeated = {(f.group, f.equation): f for f in data.floors if f.source == REPEATS}
     loud: dict[str, list[Segment]] = {}
@@ -107,7 +106,7 @@ class _LineFit:
 def _fitted(
     rig: Rig, conditioned: ConditionedRecord, fit: ExactFit, line: Line, chosen: bool
 ) -> _LineFit | None:
-    """Fit a sine to what a model leaves in one record, None where the joint is locked.
+    """Fit a sine to a model's residual in one record, None where the joint is locked.
 
     `chosen`: leave out the rows that judge.
     """
@@ -137,11 +136,11 @@ def judged_line(
     divided: Collection[Group],
     noise: float,
 ) -> JudgedEffect:
-    """Return a periodic torque with its gates, beside the effects of a fitted model.
+    """Return a periodic torque, fitted to the residual of a model, with its gates.
 
-    `train` and `holdout` are the records, each repeat by itself; of those in `divided` the rows
-    that judge are left out. `noise` is the noise floor of the joint's torque balance in the
-    held-out records, SI.
+    `train` and `holdout` are the single records, not averaged over repeats; of those in `divided`
+    the rows that judge are left out. `noise` is the noise floor of the joint's torque balance in
+    the held-out records, SI.
     """
     joint, frequency = line
     own = [f for c in train if (f := _fitted(rig, c, fit, line, False)) is not None]
@@ -198,7 +197,7 @@ def judged_line(
 
 
 def _mean_amplitude(rig: Rig, joint: int, own: Sequence[_LineFit]) -> Estimate:
-    """Return the mean amplitude, with what the records differ by beyond noise in its error."""
+    """Return the mean amplitude; its error includes the scatter between records beyond noise."""
     weight = np.array([1.0 / f.error**2 for f in own])
     values = np.array([f.amplitude for f in own])
     spread = float(values.std(ddof=1)) / math.sqrt(len(own))
@@ -217,7 +216,8 @@ def _probability(own: Sequence[_LineFit]) -> float:
 def _frequency_error(own: Sequence[_LineFit], amplitude: float) -> float:
     """Return the standard error of the frequency [Hz] of sines of free phase in several records.
 
-    A record of T seconds gives sqrt(12) / (2 pi T) of its phase's error (Rife and Boorstyn, 1974).
+    Of a record of T seconds it is sqrt(12) / (2 pi T) times the phase's error (Rife and Boorstyn,
+    1974).
     """
     known = sum((2 * math.pi * f.seconds * amplitude / f.error) ** 2 / 12.0 for f in own)
     return 1.0 / math.sqrt(known)
@@ -229,7 +229,7 @@ def _estimate(value: float, unit: str, std: float) -> Estimate:
 
 
 def phase_notes(named: Sequence[JudgedEffect], lines: Sequence[Line]) -> list[str]:
-    """Say which named torques have a phase of their own in each record."""
+    """Return a note for each named torque whose phase differs between records."""
     of_joint = {f"joint {joint + 1}": (joint, f) for joint, f in lines}
     found = [
         of_joint[e.where]
@@ -237,8 +237,7 @@ def phase_notes(named: Sequence[JudgedEffect], lines: Sequence[Line]) -> list[st
         if e.name == PeriodicDisturbance.name and e.where in of_joint
     ]
     return [
-        f"{equation('torque', joint)}: the torque at {plain(f, 3)} Hz begins at another phase in "
-        "each record; it is fitted to each record by itself, and left out of the models and their "
-        "free runs"
+        f"{equation('torque', joint)}: the torque at {plain(f, 3)} Hz has another phase in each "
+        "record; it is fitted to each record separately, and models and free runs leave it out"
         for joint, f in found
     ]

@@ -1,4 +1,4 @@
-"""Records that carry a load which others lack, where no record states it.
+"""Find the records that carry a load which others lack, where no record states it.
 
 A load of mass m at the tip adds m p to the torque rows: p = X g, of the baseline's columns X and
 the growth g of its coefficients per kilogram. Of records that all carry it M, R and W absorb it; of
@@ -55,7 +55,8 @@ class LoadFit:
     """A load that some of the records carry and others do not.
 
     `mass` [kg]; `loaded` are the training records that carry it; `beta` are the coefficients of the
-    torque rows beside it. `resists` is whether its inertia shows, and is that of its weight.
+    torque rows beside it. `resists` is whether the records show its inertia, which then agrees with
+    its weight.
     """
 
     mass: float
@@ -92,8 +93,8 @@ def undeclared_load(
 ) -> UndeclaredLoad | None:  # fmt: skip
     """Return the runs with the load that the torque rows show in some records, None if in none.
 
-    A record that is not fitted to is asked by its rows alone; a held-out one by the rows that
-    choose, where others of it judge.
+    In a record that nothing is fitted to, its rows alone decide; in a held-out record whose rows
+    are divided, the rows that choose.
     """
     unseen = (*holdout, *judge)
     if any(record.loaded is not None for run in (*train, *unseen) for record in run.records):
@@ -167,7 +168,7 @@ def loaded_records(
 ) -> frozenset[Key]:
     """Return the records of other runs that carry the load of the training records.
 
-    With `divided` only the rows that choose are asked, not those of blocks that are set aside.
+    With `divided`, rows of blocks that are set aside for judging are not used.
     """
     rows = _load_rows(rig, terms, runs, load.beta)
     asked = np.ones(len(rows.column))
@@ -255,11 +256,12 @@ def _fit(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:
 
 
 def _resists(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
-    """Return whether what the records `loaded` (U,) have more resists motion as it weighs.
+    """Return whether the inertia of the load in the records `loaded` (U,) agrees with its weight.
 
-    The mass by gravity and that by inertia alone may differ by `TRACE.invariance_tolerance`, plus
-    noise: what a tilt of the base or an offset of a sensor adds does not resist. None where M and R
-    absorb the inertia, since the joint moves in no record without the load.
+    The mass from gravity terms alone and that from inertia terms alone may differ by
+    `TRACE.invariance_tolerance`, plus noise: a tilt of the base or an offset of a sensor adds a
+    weight without inertia. None where M and R absorb the inertia, since the joint moves in no
+    record without the load.
     """
     rates = growth(rows.data.rig)
     base = rows.data.base * np.where(loaded[rows.unit], 1.0, 0.0)[:, None]

@@ -58,7 +58,7 @@ def test_a_force_in_another_phase_in_every_repeat_is_named_with_its_amplitude() 
     assert result.after["torque_1"] < 1.3 * result.noise_floor["torque_1"]
     assert result.before["torque_1"] > 2.0 * result.noise_floor["torque_1"]
     assert result.unexplained_fraction < 0.05
-    assert any("begins at another phase" in note for note in result.notes)
+    assert any("has another phase in each record" in note for note in result.notes)
 
 
 def test_a_force_that_the_held_out_records_lack_is_refused() -> None:
