@@ -262,6 +262,14 @@ class Effect(Term):
         """
         return ""
 
+    def distinct(self, intervals: Mapping[str, tuple[float, float]]) -> bool:
+        """Return whether no numbers within `intervals` make it an effect of `includes`.
+
+        `intervals` holds the 95 % intervals of its linear coefficients, errors of forms included.
+        False where it cannot be judged.
+        """
+        return False
+
     def outside(self, rig: Rig, shape: Sequence[float]) -> str:
         """Return which shape parameter lies on or beyond its bounds, in words ('' if none).
 

@@ -126,6 +126,11 @@ class AsymmetricFriction(Friction):
         equal = abs(ahead - back) < times * DIFFERENCE * 0.5 * (ahead + back)
         return "coulomb_friction" if equal else ""
 
+    def distinct(self, intervals: Mapping[str, tuple[float, float]]) -> bool:
+        """Return whether the intervals of both levels have no value in common."""
+        ahead, back = (intervals[name] for name in self._names())
+        return ahead[1] < back[0] or back[1] < ahead[0]
+
 
 @dataclass(frozen=True)
 class PressureDependentFriction(Friction):

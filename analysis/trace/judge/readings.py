@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shapes_of
+from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
@@ -102,26 +103,35 @@ def _needs_richer(
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records need `other`, the richer of two sets.
 
-    In training `other` must remove: with the same number of effects `TRACE.richer_name_share` of
-    what `hypothesis` leaves, more than noise for each number, and `_form_error_energy`; with one
-    more effect what a further effect must. In held-out records `hypothesis`, whose residual there
-    is `held` (M,), must lose more than `TRACE.standard_errors`. The training rows must determine
-    an effect that is added (`_is_determined`).
+    In training `other` must remove: with the same number of effects more than noise for each
+    number, and `_form_error_energy`; with one more effect what a further effect must. In held-out
+    records `hypothesis`, whose residual there is `held` (M,), must lose more than
+    `TRACE.standard_errors`. The training rows must determine an effect that is added
+    (`_is_determined`). One that replaces another removes `TRACE.richer_name_share` of what
+    `hypothesis` leaves, or has intervals that exclude the simpler one (`Effect.distinct`): two
+    levels of friction that gravity's W nearly imitates remove little.
     """
     more = other.size[1] - hypothesis.size[1]
     if len(other.effects) > len(hypothesis.effects):
         least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
     else:
-        # A law leaves form error beside noise: a number that removes little only adapts the form.
-        share = TRACE.richer_name_share * hypothesis.total
         noise = TRACE.standard_errors**2 * more
-        least = max(noise, share, _form_error_energy(hypotheses, hypothesis, other))
-    if hypothesis.fit.energy - other.fit.energy <= least:
+        least = max(noise, _form_error_energy(hypotheses, hypothesis, other))
+    removed = hypothesis.fit.energy - other.fit.energy
+    if removed <= least:
         return False
     lost = loss_in_deviations(held, held_out_residual(holdout_data, other.fit))
     if lost <= TRACE.standard_errors:
         return False
-    return all(_is_determined(hypotheses, other, u) for u in _added(other, hypothesis))
+    if len(other.effects) > len(hypothesis.effects):
+        return all(_is_determined(hypotheses, other, u) for u in _added(other, hypothesis))
+    # A law leaves form error beside noise: a number that removes little may only adapt the form.
+    return removed > TRACE.richer_name_share * hypothesis.total or all(
+        used.term.distinct({n: e.ci95 for n, e in _numbers(hypotheses, other, used).items()})
+        for used in other.effects
+        if isinstance(used.term, Effect)
+        and (used.term.name, used.term.where) not in hypothesis.keys
+    )
 
 
 def _added(other: Hypothesis, hypothesis: Hypothesis) -> list[Used]:
@@ -137,13 +147,19 @@ def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used
     A Stribeck speed far above those of the records makes of it a second level by Coulomb, whose
     size the two levels share in any proportion.
     """
+    shapes = shapes_of(hypotheses.train_data.rig, used)
+    details = {s.parameter for s in shapes if s.detail or s.resolution}
+    numbers = _numbers(hypotheses, hypothesis, used)
+    intervals = [e.ci95 for name, e in numbers.items() if name not in details]
+    return all(not low <= 0.0 <= high for low, high in intervals)
+
+
+def _numbers(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> dict[str, Estimate]:
+    """Return an effect's numbers with 95 % intervals, errors of the forms included."""
     data, fit = hypotheses.train_data, hypothesis.fit
     values = parameter_values(data.rig, fit.terms, dict(fit.beta))
     errors = effect_errors(data, fit, used, values)
-    numbers = estimates(data, used, errors, form_shift(data, fit))
-    details = {s.parameter for s in shapes_of(data.rig, used) if s.detail or s.resolution}
-    intervals = [e.ci95 for name, e in numbers.items() if name not in details]
-    return all(not low <= 0.0 <= high for low, high in intervals)
+    return estimates(data, used, errors, form_shift(data, fit))
 
 
 def _form_error_energy(

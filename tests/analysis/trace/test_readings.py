@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from analysis.trace.data.candidates import catalogue
+from analysis.trace.engine import trace
 from analysis.trace.judge import readings
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
 from tests.analysis.trace.gate_cases import searched
+from tests.studies.foreign.bench import runs_of
+from tests.studies.foreign.cases import case_of
 
 
 def test_two_levels_that_energy_takes_for_one_are_asymmetric_friction(rig: Rig) -> None:
@@ -26,6 +30,22 @@ def test_one_level_in_the_same_noise_stays_coulomb_friction(rig: Rig) -> None:
     s = searched(rig, *runs, "coulomb_friction", "asymmetric_friction")
     settled = readings.best_readings(s.hypotheses, s.winner, s.holdout_data)
     assert [u.term.name for u in settled.effects] == ["coulomb_friction"]
+
+
+def test_levels_are_found_that_gravity_nearly_imitates_at_the_first_joint() -> None:
+    """Levels of 21 and 72 N remove only 12 % of what one level leaves: W1 takes their mean."""
+    case = case_of(72044, kind="pair")
+    names = ("coulomb_friction", "asymmetric_friction", "torque_offset")
+    train, held_out = runs_of(case.bench, case.seed)
+    found = trace(
+        [train], held_out, effects=catalogue(case.bench.rig, names), look_ahead=False,
+        free_forms=False, families=("mechanical",),
+    )  # fmt: skip
+    levels = next(e for e in found.effects if e.name == "asymmetric_friction")
+    assert (levels.where, found.verdict) == ("joint 1", "explained")
+    for name, size in (("F_ext_1", 21.0), ("F_ret_1", 72.0)):
+        low, high = levels.parameters[name].ci95
+        assert low < size < high
 
 
 @pytest.mark.parametrize(("breakaway", "determined"), [(0.0, False), (16.0, True)])
