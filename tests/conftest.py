@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 
 # As the command line does: threads of a linear solver wait busily for cores that others use.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -20,6 +21,10 @@ from tests.warm_up import compile_all
 
 # Equations compiled by one test serve the next, and those of the next day.
 CACHE = Path(__file__).parents[1] / ".equations_cache"
+
+# A shell that starts the tests in the background has SIGINT ignored; programs that they start and
+# stop by Ctrl-C would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No test depends on how fast the machine is: an example may take what it takes.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
