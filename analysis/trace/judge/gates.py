@@ -85,7 +85,7 @@ def judge_effects(
     null = inference.null_maximum(
         hypotheses.candidates, train_data, _noise_samples(train_data, winner.fit.residual), rng
     )
-    after = held_out_residual(holdout_data, winner.fit)
+    before, after = (held_out_residual(holdout_data, o.fit) for o in (hypotheses.empty, winner))
     shift = form_shift(train_data, winner.fit)
     out = []
     for used in winner.effects:
@@ -96,7 +96,10 @@ def judge_effects(
         tie_test = _TieTest(holdout_data, changes, after, without)
         rivals = _rivals(hypotheses, winner, used, alternative, holdout_data, tie_test)
         removed = _removed_share(holdout_data, changes, without, after)
-        disturbed = _disturbed_equations(hypotheses, winner, alternative)
+        disturbed = {
+            *_disturbed_equations(hypotheses, winner, alternative),
+            *_disturbed_in_held_out(holdout_data, before, without, after),
+        }
         p = inference.p_value(alternative.fit.energy - winner.fit.energy, null)
         errors = inference.effect_errors(train_data, winner.fit, used, values)
         differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
@@ -304,11 +307,30 @@ def _disturbed_equations(
     ]
 
 
-def _removal_in_words(removed: float, disturbed: Sequence[str]) -> str:
+def _disturbed_in_held_out(
+    holdout_data: RegressionData, before: Array, without: Array, after: Array
+) -> list[str]:
+    """Return the equations in which held-out records lose by an effect.
+
+    Their error exceeds `TRACE.noted_ratio` noise floors, and their energy above noise exceeds that
+    of the baseline by `TRACE.harm_ratio` and that without the effect. `before`, `without` and
+    `after` (M,) are the whitened residuals of the baseline, and without and with the effect.
+    """
+    start, alone, now = (energy_above_noise(holdout_data, r) for r in (before, without, after))
+    return [
+        e
+        for e, ratio in _error_over_floor(holdout_data, after).items()
+        if ratio > TRACE.noted_ratio
+        and now[e] > max(TRACE.harm_ratio * max(0.0, start[e]), alone[e])
+    ]
+
+
+def _removal_in_words(removed: float, disturbed: Collection[str]) -> str:
     text = f"{100 * removed:.0f} % of the energy above noise"
     if not disturbed:
         return text
-    return f"{text}, but the residual of {' '.join(disturbed)} is larger than under the baseline"
+    equations = " ".join(sorted(disturbed))
+    return f"{text}, but the residual of {equations} is larger than under the baseline"
 
 
 def _removed_share(

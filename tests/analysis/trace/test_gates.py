@@ -394,3 +394,18 @@ def test_what_a_gate_is_for_holds_and_is_lost_without_it(
 def test_every_rule_and_fault_has_a_story() -> None:
     told = {name for _, broken in STORIES for name in broken}
     assert set(by_name(RULES + FAULTS)) - told == NO_BENCH
+
+
+def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect(rig: Rig) -> None:
+    """Three times the noise in one equation: by the effect, there before, or without it too."""
+    s = gate_cases.searched(rig, *pair_of_runs(rig, c_internal=LEAK), "internal_leakage")
+    rows = s.holdout_data
+    good = np.random.default_rng(0).standard_normal(len(rows.mean_residual))
+    bad = good.copy()
+    for segment in rows.segments:
+        if segment.equation == "torque_2":
+            bad[segment.where] *= 3.0
+    assert gates._disturbed_in_held_out(rows, good, good, bad) == ["torque_2"]
+    assert gates._disturbed_in_held_out(rows, bad, good, bad) == []
+    assert gates._disturbed_in_held_out(rows, good, bad, bad) == []
+    assert gates._disturbed_in_held_out(rows, good, good, good) == []
