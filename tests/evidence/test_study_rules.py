@@ -53,7 +53,7 @@ def test_an_answer_without_rules_kept_from_others_is_that_of_the_whole_trace(
 
 
 def test_a_rule_is_back_when_its_trace_failed() -> None:
-    rule = by_name(RULES)["removes on held-out"]
+    rule = by_name(RULES)["held-out band"]
     ((settings, name, _),) = rule.changes
     before = getattr(settings, name)
 

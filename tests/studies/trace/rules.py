@@ -121,8 +121,9 @@ def _first_repeat(train_data: regression_data.RegressionData) -> Array:
 
 
 RULES: Final = (
-    Rule("removes on held-out", "an effect need not reduce the held-out error",
-         (setting("least_removed", -math.inf),)),
+    Rule("removes on held-out", "held-out errors say nothing for or against an effect",
+         (setting("least_removed", -math.inf),
+          (gates, "_disturbed_in_held_out", lambda *_: []))),
     Rule("no harm elsewhere", "an effect may increase the residual of another equation",
          (setting("harm_ratio", math.inf),)),
     Rule("physics", "any sign, size and shape passes",
