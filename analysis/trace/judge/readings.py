@@ -109,10 +109,11 @@ def _needs_richer(
     `TRACE.standard_errors`. The training rows must determine an effect that is added
     (`_is_determined`). One that replaces another removes `TRACE.richer_name_share` of what
     `hypothesis` leaves, or has intervals that exclude the simpler one (`Effect.distinct`): two
-    levels of friction that gravity's W nearly imitates remove little.
+    levels of friction remove little where a change of W makes most of their difference.
     """
     more = other.size[1] - hypothesis.size[1]
-    if len(other.effects) > len(hypothesis.effects):
+    added = len(other.effects) > len(hypothesis.effects)
+    if added:
         least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
     else:
         noise = TRACE.standard_errors**2 * more
@@ -123,22 +124,13 @@ def _needs_richer(
     lost = loss_in_deviations(held, held_out_residual(holdout_data, other.fit))
     if lost <= TRACE.standard_errors:
         return False
-    if len(other.effects) > len(hypothesis.effects):
-        return all(_is_determined(hypotheses, other, u) for u in _added(other, hypothesis))
+    fresh = [u for u in other.effects if (u.term.name, u.term.where) not in hypothesis.keys]
+    if added:
+        return all(_is_determined(hypotheses, other, u) for u in fresh)
     # A law leaves form error beside noise: a number that removes little may only adapt the form.
     return removed > TRACE.richer_name_share * hypothesis.total or all(
-        used.term.distinct({n: e.ci95 for n, e in _numbers(hypotheses, other, used).items()})
-        for used in other.effects
-        if isinstance(used.term, Effect)
-        and (used.term.name, used.term.where) not in hypothesis.keys
+        _is_distinct(hypotheses, other, u) for u in fresh
     )
-
-
-def _added(other: Hypothesis, hypothesis: Hypothesis) -> list[Used]:
-    """Return the effect that a set has beside all those of another; none where it replaces one."""
-    if not hypothesis.keys < other.keys:
-        return []
-    return [u for u in other.effects if (u.term.name, u.term.where) not in hypothesis.keys]
 
 
 def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> bool:
@@ -152,6 +144,13 @@ def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used
     numbers = _numbers(hypotheses, hypothesis, used)
     intervals = [e.ci95 for name, e in numbers.items() if name not in details]
     return all(not low <= 0.0 <= high for low, high in intervals)
+
+
+def _is_distinct(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> bool:
+    """Return whether an effect's 95 % intervals exclude those that it includes."""
+    assert isinstance(used.term, Effect)
+    numbers = _numbers(hypotheses, hypothesis, used)
+    return used.term.distinct({name: e.ci95 for name, e in numbers.items()})
 
 
 def _numbers(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> dict[str, Estimate]:

@@ -67,7 +67,7 @@ class LoadFit:
 
 @dataclass(frozen=True)
 class _LoadRows:
-    """Whitened torque rows (M,) of records, each by itself, and what 1 kg at the tip adds to them.
+    """Whitened torque rows (M,) of single records, and what 1 kg at the tip adds to them.
 
     `unit` (M,) numbers each row's record among `keys`.
     """
