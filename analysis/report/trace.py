@@ -15,7 +15,6 @@ from analysis.report.plots import place_plot, trace_plots
 from analysis.trace.clues.frequency import FREQUENCY
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
-from analysis.trace.settings import TRACE
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.model.channels import place_in_words
 from rig.model.records import Run
@@ -107,8 +106,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
     drawn = [
         d for d in result.depends_on
         if d.variable != FREQUENCY
-        and (result.verdict != CONFOUNDED
-             or result.after[d.equation] > TRACE.noted_ratio * result.noise_floor[d.equation])
+        and (result.verdict != CONFOUNDED or d.equation in result.above_floor)
     ][:2]  # fmt: skip
     for k, clue in enumerate(drawn):
         heading = f"remaining residual of {clue.equation} against {clue.variable}"

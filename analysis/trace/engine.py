@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, ordered
-from analysis.effects.free_forces import PositionForce
 from analysis.effects.payload import Payload
 from analysis.identify import checks as ck
 from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
@@ -24,9 +23,8 @@ from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
-from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
-from analysis.trace.data.regression_data import RegressionData, signals_of
-from analysis.trace.data.spectral_lines import spectral_lines
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.spectral_lines import SpectralLines, spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import (
@@ -46,10 +44,16 @@ from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import detection_limit_notes, detection_limits
 from analysis.trace.next_experiment.proposal import propose
+from analysis.trace.notes import (
+    evidence_notes,
+    record_condition_notes,
+    refitted_notes,
+    undetermined_notes,
+    undetermined_weight_notes,
+)
 from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
     CLEAN,
-    CONFOUNDED,
     EXPLAINED,
     UNEXPLAINED,
     JudgedEffect,
@@ -57,14 +61,11 @@ from analysis.trace.result import (
 )
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import ExactFit
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
-from analysis.trace.settings import TRACE
-from analysis.trace.words import sentence
+from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError
 from rig.model.records import Record, Run, with_loads_stated
 from rig.model.rig import Rig
-from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
@@ -147,95 +148,149 @@ class _Options:
         return tried and all(used.term.name != Payload.name for used in self.known)
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """What a trace begins with: rows without unlocked lines, candidates, the baseline identified.
+
+    `as_recorded` are the training rows with the lines, `notes` what the rows and the baseline show.
+    """
+
+    records: TraceRuns
+    rows: TraceRows
+    as_recorded: RegressionData
+    terms: tuple[Used, ...]
+    candidates: Sequence[Effect]
+    free: Sequence[Effect]
+    baseline: Model
+    notes: tuple[str, ...]
+
+
+def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
+    """Build the rows and candidates, and identify the baseline."""
+    known, unseen = options.known, (*records.holdout, *records.judge)
+    terms = ordered((*known, *temperature_terms(known, records.train, unseen)))
+    as_recorded = trace_rows(rig, terms, records)
+    records, rows = _without_unlocked_lines(rig, terms, records, as_recorded)
+    moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
+    baseline = _identified(records.train, rows.train.terms)
+    notes = (
+        *rows.unseen.notes,
+        *evidence_notes(rows.train, rows.unseen.choosing),
+        *undetermined_notes(baseline.model),
+        *(check.detail for check in baseline.checks if check.name == GEOMETRY),
+    )
+    return _Prepared(
+        records, rows, as_recorded.train, terms,
+        _not_in_model(options.effects, known, moving),
+        _not_in_model(free_mechanisms(rig), known) if options.free_forms else [],
+        baseline.model, notes,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """The set of effects with the shapes that are used, and the model with them.
+
+    `effects` are those named, with intervals that hold every error; `lines` are the spectral lines
+    of what remains in training.
+    """
+
+    winner: Hypothesis
+    model: Model
+    effects: tuple[JudgedEffect, ...]
+    lines: tuple[SpectralLines, ...]
+
+
+def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
+    """Identify the model with the effects found, hidden states by multiple shooting."""
+    runs, before, rows = prepared.records.train, prepared.baseline, finding.rows
+    winner = finding.winner
+    after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    shooting = shoot_hidden_states(
+        runs, prepared.rows.unseen.choosing_runs, after, rows.train, rows.unseen.choosing, winner
+    )
+    if shooting.winner is not winner:
+        winner = shooting.winner
+        after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    effects = tuple(
+        with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
+    )
+    return _Fitted(winner, after, effects, spectral_lines(rows.train, winner.fit.residual))
+
+
 def _traced(
     rig: Rig, records: TraceRuns, options: _Options, done: Callable[[float], None]
 ) -> Trace:
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
     started = time.perf_counter()
-    runs, holdout, judge = records.train, records.holdout, records.judge
-    known, seed = options.known, options.seed
-    terms = ordered((*known, *temperature_terms(known, runs, [*holdout, *judge])))
-    rows = trace_rows(rig, terms, records)
-    as_recorded = rows.train
-    records, rows = _without_unlocked_lines(rig, terms, records, rows)
-    moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
-    candidates = _not_in_model(options.effects, known, moving)
-    free = _not_in_model(free_mechanisms(rig), known) if options.free_forms else []
+    prepared = _prepared(rig, records, options)
+    before, rows, terms = prepared.baseline, prepared.rows, prepared.terms
 
     def columns(share: float) -> None:
         done(PREPARED + (COLUMNS - PREPARED) * share)
 
-    baseline = _identified(runs, rows.train.terms)
-    before = baseline.model
-    notes = [*rows.unseen.notes, *_evidence_notes(rows.train, rows.unseen.choosing)]
-    notes += [
-        *_undetermined_notes(before),
-        *(check.detail for check in baseline.checks if check.name == GEOMETRY),
-    ]
-    finding = find(rig, terms, records, rows, candidates, free, seed, columns)
-    records = replace(records, lines=finding.rows.lines)
-    verdict, winner = finding.verdict, finding.winner
-    judged_effects, refused = finding.named, finding.refused
-    notes += [
-        *unrepeated_notes(finding.rows.train),
-        *finding.notes,
-        *phase_notes(finding.named, records.lines),
-    ]
+    finding = find(
+        rig, terms, prepared.records, rows, prepared.candidates, prepared.free, options.seed,
+        columns,
+    )  # fmt: skip
     done(JUDGED)
-    train_data, choosing = finding.rows.train, finding.rows.unseen.choosing
-    split = spectral_lines(train_data, winner.fit.residual)
+    records = replace(prepared.records, lines=finding.rows.lines)
+    hypotheses, train_data, unseen = finding.hypotheses, finding.rows.train, finding.rows.unseen
     moves, formulas = (
-        ((), ()) if verdict in (CLEAN, EXPLAINED) else clues_to(train_data, choosing, winner, split)
-    )
-    hypotheses = finding.hypotheses
+        ((), ())
+        if finding.verdict in (CLEAN, EXPLAINED)
+        else clues_to(
+            train_data, unseen.choosing, finding.winner,
+            spectral_lines(train_data, finding.winner.fit.residual),
+        )
+    )  # fmt: skip
     further = (
-        propose(hypotheses, winner, judged_effects, verdict, moves) if options.look_ahead else None
+        propose(hypotheses, finding.winner, finding.named, finding.verdict, moves)
+        if options.look_ahead
+        else None
     )
-    after, from_tolerances = _identified_with_effects(runs, winner, before, finding.rows)
-    shooting = shoot_hidden_states(
-        runs, rows.unseen.choosing_runs, after, train_data, choosing, winner
-    )
-    if shooting.winner is not winner:
-        winner = shooting.winner
-        after, from_tolerances = _identified_with_effects(runs, winner, before, finding.rows)
-        split = spectral_lines(train_data, winner.fit.residual)
-    judged_effects = tuple(
-        with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in judged_effects
-    )
+    fitted = _fitted(prepared, finding)
+    winner, after = fitted.winner, fitted.model
     # Everything is chosen. From here on the judging rows are read, and nothing is chosen by them.
-    unseen = finding.rows.unseen
     first, last = (
-        held_out.refitted_to_held_out(unseen.judging, hypotheses.empty.fit),
-        held_out.refitted_to_held_out(unseen.judging, winner.fit),
+        held_out.refitted_to_held_out(unseen.judging, fit)
+        for fit in (hypotheses.empty.fit, winner.fit)
     )
     error = held_out.errors(rig, unseen.members, first, last, unseen.divided)
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
-        detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
+        detection_limits(train_data, prepared.candidates, winner, after)
+        if verdict != UNEXPLAINED
+        else []
     )
-    notes += [*_refitted_notes(winner.fit, last, after), *_undetermined_weight_notes(winner, after)]
-    notes += _record_condition_notes(train_data, winner)
-    notes += _undetermined_notes(
-        after, [n for n, e in before.parameters.items() if not e.identified]
-    )
-    notes += [
+    undetermined = [n for n, e in before.parameters.items() if not e.identified]
+    notes = [
+        *prepared.notes,
+        *unrepeated_notes(train_data),
+        *finding.notes,
+        *phase_notes(finding.named, records.lines),
+        *refitted_notes(winner.fit, last, after),
+        *undetermined_weight_notes(winner, after),
+        *record_condition_notes(train_data, winner),
+        *undetermined_notes(after, undetermined),
         *kept,
-        *_tolerated_error_notes(verdict, error, [*notes, *kept]),
         *detection_limit_notes(hidden),
     ]
-    runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
+    runs_before, runs_after = held_out.free_runs([*records.holdout, *records.judge], before, after)
     result = Trace(
-        verdict, judged_effects, error.noise, error.before, error.after,
+        verdict, fitted.effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _remaining_fraction(hypotheses, winner, as_recorded), moves, further, as_recorded.floors,
-        first, last, tuple(notes), refused=refused, size=error.size,
+        _remaining_fraction(hypotheses, winner, prepared.as_recorded), moves, further,
+        prepared.as_recorded.floors, first, last, tuple(notes),
+        refused=finding.refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
-        lines=split, formulas=formulas,
+        lines=fitted.lines, formulas=formulas,
         free_curves=held_out.free_curves(runs_before, runs_after),
         detection_limits=tuple(hidden), seconds=time.perf_counter() - started,
     )  # fmt: skip
-    return replace(result, sentence=sentence(result))
+    notes += tolerated_error_notes(result)
+    return replace(result, notes=tuple(notes), sentence=sentence(result))
 
 
 def _without_unlocked_lines(
@@ -313,114 +368,6 @@ def _judging_rows_above_band(
     kept = gates.held_out_above_band(known, before.fit, after.fit)
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
     return {e for e, _ in kept}, [*words, *beyond_curve_notes(judge_data, known)]
-
-
-def _evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
-    """State where the noise floor is from few data, and which rows are left out."""
-    out = []
-    sources = {f.source for f in train_data.floors}
-    single = sorted({f.group[1] for f in train_data.floors if f.source == STATED})
-    if single:
-        out.append(
-            f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
-            "the rig file's stated sensor noise; noise above that value would be taken "
-            "for model error, so the evidence for every name is weaker"
-        )
-    elif sources != {REPEATS}:
-        where = PERIODS if PERIODS in sources else NEIGHBOURS
-        out.append(f"one repeat per step: the noise floor comes from {where} within the record")
-    if all(f.source == STATED for f in holdout_data.floors):
-        out.append("the held-out noise floor is the rig file's stated sensor noise")
-    return [
-        *out,
-        *_masked_row_notes("training", train_data),
-        *_masked_row_notes("held-out", holdout_data),
-    ]
-
-
-def _masked_row_notes(kind: str, data: RegressionData) -> list[str]:
-    """Name the equations of which at least `TRACE.masked_share` of the rows is left out."""
-    kept: dict[str, int] = {}
-    missing: dict[str, int] = {}
-    for s in data.segments:
-        _, rows = data.source(s)
-        kept[s.equation] = kept.get(s.equation, 0) + len(rows.rhs)
-        missing[s.equation] = missing.get(s.equation, 0) + rows.masked
-    shares = {e: missing[e] / max(missing[e] + kept[e], 1) for e in sorted(kept)}
-    return [
-        f"{equation}: {plain(100 * share, 2)} % of the {kind} rows are left out, since a pressure "
-        "lies outside 0 to the supply's, or samples were clipped or lost: an effect that acts only "
-        "there is not seen"
-        for equation, share in shares.items()
-        if share >= TRACE.masked_share
-    ]
-
-
-def _undetermined_notes(model: Model, known: Collection[str] = ()) -> list[str]:
-    """Name the parameters that the records do not determine, except those `known` already."""
-    missing = [n for n, e in model.parameters.items() if not e.identified and n not in known]
-    if not missing:
-        return []
-    return [
-        f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
-        "the motion that belongs to it may show as a residual"
-    ]
-
-
-def _record_condition_notes(train_data: RegressionData, winner: Hypothesis) -> list[str]:
-    """State sizes at the conditions of the records, for parameters given at other conditions."""
-    terms = [(u.term, u.shape) for u in winner.effects if isinstance(u.term, Effect)]
-    if not terms:
-        return []
-    signals = signals_of(train_data)
-    said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
-    return [f"{name}: {text}" for name, text in said if text]
-
-
-def _refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
-    """Name the parameters whose values in the stated errors were fitted to the judging rows."""
-    names = [n for n in held_out.refitted_names(fit, judged) if n in model.parameters]
-    if not names:
-        return []
-    return [
-        f"the held-out records show {', '.join(names)} at least "
-        f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
-        "do: the errors are given with their values; record training motions like the held-out ones"
-    ]
-
-
-def _undetermined_weight_notes(winner: Hypothesis, after: Model) -> list[str]:
-    """Name the weight parameters that a free force over position makes undetermined in one pose."""
-    joints = [u.term.joint + 1 for u in winner.effects if isinstance(u.term, PositionForce)]
-    return [
-        f"W{joint} is no measured weight: in one pose of the other joints gravity is a force over "
-        f"position too, and position_force at joint {joint} shares it"
-        for joint in joints
-        if f"W{joint}" in after.parameters
-    ]
-
-
-def _tolerated_error_notes(
-    verdict: str, error: held_out.Errors, failures: Sequence[str]
-) -> list[str]:
-    """State held-out errors of an explanation above `TRACE.noted_ratio` times the noise floor.
-
-    Equations that one of the notes `failures` begins with are left out.
-    """
-    if verdict not in (EXPLAINED, CONFOUNDED):
-        return []
-    out = []
-    for e, noise in error.noise.items():
-        if error.after[e] > TRACE.noted_ratio * noise and not any(
-            n.startswith(f"{e}:") for n in failures
-        ):
-            share = (error.after[e] ** 2 - noise**2) / max(error.before[e] ** 2 - noise**2, 1e-30)
-            out.append(
-                f"{e}: held-out error {error.after[e] / noise:.2f} times the noise floor, "
-                f"{plain(100 * share, 2)} % of the baseline's energy, within "
-                "the tolerance for the form of the named effect"
-            )
-    return out
 
 
 def _remaining_fraction(

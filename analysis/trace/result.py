@@ -16,7 +16,7 @@ from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.search.refinement import ExactFit
-from analysis.trace.settings import CLUES
+from analysis.trace.settings import CLUES, TRACE
 from rig.model.channels import place_in_words
 from rig.model.units import plain
 
@@ -267,6 +267,19 @@ class Trace:
     def worst(self, error: Mapping[str, float]) -> float:
         """Return the largest of the held-out errors, `before` or `after`, over its noise floor."""
         return float(np.nanmax([error[e] / max(self.noise_floor[e], 1e-30) for e in error]))
+
+    @property
+    def above_floor(self) -> list[str]:
+        """The equations whose `after` exceeds `TRACE.noted_ratio` noise floors, worst first."""
+        over = {e: error / max(self.noise_floor[e], 1e-30) for e, error in self.after.items()}
+        return sorted((e for e in over if over[e] > TRACE.noted_ratio), key=lambda e: -over[e])
+
+    def remaining_share(self, equation: str) -> float:
+        """Return the energy above noise of `after` over that of `before`, in an equation."""
+        floor, before, after = (
+            error[equation] ** 2 for error in (self.noise_floor, self.before, self.after)
+        )
+        return (after - floor) / max(before - floor, 1e-30)
 
     @property
     def moves_with(self) -> tuple[str, ...]:

@@ -107,23 +107,38 @@ def _remarks(result: Trace) -> list[str]:
 
 def _tolerated(result: Trace) -> list[str]:
     """Say which error of an explanation is above the noise's band, and why it may be."""
+    above = [e for e in result.above_floor if result.remaining_share(e) < 1.0]
+    if result.verdict not in (EXPLAINED, CONFOUNDED) or not above:
+        return []
+    e = above[0]
+    return [
+        f"What is left in {e}, {result.after[e] / result.noise_floor[e]:.1f} times the noise "
+        f"floor, is {plain(100 * result.remaining_share(e), 2)} % of the energy that was above "
+        f"the noise: the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %."
+    ]
+
+
+def tolerated_error_notes(result: Trace) -> list[str]:
+    """Return notes on held-out errors of an explanation above `TRACE.noted_ratio` noise floors.
+
+    Equations of which a note of the result speaks already are left out.
+    """
     if result.verdict not in (EXPLAINED, CONFOUNDED):
         return []
-    floor = {e: max(v, 1e-30) for e, v in result.noise_floor.items()}
-    above = [
-        e
-        for e, after in result.after.items()
-        if after > TRACE.noted_ratio * floor[e] and after < result.before[e]
-    ]
-    if not above:
-        return []
-    e = max(above, key=lambda name: result.after[name] / floor[name])
-    energy = [error[e] ** 2 - floor[e] ** 2 for error in (result.after, result.before)]
-    return [
-        f"What is left in {e}, {result.after[e] / floor[e]:.1f} times the noise floor, is "
-        f"{plain(100 * energy[0] / energy[1], 2)} % of the energy that was above the noise: the "
-        f"form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %."
-    ]
+    out = []
+    for e in result.above_floor:
+        if any(note.startswith(f"{e}:") for note in result.notes):
+            continue
+        share = result.remaining_share(e)
+        why = (
+            f"{plain(100 * share, 2)} % of the baseline's energy above noise, within the tolerance "
+            "for the form of the named effect"
+            if share < 1.0
+            else "no less than under the baseline: no named effect acts in it"
+        )
+        times = result.after[e] / result.noise_floor[e]
+        out.append(f"{e}: held-out error {times:.2f} times the noise floor, {why}")
+    return out
 
 
 def quantity(estimate: Estimate) -> str:

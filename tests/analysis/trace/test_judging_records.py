@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace import engine
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import in_judging_block, set_aside
 from analysis.trace.engine import trace
 from analysis.trace.judge import held_out
+from analysis.trace.notes import masked_row_notes
 from analysis.trace.result import Trace
 from analysis.trace.search.refinement import design_matrix, fit_coefficients
 from analysis.trace.settings import TRACE
@@ -229,6 +229,6 @@ def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) 
         )
         for share in (0.01, 0.1)
     )
-    assert engine._masked_row_notes("training", few) == []
-    notes = engine._masked_row_notes("training", many)
+    assert masked_row_notes("training", few) == []
+    notes = masked_row_notes("training", many)
     assert any(n.startswith("flow_cap_2: 9 % of the training rows") for n in notes), notes

@@ -1,0 +1,101 @@
+"""Notes on a trace's evidence: few data, masked rows, parameters that the records leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from analysis.effects.base import Effect
+from analysis.effects.free_forces import PositionForce
+from analysis.simulation.model import Model
+from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
+from analysis.trace.data.regression_data import RegressionData, signals_of
+from analysis.trace.judge.held_out import refitted_names
+from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.refinement import ExactFit
+from analysis.trace.settings import TRACE
+from rig.model.units import plain
+
+
+def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
+    """State where the noise floor is from few data, and which rows are left out."""
+    out = []
+    sources = {f.source for f in train_data.floors}
+    single = sorted({f.group[1] for f in train_data.floors if f.source == STATED})
+    if single:
+        out.append(
+            f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
+            "the rig file's stated sensor noise; noise above that value would be taken "
+            "for model error, so the evidence for every name is weaker"
+        )
+    elif sources != {REPEATS}:
+        where = PERIODS if PERIODS in sources else NEIGHBOURS
+        out.append(f"one repeat per step: the noise floor comes from {where} within the record")
+    if all(f.source == STATED for f in holdout_data.floors):
+        out.append("the held-out noise floor is the rig file's stated sensor noise")
+    return [
+        *out,
+        *masked_row_notes("training", train_data),
+        *masked_row_notes("held-out", holdout_data),
+    ]
+
+
+def masked_row_notes(kind: str, data: RegressionData) -> list[str]:
+    """Name the equations of which at least `TRACE.masked_share` of the rows is left out."""
+    kept: dict[str, int] = {}
+    missing: dict[str, int] = {}
+    for s in data.segments:
+        _, rows = data.source(s)
+        kept[s.equation] = kept.get(s.equation, 0) + len(rows.rhs)
+        missing[s.equation] = missing.get(s.equation, 0) + rows.masked
+    shares = {e: missing[e] / max(missing[e] + kept[e], 1) for e in sorted(kept)}
+    return [
+        f"{equation}: {plain(100 * share, 2)} % of the {kind} rows are left out, since a pressure "
+        "lies outside 0 to the supply's, or samples were clipped or lost: an effect that acts only "
+        "there is not seen"
+        for equation, share in shares.items()
+        if share >= TRACE.masked_share
+    ]
+
+
+def undetermined_notes(model: Model, known: Collection[str] = ()) -> list[str]:
+    """Name the parameters that the records do not determine, except those `known` already."""
+    missing = [n for n, e in model.parameters.items() if not e.identified and n not in known]
+    if not missing:
+        return []
+    return [
+        f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
+        "the motion that belongs to it may show as a residual"
+    ]
+
+
+def record_condition_notes(train_data: RegressionData, winner: Hypothesis) -> list[str]:
+    """State sizes at the conditions of the records, for parameters given at other conditions."""
+    terms = [(u.term, u.shape) for u in winner.effects if isinstance(u.term, Effect)]
+    if not terms:
+        return []
+    signals = signals_of(train_data)
+    said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
+    return [f"{name}: {text}" for name, text in said if text]
+
+
+def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
+    """Name the parameters whose values in the stated errors were fitted to the judging rows."""
+    names = [n for n in refitted_names(fit, judged) if n in model.parameters]
+    if not names:
+        return []
+    return [
+        f"the held-out records show {', '.join(names)} at least "
+        f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
+        "do: the errors are given with their values; record training motions like the held-out ones"
+    ]
+
+
+def undetermined_weight_notes(winner: Hypothesis, after: Model) -> list[str]:
+    """Name the weight parameters that a free force over position makes undetermined in one pose."""
+    joints = [u.term.joint + 1 for u in winner.effects if isinstance(u.term, PositionForce)]
+    return [
+        f"W{joint} is no measured weight: in one pose of the other joints gravity is a force over "
+        f"position too, and position_force at joint {joint} shares it"
+        for joint in joints
+        if f"W{joint}" in after.parameters
+    ]
