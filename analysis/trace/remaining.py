@@ -83,7 +83,7 @@ def _tolerated_remainders(
     """Return the equations beside `known` that keep more than `HypothesisSet.negligible` allows."""
     listed = {r.equation for r in known}
     out = []
-    for e, residual in gates.training_excess(hypotheses, winner).items():
+    for e, residual in winner.excess_energy.items():
         if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
             share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"

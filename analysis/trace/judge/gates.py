@@ -26,7 +26,7 @@ from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
-from analysis.trace.search.refinement import ExactFit, design_matrix
+from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.units import plain, with_interval
 
@@ -180,7 +180,7 @@ def equations_above_band(
     form is a share of the effect, which better sensors do not make smaller.
     """
     out = []
-    for e, residual in training_excess(hypotheses, winner).items():
+    for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.noise_band.by_equation[e]
@@ -191,12 +191,6 @@ def equations_above_band(
     return out + held_out_above_band(holdout_data, hypotheses.empty.fit, winner.fit)
 
 
-def training_excess(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
-    """Return the training energy above noise by equation, cavitating instants left out."""
-    data = hypotheses.train_data
-    return energy_above_noise(data, _zeroed_where_cavitating(data, winner.fit, winner.fit.residual))
-
-
 def held_out_above_band(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
@@ -205,7 +199,7 @@ def held_out_above_band(
     The band is an rms of `TRACE.held_out_band` noise floors or `TRACE.held_out_share` of the energy
     above noise that the model `before` leaves, whichever is larger.
     """
-    left = _zeroed_where_cavitating(holdout_data, after, held_out_residual(holdout_data, after))
+    left = held_out_residual(holdout_data, after)
     start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
     now = energy_above_noise(holdout_data, left)
     return [
@@ -213,27 +207,6 @@ def held_out_above_band(
         for e, r in _error_over_floor(holdout_data, left).items()
         if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
-
-
-def _zeroed_where_cavitating(data: RegressionData, model: ExactFit, residual: Array) -> Array:
-    """Return a residual (M,) set to zero where the oil cavitates under a model.
-
-    A true gain of a pressure sensor puts some pressures below zero, where no flow can be compared:
-    these instants count neither for nor against the model. An equation with more than
-    `TRACE.cavitating_share` of them keeps its residual.
-    """
-    outside = np.asarray(~np.any(design_matrix(data, model.terms).matrix, axis=1))
-    if not outside.any():  # the usual case
-        return residual
-    rows: dict[str, list[int]] = {}
-    for s in data.segments:
-        rows.setdefault(s.equation, []).extend(range(s.where.start, s.where.stop))
-    out = residual.copy()
-    for at in rows.values():
-        own = outside[at]
-        if own.mean() <= TRACE.cavitating_share:
-            out[np.array(at)[own]] = 0.0
-    return out
 
 
 def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> float:

@@ -26,19 +26,35 @@ from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Whitened rows of a model on regression data: matrix (M, k) of `names`, right side (M,)."""
+    """Whitened rows of a model on regression data: matrix (M, k) of `names`, right side (M,).
+
+    `cavitating` are, for each equation with such rows, the rows (numbers) at which the oil does
+    not cavitate under the model and those at which it does.
+    """
 
     names: tuple[str, ...]
     matrix: Array
     rhs: Array
+    cavitating: tuple[tuple[Indices, Indices], ...] = ()
 
     def residual(self, beta: Mapping[str, float]) -> Array:
-        """Return the residual (M,) under coefficients of the rows."""
-        return np.asarray(self.rhs - self.matrix @ np.array([beta.get(n, 0.0) for n in self.names]))
+        """Return the residual (M,) under coefficients of the rows.
+
+        Where the oil cavitates no flow can be compared. Up to `TRACE.cavitating_share` of an
+        equation's rows such instants keep at most the rms of the others, so that they count
+        neither for nor against the model: a true gain of a sensor puts some pressures below zero.
+        """
+        out = self.rhs - self.matrix @ np.array([beta.get(n, 0.0) for n in self.names])
+        for others, outside in self.cavitating:
+            if len(outside) <= TRACE.cavitating_share * (len(outside) + len(others)):
+                limit = np.sqrt(np.mean(out[others] ** 2))
+                out[outside] = np.clip(out[outside], -limit, limit)
+        return np.asarray(out)
 
 
 @dataclass(frozen=True)
@@ -63,14 +79,16 @@ class ExactFit:
 def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     """Return the whitened rows of a model at the instants of the averaged records.
 
-    Instants that the model masks keep the residual of the data's own model, so that no effect
-    removes a residual by moving signals to where the equations do not hold.
+    Instants that the model masks have the residual of the data's own model, so that no effect
+    removes a residual by moving signals to where the equations do not hold (but see
+    `DesignMatrix.residual`).
     """
     built = [shared_rows(data.rig, terms, record, data.cache) for record in data.records]
     names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
     M = data.base.shape[0]
     X, y = np.zeros((M, len(names))), data.mean_residual.copy()
     index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
+    kept: dict[str, list[Indices]] = {}
     for segment in data.segments:
         k = index[segment.group]
         rows, before = built[k][segment.equation], data.rows[k][segment.equation]
@@ -83,7 +101,26 @@ def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
         columns = [names.index(n) for n in rows.names]
         X[np.ix_(at, columns)] = rows.matrix[there] * weight
         y[at] = rows.rhs[there] * weight
-    return DesignMatrix(names, X, y)
+        kept.setdefault(segment.equation, []).append(at)
+    return DesignMatrix(names, X, y, _cavitating(data, kept))
+
+
+def _cavitating(
+    data: RegressionData, kept: Mapping[str, Sequence[Indices]]
+) -> tuple[tuple[Indices, Indices], ...]:
+    """Return the rows `kept` by a model and those it masks, of each equation with masked rows."""
+    out = []
+    for equation, parts in kept.items():
+        own = [
+            np.arange(*s.where.indices(s.where.stop))
+            for s in data.segments
+            if s.equation == equation
+        ]
+        here = np.concatenate(parts)
+        every = np.concatenate(own)
+        if len(here) < len(every):
+            out.append((here, np.setdiff1d(every, here)))
+    return tuple(out)
 
 
 def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from analysis.terms.base import Used
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates, tied_in_held_out
 from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
-from analysis.trace.words import sentence
+from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.rig import Rig
 
 FLOOR = {"flow_cap_1": 3.5e-8, "torque_2": 0.14}
@@ -28,21 +29,23 @@ def effect(name: str, variable: str, numbers: dict[str, tuple[float, float, str]
     return JudgedEffect(name, "joint 2", parameters, 0.005, 1.0, (), (), variable)
 
 
-def told(
+def explained(
     rig: Rig,
     effects: tuple[JudgedEffect, ...],
     before: dict[str, float] = BEFORE,
     after: dict[str, float] = AFTER,
     notes: tuple[str, ...] = (),
-) -> str:
+) -> Trace:
     model = nominal_model(rig, tuple(map(Used, baseline_of(rig))))
     fit = ExactFit((), {}, np.zeros(0), np.zeros((0, 0)))
-    return sentence(
-        Trace(
-            EXPLAINED, effects, FLOOR, before, after, {}, {}, model, model, 0.0, (), None, (), fit,
-            fit, notes,
-        )
+    return Trace(
+        EXPLAINED, effects, FLOOR, before, after, {}, {}, model, model, 0.0, (), None, (), fit,
+        fit, notes,
     )  # fmt: skip
+
+
+def told(rig: Rig, *arguments: Any, **named: Any) -> str:
+    return sentence(explained(rig, *arguments, **named))
 
 
 SPRING = effect("joint_spring", "the joint's angle", {"k_spring_2": (2.2, 0.04, "N*m/rad")})
@@ -87,6 +90,20 @@ def test_an_error_above_the_noise_is_said_to_be_within_the_form(rig: Rig) -> Non
     assert "left in torque_2, 3.3 times the noise floor, is 0.27 % of the energy" in text
     assert "may miss 10 %" in text
     assert "may miss" not in told(rig, (SPRING,))
+
+
+def test_an_error_that_no_effect_lowers_is_no_error_of_a_form(rig: Rig) -> None:
+    high = {"flow_cap_1": 2 * FLOOR["flow_cap_1"], "torque_2": 3 * FLOOR["torque_2"]}
+    before = high | {"torque_2": 60 * FLOOR["torque_2"]}
+    of_form, untouched = tolerated_error_notes(explained(rig, (SPRING,), before, high))
+    assert of_form.startswith("torque_2: held-out error 3.00 times the noise floor, 0.22 % of the")
+    assert of_form.endswith("within the tolerance for the form of the named effect")
+    assert untouched == (
+        "flow_cap_1: held-out error 2.00 times the noise floor, no less than under the baseline: "
+        "no named effect acts in it"
+    )
+    said = explained(rig, (SPRING,), before, high, notes=("torque_2: 3 % remains",))
+    assert tolerated_error_notes(said) == [untouched]
 
 
 def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> None:
