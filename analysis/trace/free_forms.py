@@ -28,7 +28,8 @@ def explained_by_free_form(
     """Return the first set with a free form that explains the records, None where none does.
 
     `free` are the free mechanisms, `winner` the named effects that passed the gates. A free form
-    joins these effects, or replaces those of one mechanism. Every gate of every effect must hold
+    joins these effects, or replaces those of one mechanism; it never joins a name of its own
+    mechanism at the same place. Every gate of every effect must hold
     with it, no remainder may speak against the set, and no named effect may fit as well as the
     free form. With `fewer` the named effects explain within the tolerance of their forms, but with
     several mechanisms: a set in their place must need fewer and leave at most
@@ -61,8 +62,10 @@ def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -
     out: list[Hypothesis] = []
     for start in _sets_to_extend(wide, winner, fewer):
         for single in wide.extensions(start, free=True):
-            # Beside a further effect a form that removes too little would be dropped.
-            if wide.removes_too_little(start, single):
+            # A curve beside a name of its mechanism would be a form of that name's error. One that
+            # removes too little would be dropped beside a further effect.
+            beside_its_name = mechanism_count(single) == mechanism_count(start)
+            if beside_its_name or wide.removes_too_little(start, single):
                 continue
             enough = wide.within_form_tolerance(single)
             hypothesis = single if enough else _with_further_effect(wide, single)

@@ -20,7 +20,7 @@ from analysis.trace.result import Dependence, Formula
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import SEARCH, TRACE
 from rig.model.units import plain
 
 
@@ -41,51 +41,19 @@ def remainders(
 ) -> list[Remainder]:
     """Return the equations in which a set leaves more than noise and tolerances allow.
 
-    These are, in this order: equations above the band (`gates.equations_above_band`); equations in
-    which the set removes energy and whose residual one formula fits, which the simpler form of an
-    effect does not cause; equations that keep more than `HypothesisSet.negligible` allows. The
-    first speak against the set, the second do where the residual is above the noise's band and an
-    effect of the set acts there, the third do not.
+    First those above the band (`gates.equations_above_band`), which speak against the set, then
+    those whose training energy above noise exceeds `TRACE.visible_deviations` standard deviations
+    of the noise's own energy and `SEARCH.form_share` of what the baseline leaves.
     """
     out = [
         Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
     ]
-    visible = _visible_shares(hypotheses, winner) if winner.effects else {}
-    known = {r.equation for r in out}
-    asked = [equation for equation in visible if equation not in known]
-    if not asked:
-        return [*out, *_tolerated_remainders(hypotheses, winner, out)]
-    train_rows, holdout_rows = (
-        rebased(hypotheses.train_data, winner.fit),
-        rebased(holdout_data, winner.fit),
-    )
-    held_residual = held_out.held_out_residual(holdout_data, winner.fit)
-    for equation in asked:
-        expression = formula(train_rows, winner.fit.residual, holdout_rows, held_residual, equation)
-        # A constant is no law of another cause: a form that is slightly off leaves one.
-        if (
-            expression is not None
-            and expression.share >= TRACE.formula_share
-            and expression.variables
-        ):
-            share = plain(100 * visible[equation], 2)
-            words = f"{share} % of the repeatable energy remains, and a formula fits it"
-            loud = winner.excess_energy[equation] > hypotheses.noise_band.by_equation[equation]
-            veto = loud and visible[equation] < TRACE.unexplained_share
-            tail = "" if veto else _tolerance_words(visible[equation])
-            out.append(Remainder(equation, f"{words}: {expression.text}{tail}", veto))
-    return [*out, *_tolerated_remainders(hypotheses, winner, out)]
-
-
-def _tolerated_remainders(
-    hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Remainder]
-) -> list[Remainder]:
-    """Return the equations beside `known` that keep more than `HypothesisSet.negligible` allows."""
-    listed = {r.equation for r in known}
-    out = []
-    for e, residual in winner.excess_energy.items():
-        if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
-            share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
+    listed = {r.equation for r in out}
+    counts = hypotheses.train_data.row_counts
+    for e, energy in winner.excess_energy.items():
+        share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
+        visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
+        if winner.effects and e not in listed and visible and share > SEARCH.form_share:
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             out.append(Remainder(e, words + _tolerance_words(share), False))
     return out
@@ -93,30 +61,11 @@ def _tolerated_remainders(
 
 def _tolerance_words(share: float) -> str:
     """Say why a remaining share of the energy does not speak against the named effects."""
-    if share < TRACE.unexplained_share:
+    if share < 1.0 - TRACE.least_removed:
         return "; within the tolerance for the form of the named effect"
     return (
         "; no named effect acts there, and the residual is too close to the noise to name another"
     )
-
-
-def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
-    """Return the remaining share of the baseline's energy, of equations that stand out of noise.
-
-    These keep more than `TRACE.formula_least_share`, and more energy than
-    `TRACE.formula_deviations` standard deviations of the noise's own.
-    """
-    counts = hypotheses.train_data.row_counts
-    shares = {
-        e: v / max(hypotheses.empty.excess_energy[e], 1e-30)
-        for e, v in winner.excess_energy.items()
-    }
-    return {
-        e: share
-        for e, share in shares.items()
-        if share > TRACE.formula_least_share
-        and winner.excess_energy[e] > TRACE.formula_deviations * np.sqrt(2 * counts[e])
-    }
 
 
 def clues_to(

@@ -38,11 +38,7 @@ class TraceSettings:
     """Energy above noise of an equation with an effect over that under the baseline: with more, the
     effect is refused (tuned)."""
     # Residual that may remain.
-    training_share: float = 0.05
-    """Largest remaining share of an equation's training energy above noise under the baseline: so
-    much may a named form differ from the real one (tuned: seals of LuGre's and Karnopp's law,
-    turbulent leaks)."""
-    held_out_share: float = 0.10
+    held_out_share: float = 0.05
     """Largest remaining share of an equation's held-out energy above noise under the baseline;
     held-out records may be quieter than training records (tuned)."""
     held_out_band: float = 1.5
@@ -64,18 +60,9 @@ class TraceSettings:
     noted_ratio: float = 1.3
     """Held-out rms of an equation over its noise floor, from which a note beside an explanation
     states what remains (contract)."""
-    formula_deviations: float = 8.0
+    visible_deviations: float = 8.0
     """Energy above noise of an equation over the standard deviation of the noise's own energy, from
-    which a formula is fitted to the residual."""
-    formula_least_share: float = 0.005
-    """Remaining share of an equation's energy above noise under the baseline, from which a formula
-    is fitted to it (tuned)."""
-    formula_share: float = 0.7
-    """Share of the held-out residual that a formula removes, from which the residual counts as
-    following it (tuned on hardening springs)."""
-    unexplained_share: float = 0.5
-    """Remaining share of an equation's energy above noise under the baseline, from which no effect
-    found acts in the equation (tuned)."""
+    which a further effect is searched for in it (tuned)."""
     clue_share: float = 0.1
     """Share of the remaining energy of all equations, below which an equation is not searched for
     clues (tuned)."""

@@ -102,7 +102,9 @@ def test_the_curve_of_a_leak_whose_form_has_no_name_is_right() -> None:
     turbulent = Wrong(*LEAK, "turbulent", curve="leakage_curve")
     curve = {("leakage_curve", "joint 1")}
     assert answer_of(_case(SINGLE, turbulent), "explained", curve, set()) == "right"
-    assert answer_of(_case(SINGLE, Wrong(*LEAK, "laminar")), "explained", curve, set()) == "wrong"
+    assert answer_of(_case(SINGLE, Wrong(*LEAK, "laminar")), "explained", curve, set()) == (
+        "right mechanism"
+    )
 
 
 def test_bounds_are_those_of_the_binomial() -> None:

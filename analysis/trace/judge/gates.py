@@ -175,19 +175,15 @@ def equations_above_band(
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the band, and in words how much in which records.
 
-    The band of training records is noise or `TRACE.training_share` of the baseline's energy,
-    whichever is larger; for held-out records see `held_out_above_band`. The error of an effect's
-    form is a share of the effect, which better sensors do not make smaller.
+    Held-out records judge a set of effects (`held_out_above_band`); without any effect, training
+    records must hold no more than noise either (`HypothesisSet.negligible`).
     """
-    out = []
-    for e, residual in winner.excess_energy.items():
-        share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-        if share > TRACE.training_share and not hypotheses.negligible(e, residual):
-            times = residual / hypotheses.noise_band.by_equation[e]
-            stays = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            grown = share > 1.0 + SEARCH.tolerance
-            words = "the repeatable energy is larger than under the baseline" if grown else stays
-            out.append((e, f"{words}, {plain(times, 2)} times the band"))
+    band = hypotheses.noise_band.by_equation
+    out = [
+        (e, f"the repeatable energy is {plain(energy / band[e], 2)} times the band")
+        for e, energy in winner.excess_energy.items()
+        if not winner.effects and not hypotheses.negligible(e, energy)
+    ]
     return out + held_out_above_band(holdout_data, hypotheses.empty.fit, winner.fit)
 
 

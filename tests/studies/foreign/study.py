@@ -21,10 +21,11 @@ from tests.studies.foreign.bench import Bench, runs_of, training_of
 from tests.studies.foreign.cases import NONE, OUTSIDE, PAIR, Case, case_of
 
 ABSTAINED_RIGHT = "abstained, truth found"
+MECHANISM = "right mechanism"  # a free curve where a name of its mechanism is hidden
 BESIDE = "wrong beside unexplained"
 BETTER = ("repeats", "noise", "longer")
 # Answers from weak to strong: better data may only move a bench upwards.
-STRENGTH = ("quiet", "abstained", ABSTAINED_RIGHT, "refused", "in class", "right")
+STRENGTH = ("quiet", "abstained", ABSTAINED_RIGHT, "refused", MECHANISM, "in class", "right")
 LOUD = 3.0  # repeatable residual over the noise from which an effect must be found
 CONFIDENCE = 0.95
 
@@ -152,13 +153,15 @@ def _sizes(case: Case, effects: Iterable[Any]) -> tuple[list[float], tuple[int, 
 def answer_of(  # noqa: PLR0911  a table of answers
     case: Case, verdict: str, named: set[tuple[str, str]], tied: set[tuple[str, str]]
 ) -> str:
-    """Judge an answer: right, in class, quiet, partly, abstained, wrong, false alarm."""
-    from analysis.trace.data.candidates import catalogue
+    """Judge an answer: right, in class, quiet, partly, abstained, wrong, false alarm …"""
+    from analysis.trace.data.candidates import catalogue, free_mechanisms
 
     drawn = {(w.curve, w.where): (w.name, w.where) for w in case.hidden if w.curve}
     named = {drawn.get(key, key) for key in named}
     truth, own = case.truth, named - case.allowed
-    known = {e.name for e in catalogue(case.bench.rig)}
+    rig = case.bench.rig
+    known, curves = ({e.name for e in some(rig)} for some in (catalogue, free_mechanisms))
+    mechanisms = {e.name: e.mechanism for e in (*catalogue(rig), *free_mechanisms(rig))}
     if case.kind == NONE:
         return "right" if verdict == "clean" else "false alarm" if named else "abstained"
     if case.kind == OUTSIDE or any(name not in known for name, _ in truth):
@@ -176,6 +179,12 @@ def answer_of(  # noqa: PLR0911  a table of answers
         return "right"
     if verdict == "confounded" and truth <= named | tied:
         return "in class"
+    if settled and own - truth and all(name in curves for name, _ in own - truth):
+        found, hidden = (
+            {(mechanisms[name], where) for name, where in keys} for keys in (named, truth)
+        )
+        if found <= hidden:
+            return MECHANISM if found == hidden else "partly"
     if settled:
         return "partly" if own < truth else "wrong"
     if own <= truth:
@@ -225,6 +234,8 @@ def text(outcomes: Sequence[Outcome]) -> str:
     clean = [o for o in outcomes if o.kind == NONE]
     for word, hits, of in (
         ("right or in class, loud", _count(hidden, "right", "in class", "refused"), len(hidden)),
+        ("right mechanism, a curve in place of its name, loud", _count(hidden, MECHANISM),
+         len(hidden)),
         ("wrong name, explained or confounded", _count(outcomes, "wrong"), len(outcomes)),
         ("wrong name beside unexplained", _count(outcomes, BESIDE),
          len(outcomes)),

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 ALL: Final = "all rules"
 WRONG: Final = ("wrong", "wrong beside unexplained", "false alarm", "partly")
-SETTLED: Final = ("right", "in class", "refused")
+SETTLED: Final = ("right", "right mechanism", "in class", "refused")
 
 
 @dataclass(frozen=True)

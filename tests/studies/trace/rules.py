@@ -134,14 +134,7 @@ RULES: Final = (
     Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
          ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
-    Rule("training band", "any share of the training energy may remain",
-         (setting("training_share", math.inf),)),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
-    Rule("formula check", "a remaining residual that one formula fits is accepted",
-         (setting("formula_share", math.inf),)),
-    Rule("formula check by equation",
-         "a residual that a formula fits refuses effects of any equation",
-         (setting("unexplained_share", math.inf),)),
     Rule("further search", "no further effect is searched for in single equations",
          ((HypothesisSet, "extended_in", lambda *_: None),)),
     Rule("price of parameters", "a further parameter costs nothing",
@@ -176,7 +169,7 @@ FAULTS: Final = (
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
          (setting("held_out_band", 3.0),)),
     Rule("form tolerance x 10", "half of what repeated may stay",
-         (setting("training_share", 0.5), setting("held_out_share", 1.0)),),
+         (setting("held_out_share", 1.0),)),
     Rule("floor x 0.3", "the noise is taken for a third", tuple(
         (module, "floors", _floors(0.3)) for module in (noise_floor, regression_data)), True),
     Rule("floor x 3", "the noise is taken for three times as large", tuple(
