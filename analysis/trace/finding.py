@@ -113,7 +113,7 @@ def trace_rows(
     """Return the whitened rows of all runs under a model of `terms`.
 
     `filtering` gives the row filter of each record. Coefficients are fitted to the training rows.
-    Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation.
+    Raises InputError where a step leaves too few rows of an equation (`_without_masked_steps`).
     """
 
     def filters(record: Record) -> Filtering:
@@ -137,28 +137,41 @@ def _training_rows(
     rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord]
 ) -> RegressionData:
     """Return the training rows, with the columns of the spools' paths between samples."""
-    data = regression_data(rig, terms, train)
-    _refuse_short(data)
+    data = _without_masked_steps(regression_data(rig, terms, train))
     paths = path_terms(data)
-    return regression_data(rig, (*terms, *paths), train) if paths else data
+    if not paths:
+        return data
+    return _without_masked_steps(regression_data(rig, (*terms, *paths), train))
 
 
-def _refuse_short(train_data: RegressionData) -> None:
-    for s in train_data.segments:
+def _without_masked_steps(train_data: RegressionData) -> RegressionData:
+    """Return the rows without equations of a step of which nearly all rows are masked.
+
+    Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation and is
+    too short, or is the only one with rows of that equation.
+    """
+    least = TRACE.least_rows
+    short = [s for s in train_data.segments if s.where.stop - s.where.start < least]
+    elsewhere = {s.equation for s in train_data.segments if s not in short}
+    kept = np.ones(train_data.base.shape[0], dtype=bool)
+    for s in short:
         count = s.where.stop - s.where.start
-        if count < TRACE.least_rows:
-            conditioned, rows = train_data.source(s)
-            record, masked = conditioned.record, rows.masked
-            remedy = "take longer records"
-            if masked > count:
-                remedy = (
-                    f"{masked} others are masked, since a pressure lies outside 0 to the supply's, "
-                    "or samples were clipped or lost: move less, or check the sensors' ranges"
-                )
-            raise InputError(
-                f"step {s.group[1]!r}: records of {record.samples / record.sample_rate:.3g} s "
-                f"leave {count} rows of {s.equation}; the trace needs {TRACE.least_rows}: {remedy}"
+        conditioned, rows = train_data.source(s)
+        record, masked = conditioned.record, rows.masked
+        if masked > count and s.equation in elsewhere:
+            kept[s.where] = False
+            continue
+        remedy = "take longer records"
+        if masked > count:
+            remedy = (
+                f"{masked} others are masked, since a pressure lies outside 0 to the supply's, "
+                "or samples were clipped or lost: move less, or check the sensors' ranges"
             )
+        raise InputError(
+            f"step {s.group[1]!r}: records of {record.samples / record.sample_rate:.3g} s "
+            f"leave {count} rows of {s.equation}; the trace needs {least}: {remedy}"
+        )
+    return train_data if kept.all() else train_data.at(kept)
 
 
 def search_and_judge(

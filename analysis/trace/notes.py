@@ -34,8 +34,20 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return [
         *out,
+        *_masked_step_notes(train_data),
         *masked_row_notes("training", train_data),
         *masked_row_notes("held-out", holdout_data),
+    ]
+
+
+def _masked_step_notes(train_data: RegressionData) -> list[str]:
+    """Name the equations of a step that are left out, since nearly all their rows are masked."""
+    kept = {(s.group, s.equation) for s in train_data.segments}
+    return [
+        f"{equation}: step {group[1]!r} is left out of training, since a pressure lies outside 0 "
+        f"to the supply's, or samples were clipped or lost, in all but fewer than "
+        f"{TRACE.least_rows} rows"
+        for group, equation in sorted({(f.group, f.equation) for f in train_data.floors} - kept)
     ]
 
 

@@ -23,10 +23,10 @@ from analysis.trace.search.refinement import design_matrix, fit_coefficients
 from analysis.trace.settings import TRACE
 from rig.cli.main import app
 from rig.model.parse import InputError
-from rig.model.records import Run
+from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from rig.runs.exchange.fixtures import write_run
-from tests.analysis.trace.gate_cases import LEAK, at_joint_2
+from tests.analysis.trace.gate_cases import LEAK, at_joint_2, joined
 from tests.analysis.trace.hidden import RMS, experiment, pair_of_runs, pushed
 
 FEW = ("internal_leakage", "external_leakage", "spool_offset")
@@ -214,6 +214,28 @@ def test_what_the_judging_records_know_far_better_is_no_error_of_the_model(
     assert sizes[2] == pytest.approx(sizes[0], rel=0.02)
     settled = held_out.refitted_to_held_out(data["held"], replace(wrong, information=poor))
     assert held_out.refitted_names(wrong, settled) == ["M2"]
+
+
+def test_an_equation_whose_rows_a_step_masks_is_traced_with_the_other_steps(rig: Rig) -> None:
+    """A chamber stands above the supply's pressure for most of one step."""
+    train, held_out = pair_of_runs(rig, c_internal=LEAK)
+    other = experiment(rig, seed=5, c_internal=LEAK)
+
+    def high(record: Record) -> Record:
+        pressure = np.asarray(record.channels["cap_pressure_2"]).copy()
+        pressure[int(1.3 * record.sample_rate) :] = 1.05 * rig.supply.pressure
+        return replace(record, channels=record.channels | {"cap_pressure_2": pressure})
+
+    masked = replace(other, records=tuple(map(high, other.records)))
+    candidates = at_joint_2(rig, "internal_leakage")
+    result = trace([joined(train, masked)], [held_out], candidates, look_ahead=False)
+    note = "flow_cap_2: step 'step2' is left out of training, since a pressure lies outside"
+    assert sum(n.startswith(note) for n in result.notes) == 1
+    assert {f.equation for f in result.floors if f.group[1] == "step1"} <= set(result.after)
+    whole = trace([train], [held_out], candidates, look_ahead=False)
+    assert not any("left out of training" in n for n in whole.notes)
+    with pytest.raises(InputError, match=r"rows of flow_cap_2; the trace needs 40: \d+ others are"):
+        trace([masked], [held_out], candidates, look_ahead=False)
 
 
 def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) -> None:
