@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from analysis.terms import baseline, make
 from analysis.terms.base import Used
@@ -16,6 +17,8 @@ from analysis.trace.data.regression_data import regression_data
 from analysis.trace.search import refinement
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
+
+Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize("start", [0.9, 0.98, 1.02, 1.1])
@@ -59,6 +62,32 @@ def test_an_effect_explains_nothing_by_moving_pressures_beyond_the_supplys(rig: 
     assert np.linalg.norm(found.residual[flow]) > 10 * np.linalg.norm(
         train_data.mean_residual[flow]
     )
+
+
+def test_a_few_instants_at_which_an_effect_makes_the_oil_cavitate_count_like_the_others(
+    rig: Rig,
+) -> None:
+    run = bench.run(rig, bench.Wrong.of(c_internal=1e-11), 0.03, 1)
+    train_data = regression_data(rig, tuple(map(Used, baseline())), conditioned_records(rig, [run]))
+    leak = Used(make("internal_leakage", "joint 2"))
+
+    def fitted(share: float) -> tuple[Array, Array, Array]:
+        """Return residuals where the oil cavitates and elsewhere, and those of the baseline there.
+
+        The cap's sensor is said to read so high that the pressure is below zero at a `share`.
+        """
+        high = float(np.quantile(run.records[0].channels["cap_pressure_2"], share))
+        terms = (*train_data.terms, leak, Used(make("sensor_offset", "joint 2 cap"), (high,)))
+        ((kept, outside),) = refinement.design_matrix(train_data, terms).cavitating
+        residual = refinement.fit_coefficients(train_data, terms).residual
+        return residual[outside], residual[kept], train_data.mean_residual[outside]
+
+    few, others, before = fitted(0.003)
+    assert 0 < len(few) < 0.2 * len(others)
+    assert np.abs(few).max() <= np.sqrt(np.mean(others**2)) < 0.5 * np.abs(before).max()
+    many, others, before = fitted(0.02)
+    assert len(many) > 0.2 * len(others)
+    np.testing.assert_array_equal(many, before)
 
 
 def test_a_chamber_below_the_tanks_pressure_draws_oil_from_the_tank(rig: Rig) -> None:
