@@ -22,8 +22,9 @@ from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
-# Order of preparation: sensors, null of the spool, its lag, its edges, supply and return, the rest.
-SENSOR, NULL, LAG, EDGES, SUPPLY, PLANT = range(6)
+# Order of preparation: sensors, null of the spool, its lag, its edges, volumes of the chambers,
+# supply and return (whose flow depends on the volumes), the rest.
+SENSOR, NULL, LAG, EDGES, VOLUME, SUPPLY, PLANT = range(7)
 
 
 @dataclass(frozen=True)

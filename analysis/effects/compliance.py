@@ -8,7 +8,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.effects.base import VOLUME, Array, Effect, Shape, beyond
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     COMP_CAP,
@@ -136,6 +136,7 @@ class DeadVolume(Effect):
     prepares: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
+    stage: ClassVar[int] = VOLUME
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     variable: ClassVar[str] = "the chamber's pressure rate"
     confounders: ClassVar[tuple[str, ...]] = ("entrained_air", "spool_lag", "channel_delay")

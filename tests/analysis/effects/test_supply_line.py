@@ -9,9 +9,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from analysis.effects.base import Evidence
+from analysis.effects.base import Evidence, ordered
+from analysis.effects.compliance import DeadVolume
 from analysis.effects.supply import PortEffect, ReturnLine, SupplySag
 from analysis.signals.conditioning import Signals
+from analysis.terms.base import Used
 from rig.model.rig import Rig
 from tests.analysis.test_terms import signals_of
 
@@ -58,6 +60,24 @@ def test_without_oil_between_the_drop_is_that_of_the_flow_at_each_instant(
     assert dropped(rig, more, 0.0).max() == pytest.approx(
         4 * dropped(rig, huge, 0.0).max(), rel=0.01
     )  # turbulent: as its square
+
+
+def test_the_flow_drawn_fills_the_dead_volume_too(rig: Rig, lifting: Signals) -> None:
+    """By continuity the volume takes V / b times the pressure rate, which the line must carry."""
+    volume, rate = 60e-6, 40e6 * np.sin(2 * np.pi * 12 * lifting.t) ** 2
+    rising = replace(lifting, pd_cap=np.column_stack((rate, np.zeros(len(rate)))))
+    terms = [
+        Used(SupplySag("bench"), (DROP, SHARE, 0.0)), Used(DeadVolume("joint 1 cap"), (volume,)),
+    ]  # fmt: skip
+    seen = rising
+    for used in ordered(terms):
+        seen = used.term.prepare(rig, seen, used.shape)
+    through_line = np.array([through(d, rig.supply.flow) for d in (rising.p_s - seen.p_s)[::50]])
+    softness = 1.0 / rig.nominal["b"]
+    moved = rising.sd[:, 0] * rig.joints[0].cylinder.cap_area
+    filled = softness * (rising.V_cap[:, 0] + volume) * rate
+    assert through_line == pytest.approx((moved + filled)[::50], rel=1e-6)
+    assert filled.max() > 0.05 * moved.max()
 
 
 @pytest.mark.parametrize("effect", [SupplySag("bench"), ReturnLine("bench")])

@@ -88,7 +88,7 @@ def test_an_error_above_the_noise_is_said_to_be_within_the_form(rig: Rig) -> Non
     after = AFTER | {"torque_2": 3.3 * FLOOR["torque_2"]}
     text = told(rig, (SPRING,), BEFORE | {"torque_2": 60 * FLOOR["torque_2"]}, after)
     assert "left in torque_2, 3.3 times the noise floor, is 0.27 % of the energy" in text
-    assert "may miss 10 %" in text
+    assert "may miss 5 %" in text
     assert "may miss" not in told(rig, (SPRING,))
 
 
