@@ -472,7 +472,8 @@ def _extended_set(
     """Add effects for equations that keep too much, while all pass and fewer equations do.
 
     Returns the judged effects, their set, and what it leaves. Where no remainder speaks against the
-    set, a further effect must not change whether the answer has a tied rival.
+    set, a larger set with more effects and free numbers together must not change whether the answer
+    has a tied rival.
     """
     while left:
         larger = hypotheses.extended_in(winner, {r.equation for r in left})
@@ -480,7 +481,7 @@ def _extended_set(
             break
         judged = gates.judge_effects(hypotheses, larger, holdout_data, rng)
         less = remainders(hypotheses, larger, holdout_data)
-        needed = any(r.veto for r in left)
+        needed = any(r.veto for r in left) or sum(larger.size) <= sum(winner.size)
         if not needed and has_tied_rival(judged) != has_tied_rival(effects):
             break
         if len(less) >= len(left) or not all(map(gates.passes_gates, judged)):

@@ -20,7 +20,7 @@ from analysis.trace.result import Dependence, Formula
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased
-from analysis.trace.settings import SEARCH, TRACE
+from analysis.trace.settings import TRACE
 from rig.model.units import plain
 
 
@@ -43,7 +43,7 @@ def remainders(
 
     First those above the band (`gates.equations_above_band`), which speak against the set, then
     those whose training energy above noise exceeds `TRACE.visible_deviations` standard deviations
-    of the noise's own energy and `SEARCH.form_share` of what the baseline leaves.
+    of the noise's own energy and `TRACE.visible_share` of what the baseline leaves.
     """
     out = [
         Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
@@ -53,7 +53,7 @@ def remainders(
     for e, energy in winner.excess_energy.items():
         share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
-        if winner.effects and e not in listed and visible and share > SEARCH.form_share:
+        if winner.effects and e not in listed and visible and share > TRACE.visible_share:
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             out.append(Remainder(e, words + _tolerance_words(share), False))
     return out

@@ -63,6 +63,9 @@ class TraceSettings:
     visible_deviations: float = 8.0
     """Energy above noise of an equation over the standard deviation of the noise's own energy, from
     which a further effect is searched for in it (tuned)."""
+    visible_share: float = 0.005
+    """Share of an equation's energy above noise under the baseline from which the same is done: a
+    friction beside a stiff spring left 1 % (tuned)."""
     clue_share: float = 0.1
     """Share of the remaining energy of all equations, below which an equation is not searched for
     clues (tuned)."""

@@ -141,13 +141,33 @@ class HypothesisSet:
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the simplest physical set of those that leave about the least, else `empty`."""
-        allowed = [o for o in among if not self.physical_problem(o)]
+        """Return the simplest physical set of those that leave about the least, else `empty`.
+
+        Where an effect equals a simpler one that it includes, the set with that one is tried too.
+        """
+        allowed = [o for o in (*among, *self._simpler_sets(among)) if not self.physical_problem(o)]
         if not allowed:
             return self.empty
         least = min(allowed, key=lambda o: o.total)
         near = [o for o in allowed if o is least or self.is_preferred(o, least)]
         return min(near, key=lambda o: (sum(o.size), o.size[0], o.total))
+
+    def _simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return sets with an effect replaced by a simpler one that it equals."""
+        rig, out = self.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
+        known = {(u.term.name, u.term.where) for u in self.base}
+        for hypothesis in among:
+            values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
+            for used in hypothesis.effects:
+                assert isinstance(used.term, Effect)
+                name, where = used.term.simpler(rig, values), used.term.where
+                if not name or (name, where) in known | hypothesis.keys:
+                    continue
+                simple = effect_of(name, where)
+                others = tuple(u for u in hypothesis.effects if u is not used)
+                keys = frozenset((u.term.name, u.term.where) for u in others) | {(name, where)}
+                out.setdefault(keys, (*others, Used(simple, simple.shape_of(rig, ()))))
+        return [self.refined(effects) for effects in out.values()]
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
         """Search single effects, pairs and extensions, and return the best set.
@@ -333,9 +353,9 @@ class HypothesisSet:
             least = SEARCH.number_price * (hypothesis.size[1] - now.size[1])
             return sum(drop[e] for e in here) > max(least, SEARCH.add_share * start)
 
-        more = [
-            o for o in self.extensions(now, equations) if earned(o) and not self.physical_problem(o)
-        ]
+        tried = self.extensions(now, equations)
+        tried += self._simpler_sets(tried)
+        more = [o for o in tried if earned(o) and not self.physical_problem(o)]
         if not more:
             return None
         best = min(map(residual, more))
