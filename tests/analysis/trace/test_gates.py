@@ -239,6 +239,13 @@ def an_effect_that_takes_nothing_is_dropped(b: Benches) -> None:
     assert s.hypotheses.prune(both).keys == s.set_of("internal_leakage").keys
 
 
+def equal_levels_by_direction_are_one_level(b: Benches) -> None:
+    """Only two levels are among the candidates."""
+    s = b.searched(b.runs(Fc=60.0), "asymmetric_friction")
+    assert {name for name, _ in s.winner.keys} == {"coulomb_friction"}
+    assert s.winner.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
+
+
 def friction_without_a_memory_is_coulomb_friction_too(b: Benches) -> None:
     hidden = foreign_bench.Hidden(80.0, 80.0, 5e-3)
     runs = b.kept("memoryless", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
@@ -347,6 +354,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_the_judging_rows_alone_show_is_not_explained, ("judging rows unread",)),
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
+    (equal_levels_by_direction_are_one_level, ("simpler name",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
     (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),
     (a_drop_without_a_name_is_drawn_as_a_curve, ("free forms",)),

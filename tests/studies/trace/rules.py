@@ -147,6 +147,8 @@ RULES: Final = (
          ((HypothesisSet, "_pairs", lambda *_: []),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
+    Rule("simpler name", "an effect that equals a simpler one is refused, and that one not tried",
+         ((HypothesisSet, "_simpler_sets", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
