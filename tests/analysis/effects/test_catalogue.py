@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.effects.base import Effect, ordered
+from analysis.effects.base import SUPPLY, Effect, ordered
 from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth
@@ -173,7 +173,7 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
             shape = (*shape[:2], 0.0)  # the simulation's line follows at once
         forms += [(e, one) for one in (shape, *e.other_forms(rig, shape))]
     for e, shape in forms:
-        signals = consistent(rig, state, e, shape) if e.stage == 4 else state
+        signals = consistent(rig, state, e, shape) if e.stage == SUPPLY else state
         values, par = packed(e, rig, shape)
         seen = e.prepare(rig, signals, shape)
         columns = e.columns(rig, seen, shape)
