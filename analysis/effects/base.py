@@ -116,7 +116,8 @@ class Effect(Term):
     `variable` names in plain words what the effect's contribution depends on; `confounders` are
     effects whose columns are similar on poor excitation, `separated_by` an excitation on which they
     differ; `includes` names effects that it equals at a limit of its own numbers and replaces, and
-    `beside` those that it may accompany as another part of their law.
+    `beside` those that it may accompany as another part of their law, `excludes` those that cannot
+    act at the same place.
 
     `stage` orders the terms' `prepare` (see `ordered`): sensor errors are undone first, then come
     effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
@@ -142,6 +143,7 @@ class Effect(Term):
     separated_by: ClassVar[str] = ""
     includes: ClassVar[tuple[str, ...]] = ()
     beside: ClassVar[bool] = False
+    excludes: ClassVar[tuple[str, ...]] = ()
     stage: ClassVar[int] = PLANT
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False

@@ -90,6 +90,7 @@ class ValveDeadband(ValveEffect):
     stage: ClassVar[int] = EDGES
     variable: ClassVar[str] = "the spool near its null"
     confounders: ClassVar[tuple[str, ...]] = ("spool_offset", "underlap_leakage", "spool_lag")
+    excludes: ClassVar[tuple[str, ...]] = ("underlap_leakage",)
     separated_by: ClassVar[str] = (
         "small spool amplitudes about the null beside large ones, both edges reached"
     )

@@ -472,8 +472,8 @@ def _extended_set(
     """Add effects for equations that keep too much, while all pass and fewer equations do.
 
     Returns the judged effects, their set, and what it leaves. Where no remainder speaks against the
-    set, a larger set with more effects and free numbers together must not change whether the answer
-    has a tied rival.
+    set, a further effect must not change whether the answer has a tied rival, unless simpler names
+    beside it make the whole set no larger.
     """
     while left:
         larger = hypotheses.extended_in(winner, {r.equation for r in left})
@@ -481,7 +481,8 @@ def _extended_set(
             break
         judged = gates.judge_effects(hypotheses, larger, holdout_data, rng)
         less = remainders(hypotheses, larger, holdout_data)
-        needed = any(r.veto for r in left) or sum(larger.size) <= sum(winner.size)
+        replaces = not winner.keys <= larger.keys and sum(larger.size) <= sum(winner.size)
+        needed = replaces or any(r.veto for r in left)
         if not needed and has_tied_rival(judged) != has_tied_rival(effects):
             break
         if len(less) >= len(left) or not all(map(gates.passes_gates, judged)):

@@ -102,6 +102,9 @@ class HypothesisSet:
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
         for used in sorted(hypothesis.effects, key=lambda used: used is not first):
             assert isinstance(used.term, Effect)
+            for name in used.term.excludes:
+                if (name, used.term.where) in hypothesis.keys:
+                    return f"{used.term.name} and {name} exclude each other at one place"
             problem = used.term.problem(rig, values, used.shape)
             if (used.term.name, used.term.where) not in may_be_at_bounds:
                 problem = problem or used.term.outside(rig, used.shape)

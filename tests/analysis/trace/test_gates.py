@@ -392,6 +392,15 @@ def test_every_rule_and_fault_has_a_story() -> None:
     assert set(by_name(RULES + FAULTS)) - told == NO_BENCH
 
 
+def test_an_edge_cannot_overlap_and_be_open_at_the_null(rig: Rig) -> None:
+    """Together the two names would only bend the edge's form."""
+    names = ("valve_deadband", "underlap_leakage")
+    s = gate_cases.searched(rig, *pair_of_runs(rig, c_internal=LEAK), *names)
+    assert "exclude each other" in s.hypotheses.physical_problem(s.set_of(*names))
+    for name in names:
+        assert "exclude" not in s.hypotheses.physical_problem(s.set_of(name))
+
+
 def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect(rig: Rig) -> None:
     """Three times the noise in one equation: by the effect, there before, or without it too."""
     s = gate_cases.searched(rig, *pair_of_runs(rig, c_internal=LEAK), "internal_leakage")
