@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.studies.fuzz import run
 from tests.studies.fuzz.mutation import damaged
 from tests.studies.fuzz.run import FuzzResult, cases, fuzz
 from tests.studies.fuzz.targets import MAKERS, SHARES, Target
@@ -50,13 +49,10 @@ def _leaky(data: bytes) -> None:
         raise IndexError("beyond the end")
 
 
-def test_an_error_that_nobody_expects_and_a_crash_are_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_error_that_nobody_expects_and_a_crash_are_found() -> None:
     found = FuzzResult("leaky")
     cases(Target("leaky", (b"0123456789",), _leaky, (ValueError,)), 200, 0, found, lambda: None)
     assert any(what.startswith("IndexError: beyond the end (case ") for what in found.wrong)
     assert found.cases == 200
-    monkeypatch.setattr(run, "LONGEST", 1.0)
     (wrong,) = fuzz("no such reader", 10, 0).wrong
     assert wrong.startswith("crash (1)")

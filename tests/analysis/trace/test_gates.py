@@ -241,7 +241,7 @@ def an_effect_that_takes_nothing_is_dropped(b: Benches) -> None:
 
 def equal_levels_by_direction_are_one_level(b: Benches) -> None:
     """Only two levels are among the candidates."""
-    s = b.searched(b.runs(Fc=60.0), "asymmetric_friction")
+    s = gate_cases.searched(b.rig, *b.runs(Fc=60.0), "asymmetric_friction")
     assert {name for name, _ in s.winner.keys} == {"coulomb_friction"}
     assert s.winner.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
 
