@@ -24,7 +24,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.spectral_lines import SpectralLines, spectral_lines
+from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import (
@@ -191,14 +191,12 @@ def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
 class _Fitted:
     """The set of effects with the shapes that are used, and the model with them.
 
-    `effects` are those named, with intervals that hold every error; `lines` are the spectral lines
-    of what remains in training.
+    `effects` are those named, with intervals that hold every error.
     """
 
     winner: Hypothesis
     model: Model
     effects: tuple[JudgedEffect, ...]
-    lines: tuple[SpectralLines, ...]
 
 
 def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
@@ -215,7 +213,7 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     effects = tuple(
         with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
     )
-    return _Fitted(winner, after, effects, spectral_lines(rows.train, winner.fit.residual))
+    return _Fitted(winner, after, effects)
 
 
 def _traced(
@@ -236,14 +234,12 @@ def _traced(
     done(JUDGED)
     records = replace(prepared.records, lines=finding.rows.lines)
     hypotheses, train_data, unseen = finding.hypotheses, finding.rows.train, finding.rows.unseen
+    lines = spectral_lines(train_data, finding.winner.fit.residual)
     moves, formulas = (
         ((), ())
         if finding.verdict in (CLEAN, EXPLAINED)
-        else clues_to(
-            train_data, unseen.choosing, finding.winner,
-            spectral_lines(train_data, finding.winner.fit.residual),
-        )
-    )  # fmt: skip
+        else clues_to(train_data, unseen.choosing, finding.winner, lines)
+    )
     further = (
         propose(hypotheses, finding.winner, finding.named, finding.verdict, moves)
         if options.look_ahead
@@ -251,6 +247,8 @@ def _traced(
     )
     fitted = _fitted(prepared, finding)
     winner, after = fitted.winner, fitted.model
+    if winner is not finding.winner:
+        lines = spectral_lines(train_data, winner.fit.residual)
     # Everything is chosen. From here on the judging rows are read, and nothing is chosen by them.
     first, last = (
         held_out.refitted_to_held_out(unseen.judging, fit)
@@ -285,7 +283,7 @@ def _traced(
         refused=finding.refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
-        lines=fitted.lines, formulas=formulas,
+        lines=lines, formulas=formulas,
         free_curves=held_out.free_curves(runs_before, runs_after),
         detection_limits=tuple(hidden), seconds=time.perf_counter() - started,
     )  # fmt: skip

@@ -24,6 +24,7 @@ from analysis.trace.free_forms import explained_by_free_form, mechanism_count
 from analysis.trace.judge import gates, readings
 from analysis.trace.judge.unlocked import Line, judged_line
 from analysis.trace.judgement import Judgement, has_tied_rival
+from analysis.trace.notes import WHY_MASKED
 from analysis.trace.remaining import Remainder, remainders
 from analysis.trace.result import (
     CLEAN,
@@ -164,8 +165,8 @@ def _without_masked_steps(train_data: RegressionData) -> RegressionData:
         remedy = "take longer records"
         if masked > count:
             remedy = (
-                f"{masked} others are masked, since a pressure lies outside 0 to the supply's, "
-                "or samples were clipped or lost: move less, or check the sensors' ranges"
+                f"{masked} others are masked, since {WHY_MASKED}: move less, or check the "
+                "sensors' ranges"
             )
         raise InputError(
             f"step {s.group[1]!r}: records of {record.samples / record.sample_rate:.3g} s "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Final
 
 from analysis.effects.base import Effect
 from analysis.effects.free_forces import PositionForce
@@ -14,6 +15,8 @@ from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from rig.model.units import plain
+
+WHY_MASKED: Final = "a pressure lies outside 0 to the supply's, or samples were clipped or lost"
 
 
 def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
@@ -44,9 +47,8 @@ def _masked_step_notes(train_data: RegressionData) -> list[str]:
     """Name the equations of a step that are left out, since nearly all their rows are masked."""
     kept = {(s.group, s.equation) for s in train_data.segments}
     return [
-        f"{equation}: step {group[1]!r} is left out of training, since a pressure lies outside 0 "
-        f"to the supply's, or samples were clipped or lost, in all but fewer than "
-        f"{TRACE.least_rows} rows"
+        f"{equation}: step {group[1]!r} is left out of training, since {WHY_MASKED}, in all but "
+        f"fewer than {TRACE.least_rows} rows"
         for group, equation in sorted({(f.group, f.equation) for f in train_data.floors} - kept)
     ]
 
@@ -61,9 +63,8 @@ def masked_row_notes(kind: str, data: RegressionData) -> list[str]:
         missing[s.equation] = missing.get(s.equation, 0) + rows.masked
     shares = {e: missing[e] / max(missing[e] + kept[e], 1) for e in sorted(kept)}
     return [
-        f"{equation}: {plain(100 * share, 2)} % of the {kind} rows are left out, since a pressure "
-        "lies outside 0 to the supply's, or samples were clipped or lost: an effect that acts only "
-        "there is not seen"
+        f"{equation}: {plain(100 * share, 2)} % of the {kind} rows are left out, since "
+        f"{WHY_MASKED}: an effect that acts only there is not seen"
         for equation, share in shares.items()
         if share >= TRACE.masked_share
     ]

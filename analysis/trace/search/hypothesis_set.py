@@ -157,7 +157,7 @@ class HypothesisSet:
 
     def _simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return sets with an effect replaced by a simpler one that it equals."""
-        rig, out = self.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
+        rig, out = self.train_data.rig, []
         known = {(u.term.name, u.term.where) for u in self.base}
         for hypothesis in among:
             values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
@@ -167,10 +167,9 @@ class HypothesisSet:
                 if not name or (name, where) in known | hypothesis.keys:
                     continue
                 simple = effect_of(name, where)
-                others = tuple(u for u in hypothesis.effects if u is not used)
-                keys = frozenset((u.term.name, u.term.where) for u in others) | {(name, where)}
-                out.setdefault(keys, (*others, Used(simple, simple.shape_of(rig, ()))))
-        return [self.refined(effects) for effects in out.values()]
+                others = [u for u in hypothesis.effects if u is not used]
+                out.append(self.refined([*others, Used(simple, simple.shape_of(rig, ()))]))
+        return out
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
         """Search single effects, pairs and extensions, and return the best set.

@@ -111,15 +111,12 @@ def _cavitating(
     """Return the rows `kept` by a model and those it masks, of each equation with masked rows."""
     out = []
     for equation, parts in kept.items():
-        own = [
-            np.arange(*s.where.indices(s.where.stop))
-            for s in data.segments
-            if s.equation == equation
-        ]
+        own = [s.where for s in data.segments if s.equation == equation]
+        if sum(map(len, parts)) == sum(where.stop - where.start for where in own):
+            continue  # nearly always
         here = np.concatenate(parts)
-        every = np.concatenate(own)
-        if len(here) < len(every):
-            out.append((here, np.setdiff1d(every, here)))
+        every = np.concatenate([np.arange(where.start, where.stop) for where in own])
+        out.append((here, np.setdiff1d(every, here)))
     return tuple(out)
 
 

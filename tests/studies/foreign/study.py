@@ -159,9 +159,9 @@ def answer_of(  # noqa: PLR0911  a table of answers
     drawn = {(w.curve, w.where): (w.name, w.where) for w in case.hidden if w.curve}
     named = {drawn.get(key, key) for key in named}
     truth, own = case.truth, named - case.allowed
-    rig = case.bench.rig
-    known, curves = ({e.name for e in some(rig)} for some in (catalogue, free_mechanisms))
-    mechanisms = {e.name: e.mechanism for e in (*catalogue(rig), *free_mechanisms(rig))}
+    effects, free_forms = catalogue(case.bench.rig), free_mechanisms(case.bench.rig)
+    known, curves = ({e.name for e in some} for some in (effects, free_forms))
+    mechanisms = {e.name: e.mechanism for e in (*effects, *free_forms)}
     if case.kind == NONE:
         return "right" if verdict == "clean" else "false alarm" if named else "abstained"
     if case.kind == OUTSIDE or any(name not in known for name, _ in truth):
