@@ -29,6 +29,7 @@ from rig.runs.runstate import (
     utc_now,
     write_state,
 )
+from rig.runs.salvage.rebuild import set_aside
 from rig.runs.sections import Written
 
 log = logging.getLogger(__name__)
@@ -88,7 +89,6 @@ class Recorder:
         seed: int | None = None,
         operator: str | None = None,
         provenance: Mapping[str, Any] | None = None,
-        max_pages: int | None = None,
     ) -> None:
         self.folder = Path(folder)
         self.rig = rig
@@ -98,7 +98,6 @@ class Recorder:
             "operator": operator,
             "provenance": provenance,
         }
-        self._max_pages = max_pages
         self._journal: Journal | None = None
         self._events: EventLog | None = None
         self._names: set[str] = set()
@@ -141,7 +140,6 @@ class Recorder:
             self.rig.recorded,
             len(self.rig.channels),
             info.sample_rate,
-            self._max_pages,
         )
 
     def _open_journal(self) -> Journal:
@@ -278,7 +276,7 @@ def finalise(
         raise RecordingFailed(f"{folder}: state cannot be written: {error.strerror}") from error
     if written.damaged_blocks:
         journal.close()
-        journal.path.replace(folder / "journal.damaged.sqlite")
+        set_aside(journal.path)
     else:
         journal.delete()
     return written

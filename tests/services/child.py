@@ -124,7 +124,8 @@ def prepare(mode: str, number: int) -> dict[str, Any]:
 
 
 def run(mode: str, number: int) -> int:
-    """Take two records of 0.3 s and what is around them."""
+    """Take two records of 0.3 s (longer for a limit) and what is around them."""
+    blocks = {"serve": number, "file limit": 300, "disk full": 300}.get(mode, 30)
     driver = FakeDriver(RIG, log=RUN.with_suffix(".device"), **prepare(mode, number))
     publisher = Publisher(RIG.name) if mode == "serve" else None
     ack = os.open(RUN.with_suffix(".ack"), os.O_WRONLY | os.O_CREAT)
@@ -135,7 +136,7 @@ def run(mode: str, number: int) -> int:
             for repeat in (1, 2):
                 bench.status(step="s", repeat=repeat, repeats=2, phase="recording")
                 with bench.record(step="s", repeat=repeat):
-                    for _ in range(number if mode == "serve" else 30):
+                    for _ in range(blocks):
                         bench.exchange()
                         os.pwrite(ack, b"%08d" % bench.tick, 0)
             bench.exchange()

@@ -23,7 +23,7 @@ from rig.runs.store import load_run
 from tests.services.fake_driver import FakeDriver, samples
 
 RIG = load_rig("shinshu-2dof")
-BLOCKS = 2000  # enough that most stand in the database and the newest in its log
+BLOCKS = 6000  # enough that most stand in the database and the newest in its log
 PAGE = 4096
 
 
@@ -33,7 +33,7 @@ class Killed(Exception):
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose process died after 2000 blocks, in its third record."""
+    """A run whose process died after 6000 blocks, in its third record."""
     folder = tmp_path_factory.mktemp("killed")
     original = folder / "run"
     recorder = Recorder(original, RIG)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.model.parse import InputError
+from rig.runs.journal import read_tail
 from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, read_events, read_state
 from rig.runs.sections import Written
 from rig.runs.store import ARCHIVE, is_crate, is_run, read_header
@@ -103,21 +104,23 @@ def _count_journal(path: Path) -> Written:
     """Count the contents of a journal, even one being written; raises sqlite3.Error."""
     uri = f"{path.absolute().as_uri()}?mode=ro"
     with closing(sqlite3.connect(uri, uri=True, timeout=5.0)) as db:
-        blocks = db.execute("SELECT stream, tick, samples FROM block").fetchall()
+        blocks = db.execute("SELECT stream, tick, samples, id FROM block").fetchall()
         marks = db.execute(
             "SELECT stream, start, ticks, state FROM mark WHERE state != 'discarded'"
         ).fetchall()
+    tail = read_tail(path, after=max((number for *_, number in blocks), default=0))
+    blocks += [(row.stream, row.tick, row.samples, row.id) for row in tail]
     inside = lost = 0
     for stream, start, ticks, _ in marks:
-        ends = [tick + count for of, tick, count in blocks if of == stream]
+        ends = [tick + count for of, tick, count, _ in blocks if of == stream]
         end = max(ends, default=start) if ticks is None else start + ticks
         here = sum(
             max(0, min(end, tick + count) - max(start, tick))
-            for of, tick, count in blocks
+            for of, tick, count, _ in blocks
             if of == stream
         )
         inside, lost = inside + here, lost + max(0, end - start - here)
-    total = sum(count for _, _, count in blocks)
+    total = sum(count for _, _, count, _ in blocks)
     partial = sum(state != "complete" for *_, state in marks)
     return Written(len(marks), partial, inside, lost, 0, total - inside)
 

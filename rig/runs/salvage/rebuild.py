@@ -20,7 +20,17 @@ import numpy as np
 from drivers.base import SampleBlock
 from rig.model.rig import Rig
 from rig.runs.files import sync_to_disk
-from rig.runs.journal import Block, Journal, Mark, decode_row, describes_record
+from rig.runs.journal import (
+    JOURNAL_FILES,
+    Block,
+    BlockRow,
+    Journal,
+    Mark,
+    decode_row,
+    describes_record,
+    read_tail,
+    tail_of,
+)
 from rig.runs.runstate import read_events
 from rig.runs.salvage.scan import best_marks, block_rows, marks, raw_bytes
 
@@ -28,10 +38,11 @@ log = logging.getLogger(__name__)
 
 REBUILT: Final = "journal.rebuilt.sqlite"
 DAMAGED: Final = "journal.damaged"
-_FILES: Final = ("", "-wal", "-shm")
 _WAL_HEADER, _FRAME_HEADER = 32, 24
 _AT_ONCE = 256  # rows per query; if one is unreadable, each is read alone
-_UNREADABLE = (sqlite3.Error, ValueError, TypeError, KeyError, AttributeError, OverflowError)
+_UNREADABLE = (
+    sqlite3.Error, OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -90,7 +101,19 @@ def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tup
             return "its blocks are out of order"
         newest, count = (block.stream, block.tick), count + 1
     (held, last) = db.execute("SELECT count(*), max(id) FROM block").fetchone()
-    return newest if held == count == (last or 0) else "blocks are missing"
+    if not held == count == (last or 0):
+        return "blocks are missing"
+    return _check_tail(journal.path, rig, newest, count)
+
+
+def _check_tail(path: Path, rig: Rig, newest: tuple[int, int], count: int) -> str | tuple[int, int]:
+    """Return the damage of the rows behind the database's `count`, or the newest block."""
+    for row in read_tail(path, after=count):
+        block = _as_block(row, rig)
+        if block is None or (block.stream, block.tick) <= newest or row.id != count + 1:
+            return f"blocks before the newest in {tail_of(path).name} are missing"
+        newest, count = (block.stream, block.tick), row.id
+    return newest
 
 
 def _torn(raw: Any) -> bool:
@@ -117,18 +140,18 @@ def rebuild(path: Path, rig: Rig, what: str) -> tuple[Journal, Salvage]:
     Raises RecordingFailed if the disk fails.
     """
     fresh = path.with_name(REBUILT)
-    for suffix in _FILES:
+    for suffix in JOURNAL_FILES:
         fresh.with_name(fresh.name + suffix).unlink(missing_ok=True)
     made = Journal.create(fresh, rig.recorded, len(rig.channels), rig.sample_rate)
     places: dict[tuple[int, int], tuple[int, int]] = {}  # block -> its length, its number
     kept_marks: list[Mark] = []
-    for suffix in _FILES[:2]:
+    for suffix in ("", "-wal"):
         raw = raw_bytes(path.with_name(path.name + suffix))
         kept_marks += marks(raw)
         for row in block_rows(raw):
             _keep(made, _as_block(row.values, rig), row.number, places)
-    for number, values in _rows_by_number(path):
-        _keep(made, _as_block(values, rig), number, places)
+    for values in (*_rows_by_number(path), *_tail_rows(path)):
+        _keep(made, _as_block(values, rig), int(values[0]), places)
     chosen = best_marks(kept_marks)
     for mark in chosen:
         number = made.begin_mark(mark.stream, mark.start, mark.meta)
@@ -155,7 +178,15 @@ def _keep(
         places[key] = (len(block.data), number or 0)
 
 
-def _rows_by_number(path: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
+def _tail_rows(path: Path) -> list[BlockRow]:
+    try:
+        return read_tail(path, after=0)
+    except OSError as error:
+        log.info("%s: %s", tail_of(path), error)
+        return []
+
+
+def _rows_by_number(path: Path) -> Iterator[tuple[Any, ...]]:
     """Yield the rows that SQLite can read, in groups, and one by one around a fault."""
     sql = (
         "SELECT id, stream, sequence, tick, samples, late, crc, data, saturated FROM block "
@@ -166,7 +197,7 @@ def _rows_by_number(path: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
             (last,) = db.execute("SELECT max(id) FROM block").fetchone()
             for first in range(1, int(last or 0) + 1, _AT_ONCE):
                 for row in _readable(db, sql, first, first + _AT_ONCE - 1):
-                    yield int(row[0]), tuple(row)
+                    yield tuple(row)
     except _UNREADABLE as error:
         log.info("%s: %s", path, error)
 
@@ -227,7 +258,7 @@ def set_aside(path: Path) -> Path:
         number += 1
         target = path.with_name(f"{DAMAGED}-{number}.sqlite")
     # The database first: without it the run counts as finalised.
-    for suffix in _FILES:
+    for suffix in JOURNAL_FILES:
         source = path.with_name(path.name + suffix)
         if suffix == "-shm":
             source.unlink(missing_ok=True)
