@@ -168,9 +168,10 @@ def port_flows(
 
     C x sqrt(dp) on every open edge (NOTES, "Fluid", with a laminar region), and the leaks.
     """
-    across = p_rod - p_cap
-    worn = s / j.leak_length
-    q_cap = j.leak_internal * exp(-worn * worn) * across * (1.0 + LEAK_WIDENING * abs(across))
+    q_cap = 0.0
+    if j.leak_internal > 0.0:
+        across, worn = p_rod - p_cap, s / j.leak_length
+        q_cap = j.leak_internal * exp(-worn * worn) * across * (1.0 + LEAK_WIDENING * abs(across))
     q_rod = -q_cap - j.leak_rod * (p_rod - tank)
     q_cap -= j.leak_cap * (p_cap - tank)
     demand, returned = 0.0, 0.0

@@ -108,11 +108,12 @@ def step(
     w: Any,
     k: Any,
     ends: Any,
+    first_known: bool,
 ) -> None:
     """Advance state and spools in place by h [s]: classical RK4, split where a spool passes null.
 
-    The spools move on their own and are known ahead at half and full step. Work: k (6, states),
-    ends (2, 3, N).
+    The spools move on their own and are known ahead at half and full step. `first_known`: k[0]
+    already holds the rates at the step's begin. Work: k (5, states), ends (2, 3, N).
     """
     size = len(y)
     half, end, trial = ends[0], ends[1], k[4]
@@ -126,7 +127,9 @@ def step(
             d *= at
             move_spool(spool, target, 0.5 * d, joints, half)
             move_spool(half, target, 0.5 * d, joints, end)
-        rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
+        if not first_known:
+            rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
+        first_known = False
         for n in range(size):
             trial[n] = y[n] + 0.5 * d * k[0, n]
         rates(trial, half[2], warmth, joints, bench, inertia, w, k[1])
@@ -252,6 +255,19 @@ def output(law: Any, waves: Any, tick: int, s: float, joint: Any) -> int:
 
 
 @jit
+def hold_waves(tick: int, time: float, period: float, joints: Any, laws: Any) -> None:
+    """Set each joint's periodic torque to its value `time` [s] after a tick.
+
+    Held over a step at its middle: the step is short beside any such wave.
+    """
+    for i in range(len(joints)):
+        if joints[i].wave_torque > 0.0:
+            since = (tick - laws[i].start) * period + time
+            turned = wave(joints[i].wave_rate * since, joints[i].wave_form)
+            joints[i].wave_now = joints[i].wave_torque * turned
+
+
+@jit
 def run(
     tick: int,
     period: float,
@@ -283,6 +299,8 @@ def run(
         heat = temperature(tick * period, bench)
         warmth = 1.0 + bench.bulk_temperature * (heat - bench.temperature)
         ring = tick % len(values)
+        length = period / substeps
+        hold_waves(tick, 0.5 * length, period, joints, laws)
         rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
         sense(y, k[0], spool, heat, joints, bench, channels, period, values[ring], slopes[ring])
         for c in range(len(channels)):
@@ -304,13 +322,8 @@ def run(
                 max(target[i] * joints[i].spool_gain, -joints[i].spool_stroke),
                 joints[i].spool_stroke,
             )
-        h = period / substeps
         for part in range(substeps):
-            for i in range(n):
-                # Held over a step at its middle: the step is short beside any such wave.
-                if joints[i].wave_torque > 0.0:
-                    time = (tick - laws[i].start) * period + (part + 0.5) * h
-                    turned = wave(joints[i].wave_rate * time, joints[i].wave_form)
-                    joints[i].wave_now = joints[i].wave_torque * turned
-            step(y, spool, target, h, warmth, joints, bench, inertia, w, k, ends)
+            if part:
+                hold_waves(tick, (part + 0.5) * length, period, joints, laws)
+            step(y, spool, target, length, warmth, joints, bench, inertia, w, k, ends, part == 0)
         tick += 1
