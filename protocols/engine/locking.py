@@ -212,7 +212,7 @@ def verify(session: Session, held: JointLock, step: str, first: int, last: int) 
     """Raise LockFailed if a locked piston moved by more than the tolerance."""
     piston = session.piston(held.joint, first, last)
     moved = np.abs(piston - held.piston)
-    if (moved > held.tolerance).any():
+    if np.count_nonzero(moved > held.tolerance):
         worst = float(piston[np.nanargmax(moved)])
         raise LockFailed(
             step,

@@ -277,7 +277,7 @@ class Bench:
         SafetyTrip, OperatorStop, DeviceLost, DeviceError or RecordingFailed, each with the outputs
         zeroed first; a block that trips is journalled as well.
         """
-        self._heed()
+        self._refuse_ended()  # commands of screens were read after the block before
         trip = None
         with self._outputs:
             block = self._driver.read_block()
@@ -363,7 +363,7 @@ class Bench:
             self.event("trip", trip.tick, message=str(trip), **about)
 
     def _heed(self) -> None:
-        """Raise a requested stop or a latched trip before anything else is done."""
+        """Do what screens command; raise a requested stop or a latched trip."""
         for command in self._display.commands(self._judge):
             if command.word == STOP:
                 self._stop.request("stopped by operator (from the screen)")
@@ -372,6 +372,10 @@ class Bench:
             elif command.word in (TAKE, RELEASE):
                 with suppress(RecordingFailed):  # the next block says so, with the outputs at zero
                     self.event(f"controls {_CONTROLS[command.word]}", self.tick, by=command.holder)
+        self._refuse_ended()
+
+    def _refuse_ended(self) -> None:
+        """Raise a requested stop or a latched trip."""
         if self._stop.reason is not None:
             self.zero_outputs()
             with suppress(RecordingFailed):
