@@ -27,9 +27,9 @@ from protocols.files.plan import Overrides, mapped, resolve
 from protocols.files.schema import Protocol, every_step
 from protocols.files.writer import protocol_text
 from protocols.steps.base import StepKind
-from rig.cli.proofs import PlanProof, proved
-from rig.cli.protocol_run import ProtocolJob, run_protocol
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
+from rig.cli.proof.proofs import PlanProof, proved
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.parse import InputError, first_problem
 from rig.model.records import Record, Run
 from rig.runs.files import replace_bytes, write_text

@@ -10,7 +10,7 @@ from hil_sim.scenario.file import Scenario, parse_scenario
 from protocols.engine import engine
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
-from rig.cli.experiment_loop import Loop, LoopRequest
+from rig.cli.execution.experiment_loop import Loop, LoopRequest
 from rig.model.records import Run
 from tests.studies.direct_bench import DirectBench
 

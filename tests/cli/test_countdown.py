@@ -10,8 +10,8 @@ from protocols.files.library import load
 from protocols.files.plan import resolve
 from rig.cli.bench import figures
 from rig.cli.bench.figure import Figure
-from rig.cli.output import LINE_SECONDS, Countdown, clock_text
-from rig.cli.proofs import proved
+from rig.cli.proof.proofs import proved
+from rig.cli.text.output import LINE_SECONDS, Countdown, clock_text
 from rig.runs.files import CACHE_VARIABLE
 from rig.runs.rigs import load_rig
 

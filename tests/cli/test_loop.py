@@ -17,9 +17,17 @@ from analysis.trace.loop_rounds import Round, rounds_json
 from protocols.design.check import check
 from protocols.files import library
 from protocols.files.plan import resolve
-from rig.cli import experiment_loop
-from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, LoopRequest
-from rig.cli.trace_text import rounds_text
+from rig.cli.execution import experiment_loop
+from rig.cli.execution.experiment_loop import (
+    DECLINED,
+    FLOOR,
+    NOTHING,
+    REFUSED,
+    ROUNDS,
+    Loop,
+    LoopRequest,
+)
+from rig.cli.text.trace_text import rounds_text
 from rig.runs.rigs import load_rig
 from tests.analysis.page import Page
 from tests.cli.bench import bramah, bramah_here

@@ -21,7 +21,7 @@ from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from protocols.steps.plans import StepPlan
-from rig.cli.step_planning import predictor
+from rig.cli.proof.step_planning import predictor
 from rig.model.channels import kind_of
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run

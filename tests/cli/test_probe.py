@@ -12,7 +12,7 @@ import pytest
 from drivers import make_driver, wire_at
 from drivers.base import OFF, OutputLaw, SampleBlock
 from rig.bench.probe import GOOD, pressurised, readings
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 from tests.cli.bench import bramah_here

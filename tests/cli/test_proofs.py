@@ -14,10 +14,10 @@ import pytest
 
 from protocols.files.library import read_protocol
 from protocols.files.plan import Overrides, Plan, resolve
-from rig.cli import proofs, space
-from rig.cli.proofs import PlanProof, proved
-from rig.cli.protocol_run import ProtocolJob, run_protocol
-from rig.cli.twin_choice import TwinSource
+from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
+from rig.cli.proof import proofs, space
+from rig.cli.proof.proofs import PlanProof, proved
+from rig.cli.proof.twin_choice import TwinSource
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.files import CACHE_VARIABLE, cache_folder

@@ -13,7 +13,7 @@ from rig.cli.bench.screen.arrival import age_quantile, ages_on_glass
 from rig.cli.bench.screen.runs import RunPlace, RunTimes, played
 from rig.cli.bench.screen.stops import many_stops
 from rig.cli.bench.screen.terminal import Screen
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from analysis.terms import with_effects
 from analysis.terms.base import Used
 from protocols.files.library import read_protocol
 from protocols.files.plan import Plan, resolve
-from rig.cli.proofs import PlanProof, proved
-from rig.cli.twin_choice import kept_model, save_identified, source_text, twin_source
+from rig.cli.proof.proofs import PlanProof, proved
+from rig.cli.proof.twin_choice import kept_model, save_identified, source_text, twin_source
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig

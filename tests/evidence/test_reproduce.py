@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from analysis.report.paper import TABLE_III, TABLE_IV
-from rig.cli.output import write_json
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
+from rig.cli.text.output import write_json
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.runs.exchange.importer import import_records

@@ -21,7 +21,7 @@ from hil_sim.faults.wire import TO_DEVICE, TO_HOST, Carrier, End, WireFault
 from hil_sim.link import frames
 from hil_sim.link.way import QUIET, FaultInjector, Way
 from hil_sim.link.wires import WIRES, faulty_link
-from rig.cli.simulator import wire_faults
+from rig.cli.simulated.simulator import wire_faults
 from rig.model.parse import InputError
 
 KINDS = {kind.fault_name(): kind for kind in CLASSES if issubclass(kind, WireFault)}

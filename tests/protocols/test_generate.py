@@ -16,7 +16,7 @@ from protocols.files import library
 from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
-from rig.cli.step_planning import predictor
+from rig.cli.proof.step_planning import predictor
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig

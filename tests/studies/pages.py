@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rig.cli import output
+from rig.cli.text import output
 from rig.model.parse import InputError
 
 WIDTH = 100

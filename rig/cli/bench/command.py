@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import JsonOption, writable_file
-from rig.cli.output import printed_at_end, progress, write_json
+from rig.cli.text.output import printed_at_end, progress, write_json
 
 
 def bench(

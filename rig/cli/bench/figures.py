@@ -25,9 +25,9 @@ from rig.cli.bench.speed.growth import growth_figures
 from rig.cli.bench.speed.run_figures import run_figures
 from rig.cli.bench.stream_figures import stream_figures
 from rig.cli.bench.wire_figures import wire_figures
-from rig.cli.experiment import RIG, Experiment, experiment
-from rig.cli.output import clock_text, table
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.experiment import RIG, Experiment, experiment
+from rig.cli.simulated.simulated_bench import simulated_bench
+from rig.cli.text.output import clock_text, table
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.runs.rigs import load_rig

@@ -27,8 +27,8 @@ from hil_sim.device.server import RTU, SERIAL, TCP, VALVES, WIRES
 from rig.bench.session import Bench
 from rig.cli.bench.acquisition import lateness, waited_seconds
 from rig.cli.bench.figure import Figure
-from rig.cli.device import reached_at
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.execution.device import reached_at
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.parts import WATCHDOG_RANGE, Wire
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg

@@ -11,7 +11,7 @@ from analysis.trace.clues.formula import is_balance
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Formula, Trace, to_json
-from rig.cli.trace_text import trace_text
+from rig.cli.text.trace_text import trace_text
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import hardening, pair_of_runs

@@ -15,7 +15,7 @@ from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
 from rig.cli.main import app
-from rig.cli.trace_text import trace_text
+from rig.cli.text.trace_text import trace_text
 from rig.model.records import Run
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.rigs import load_rig

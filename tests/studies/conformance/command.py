@@ -12,7 +12,7 @@ import typer
 from drivers.conformance import CheckVerdict, ConformanceReport, RandomCallBudget, Subject, run
 from rig.cli.bench.faults.figures import quiet
 from rig.cli.errors import WorkError
-from rig.cli.output import progress, table
+from rig.cli.text.output import progress, table
 from rig.model.parse import InputError
 from tests.drivers.can_bench import can_subject
 from tests.drivers.conformance_benches import FAULTS, on_wire

@@ -23,7 +23,7 @@ def effects(
 
     Example: python -m tests.studies effects --study --only valve_deadband
     """
-    from rig.cli.output import progress
+    from rig.cli.text.output import progress
     from rig.runs.rigs import load_rig
     from tests.studies.effects import simulated
     from tests.studies.effects.catalogue_text import pages, table

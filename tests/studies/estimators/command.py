@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from rig.cli.options import JsonOption
-from rig.cli.output import progress, write_json
+from rig.cli.text.output import progress, write_json
 
 WorkersOption = Annotated[int, typer.Option(min=1, help="Processes at once.")]
 ClusterOption = Annotated[

@@ -19,8 +19,8 @@ from analysis.identify.identify import identify
 from analysis.identify.result import PLAIN
 from protocols.files import library
 from protocols.files.plan import resolve
-from rig.cli.output import table
-from rig.cli.predicted_errors import of_plan, percent
+from rig.cli.proof.predicted_errors import of_plan, percent
+from rig.cli.text.output import table
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_bench

@@ -23,7 +23,7 @@ def design(
 
     Example: python -m tests.studies design lock-and-excite-multisine better.yaml --rig shinshu-2dof
     """
-    from rig.cli.output import progress, write_json
+    from rig.cli.text.output import progress, write_json
     from tests.studies.estimators.design import study, study_json, study_text
 
     found = study(protocols, rig, first, seeds, progress)

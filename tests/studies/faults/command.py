@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import progress
+from rig.cli.text.output import progress
 from tests.studies.pages import replace_section
 
 

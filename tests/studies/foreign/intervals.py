@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rig.cli.output import table
+from rig.cli.text.output import table
 from tests.studies.foreign.bench import TRAIN, records_of
 from tests.studies.foreign.cases import NONE, case_of
 from tests.studies.foreign.study import bounds

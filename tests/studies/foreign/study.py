@@ -16,7 +16,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.regression_data import regression_data
-from rig.cli.output import table
+from rig.cli.text.output import table
 from tests.studies.foreign.bench import Bench, runs_of, training_of
 from tests.studies.foreign.cases import NONE, OUTSIDE, PAIR, Case, case_of
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import progress, table
+from rig.cli.text.output import progress, table
 
 
 def fuzz(

@@ -18,7 +18,7 @@ from protocols.files.plan import Overrides, resolve
 from protocols.files.schema import Protocol
 from rig.bench.latch import BenchState
 from rig.bench.session import Bench
-from rig.cli.step_planning import predictor
+from rig.cli.proof.step_planning import predictor
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.model.trips import SafetyTrip

@@ -29,8 +29,8 @@ from analysis.trace.result import Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.shapes import shapes_in, with_shapes
-from rig.cli.output import table
-from rig.cli.trace_text import trace_text
+from rig.cli.text.output import table
+from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import progress
+from rig.cli.text.output import progress
 
 
 def crane(

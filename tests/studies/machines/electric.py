@@ -16,7 +16,7 @@ from analysis.identify.result import Identification
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from rig.cli.output import table
+from rig.cli.text.output import table
 from rig.model.electric import INCLINATION
 from rig.model.records import Run
 from rig.model.rig import ElectricRig

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import JsonOption
-from rig.cli.output import progress, write_json
+from rig.cli.text.output import progress, write_json
 
 
 def electric(
@@ -34,7 +34,7 @@ def electric(
     import math
 
     from analysis.identify.result import to_json
-    from rig.cli.render import identification_text, validation_text
+    from rig.cli.text.render import identification_text, validation_text
     from tests.studies.machines import electric as study
 
     if seeds > 1:

@@ -26,7 +26,7 @@ from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
 from analysis.trace.engine import trace
-from rig.cli.output import table
+from rig.cli.text.output import table
 from rig.model.records import Record, Run
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.importer import import_records

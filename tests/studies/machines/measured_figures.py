@@ -14,7 +14,7 @@ import typer
 
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.figures import text
-from rig.cli.output import progress
+from rig.cli.text.output import progress
 
 GROUP = "measured"
 UNSEEN = 6.4  # [mm] open-loop error on motion that the fit has not seen

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.io import loadmat
 
-from rig.cli.output import table
+from rig.cli.text.output import table
 from rig.model.parameters import mechanical_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.rig import Rig

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import JsonOption
-from rig.cli.output import progress, write_json
+from rig.cli.text.output import progress, write_json
 
 
 def pendulum(

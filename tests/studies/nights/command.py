@@ -11,7 +11,7 @@ import typer
 
 from rig.cli.errors import WorkError
 from rig.cli.options import JsonOption
-from rig.cli.output import write_json
+from rig.cli.text.output import write_json
 
 
 def kills(

@@ -31,7 +31,7 @@ from protocols.files.plan import Plan, resolve
 from protocols.files.schema import Protocol
 from rig.bench.latch import STATE_VARIABLE, reset_bench
 from rig.bench.session import Bench
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder

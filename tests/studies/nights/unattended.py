@@ -19,7 +19,7 @@ import yaml
 
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.runs.listing.summary import summarise
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_state

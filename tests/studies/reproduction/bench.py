@@ -21,8 +21,8 @@ from analysis.identify.result import Identification
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.simulation.validate import RecordValidation, validate
 from protocols.files.plan import Overrides
-from rig.cli.protocol_run import ProtocolJob, run_protocol
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.runs.store import load_run

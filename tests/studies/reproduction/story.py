@@ -12,7 +12,7 @@ from typing import Any
 from analysis.identify.result import to_json as identification_json
 from analysis.report import paper
 from analysis.simulation.validate import to_json as validation_json
-from rig.cli.output import progress, write_json
+from rig.cli.text.output import progress, write_json
 from tests.studies.pages import Section, text, write_page
 from tests.studies.reproduction.bench import FULL, QUICK, RIG, Reproduction, reproduce
 from tests.studies.reproduction.methods import METHODS, sequential, simultaneous, summary

@@ -152,7 +152,9 @@ def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Sectio
             for without in answers
             if without.rule == rule.name
         ]
-        changed = [(a, b) for a, b in pairs if (a.verdict, a.named) != (b.verdict, b.named)]
+        changed = [
+            (a, b) for a, b in pairs if (a.verdict, sorted(a.named)) != (b.verdict, sorted(b.named))
+        ]
         lost = sum(a.answer in SETTLED and b.answer not in SETTLED for a, b in changed)
         won = sum(a.answer not in SETTLED and b.answer in SETTLED for a, b in changed)
         wrong = sum(a.answer not in WRONG and b.answer in WRONG for a, b in changed)

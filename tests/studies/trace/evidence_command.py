@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.options import JsonOption
-from rig.cli.output import progress, write_json
+from rig.cli.text.output import progress, write_json
 from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersOption
 
 if TYPE_CHECKING:

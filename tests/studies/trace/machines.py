@@ -137,7 +137,7 @@ def protocols_of(rig: Rig) -> tuple[Protocol, Protocol]:
     """
     from protocols.design.generate import generate
     from protocols.design.validation_steps import validation
-    from rig.cli.step_planning import predictor
+    from rig.cli.proof.step_planning import predictor
 
     tools = predictor()
     plan = generate(rig, tools, f"lock-and-excite-{rig.name}").protocol

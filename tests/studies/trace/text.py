@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.cli.output import table
+from rig.cli.text.output import table
 from tests.studies.trace.cases import LOUD, NONE, OUTSIDE, PAIR, SINGLE
 from tests.studies.trace.study import Outcome, right
 

@@ -20,7 +20,7 @@ from protocols.files import library
 from protocols.files.plan import Plan, resolve
 from rig.bench.session import Bench
 from rig.cli.errors import WorkError
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig

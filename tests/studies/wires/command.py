@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from rig.cli.errors import WorkError
-from rig.cli.output import progress
+from rig.cli.text.output import progress
 from tests.studies.pages import markdown_table, replace_section
 from tests.studies.wires import agreement, endurance
 

@@ -13,7 +13,7 @@ from hil_sim.scenario.file import Scenario
 from protocols.engine import engine
 from protocols.files.plan import Plan
 from rig.bench.session import Bench
-from rig.cli.simulator import VALVES_RATE
+from rig.cli.simulated.simulator import VALVES_RATE
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from tests.drivers.valve_bus import HeldValves

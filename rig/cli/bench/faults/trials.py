@@ -29,7 +29,7 @@ from rig.bench.guard import EXCITED, JointRole
 from rig.bench.latch import BenchState
 from rig.bench.session import Bench
 from rig.cli.bench.faults.bench import SILENCE, FaultBench
-from rig.cli.device import reached_at
+from rig.cli.execution.device import reached_at
 from rig.model import channels as ch
 from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig

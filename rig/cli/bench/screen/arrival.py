@@ -25,7 +25,7 @@ from rig.cli.bench.screen.runs import RIG, RunPlace, RunTimes, played
 from rig.cli.bench.screen.stops import ATTACH, SEED
 from rig.cli.bench.screen.terminal import Screen
 from rig.cli.errors import WorkError
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.runs.rigs import load_rig
 
 Array = NDArray[np.float64]

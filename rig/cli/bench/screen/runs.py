@@ -31,8 +31,8 @@ from rig.bench.latch import BenchState
 from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.cli.bench.screen.terminal import SESSIONS
-from rig.cli.device import reached_at
 from rig.cli.errors import WorkError
+from rig.cli.execution.device import reached_at
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig
 

@@ -19,7 +19,7 @@ from rig.cli.bench.figure import Figure
 from rig.cli.bench.screen.runs import RIG, RunPlace, played
 from rig.cli.bench.screen.terminal import Screen
 from rig.cli.errors import WorkError
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.simulated.simulated_bench import simulated_bench
 
 STOP_LIMIT: Final = 100.0  # [ms] from key to zero outputs, 99 %
 ATTACH: Final = 30.0  # time in which a screen attaches to a run on a busy machine [s]

@@ -32,8 +32,8 @@ from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.wire_figures import bare_modbus
-from rig.cli.device import reached_at
-from rig.cli.simulated_bench import simulated_bench
+from rig.cli.execution.device import reached_at
+from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.runs.journal import Journal

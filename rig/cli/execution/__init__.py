@@ -1,0 +1,1 @@
+"""The work of verbs that connect to a bench."""

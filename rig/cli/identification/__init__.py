@@ -1,0 +1,1 @@
+"""Identification beside a run, and physically consistent parameters."""

@@ -1,0 +1,296 @@
+"""`bramah run --track`: a separate process that estimates b and the flow gains during the run.
+
+The acquisition only writes blocks to a non-blocking socket (zmq, about 20 us per block), and reads
+the estimates from it. A tracker that is slow, hangs or dies does not affect the run: blocks that
+do not fit into the tracker's queue are lost samples for the tracker alone.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import zmq
+
+from analysis.identify.streams.online import Tracker
+from analysis.simulation.model import Estimate, estimate_json
+from analysis.workers.pool import environment
+from drivers.base import SampleBlock
+from rig.cli.identification.following import Follower
+from rig.cli.text.output import write_json
+from rig.model.parse import InputError
+from rig.model.records import RecordHead
+from rig.model.rig import Rig
+from rig.model.units import with_interval
+from rig.runs.recorder import RecordMeta
+from rig.runs.runstate import EventLog
+
+log = logging.getLogger(__name__)
+Say = Callable[[str], None]
+
+NAME = "tracked.json"
+WAITING = 30_000  # length of the tracker's queue in messages: five minutes of blocks, about 40 MB
+SAY_EVERY = 2.0  # [s] of wall time
+FINISH = 20.0  # [s] allowed for the tracker to finish after the run
+NICE = 5
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Settings of the tracker; `memory`: forgetting time constant [s], infinite for none."""
+
+    rig: Rig
+    memory: float
+    endpoint: str
+
+
+def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return bulk modulus and flow gains in one line, '?' for values not yet known."""
+    parts = []
+    for name, estimate in parameters.items():
+        value, (low, high) = estimate["value"], estimate["ci95"]
+        scale, unit = (1e-6, " MPa") if name == "b" else (1e7, "")
+        text = "?" if value is None else f"{scale * value:.4g}"
+        if value is not None and low is not None and high is not None:
+            half = 0.5 * scale * (high - low)
+            text = with_interval(scale * value, half).replace(" ± ", "±")
+        parts.append(f"{name} {text}{unit}")
+    return "  ".join(parts)
+
+
+class Tracking:
+    """The tracker as the run uses it: an observer of the bench, and a context manager.
+
+    Enter it before the bench and leave it after, so that no run waits with its outputs on.
+    """
+
+    def __init__(self, rig: Rig, out: Path, say: Say, memory: float = math.inf) -> None:
+        if not memory > 0.0:
+            raise InputError(f"--memory {memory:g}: expected more than 0 s")
+        self.parameters: dict[str, Any] = {}
+        self.residuals: dict[
+            str, list[float]
+        ] = {}  # by family: rms of the residual of new rows, and of their right side
+        self.worst_handover = 0.0
+        self._rig, self._out, self._say, self._memory = rig, out, say, memory
+        self._history: list[dict[str, Any]] = []
+        self._notes: list[Callable[[dict[str, Any]], None]] = []
+        self._shows: list[Callable[[str], None]] = []
+        self._dropped = 0
+        self._next_say = -math.inf
+
+    def subscribe(
+        self, note: Callable[[dict[str, Any]], None], show: Callable[[str], None]
+    ) -> None:
+        """Add functions called with the estimates: at each record's end, and in between."""
+        self._notes.append(note)
+        self._shows.append(show)
+
+    def __enter__(self) -> Self:
+        self._folder = tempfile.TemporaryDirectory(prefix="bramah-")  # accessible to this user only
+        endpoint = f"ipc://{self._folder.name}/track"
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PAIR)
+        self._socket.set(zmq.SNDHWM, WAITING)
+        self._socket.set(zmq.LINGER, 0)
+        # This end connects, so that it queues messages sent before the tracker is ready.
+        self._socket.connect(endpoint)
+        settings = TrackingSettings(self._rig, self._memory, endpoint)
+        self._process = get_context("spawn").Process(target=work, args=(settings,), daemon=True)
+        with environment():
+            self._process.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None or issubclass(kind, Exception):
+                self._finish()
+        finally:
+            self._socket.close()
+            self._context.term()
+            self._process.join(1.0)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+            self._process.close()
+            self._folder.cleanup()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the tracker's process is running."""
+        return self._process.is_alive()
+
+    @property
+    def recorded(self) -> frozenset[str]:
+        """The names of the records in the estimates."""
+        return frozenset(str(entry["record"]) for entry in self._history)
+
+    def _finish(self) -> None:
+        """Wait for the last estimates and write all estimates into the run folder."""
+        noted = len(self._history)
+        self._notes, self._shows = [], []  # the bench is closed, so waiting is safe
+        self._send([b"stop"])
+        deadline = time.monotonic() + FINISH
+        ended = False
+        while not ended and self._process.is_alive() and time.monotonic() < deadline:
+            if self._socket.poll(100):
+                ended = self._hear()
+        if not self.parameters:
+            return
+        self._say(f"tracked: {summary(self.parameters)}")
+        if not ended:
+            self._say("the tracker did not finish in time; its last estimates are kept")
+        memory = self._memory if math.isfinite(self._memory) else None
+        data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
+        if self._out.is_dir():
+            write_json(self._out / NAME, data)
+            events = EventLog(self._out)
+            for entry in self._history[noted:]:  # the delayed messages of a slow tracker
+                events.append("tracked", None, entry)
+            events.close()
+
+    # Called by the bench
+
+    def block(self, block: SampleBlock) -> None:
+        """Send a block to the tracker and read its answers; never waits."""
+        started = time.perf_counter()
+        tick = str(block.tick).encode()
+        self._send([b"block", tick, np.ascontiguousarray(block.data, dtype="<f8").tobytes()])
+        self._hear()
+        self.worst_handover = max(self.worst_handover, time.perf_counter() - started)
+
+    def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
+        """Announce a record."""
+        head = RecordHead(
+            meta.name, meta.step, meta.locked, meta.repeat, self._rig.sample_rate, 0,
+            tuple(self._rig.recorded), start / self._rig.sample_rate, meta.period, meta.lines,
+        )  # fmt: skip
+        place = json.dumps([start, ticks]).encode()
+        self._send([b"begin", place, json.dumps(asdict(head)).encode()])
+
+    def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
+        """Announce the end of a record."""
+        words = [str(start), str(ticks), state, meta.name]
+        self._send([b"end", *(word.encode() for word in words)])
+
+    def _send(self, parts: list[bytes]) -> None:
+        try:
+            self._socket.send_multipart(parts, zmq.NOBLOCK)
+        except zmq.Again:
+            self._dropped += 1
+            if self._dropped == 1:
+                log.warning(
+                    "the tracker is too slow and loses samples; the run's record is complete"
+                )
+
+    def _hear(self) -> bool:
+        """Read the tracker's messages; return whether the last one has come."""
+        while True:
+            try:
+                reply = json.loads(self._socket.recv(zmq.NOBLOCK))
+            except zmq.Again:
+                return False
+            if reply["kind"] == "failed":
+                log.warning("the tracker stopped: %s", reply["message"])
+                return True
+            self.parameters = reply["parameters"] or self.parameters
+            self.residuals = reply["residuals"]
+            if reply["kind"] == "last":
+                return True
+            if reply["kind"] == "record":
+                entry = {"record": reply["record"], "parameters": reply["parameters"]}
+                self._history.append(entry)
+                for note in self._notes:
+                    note(entry)
+            elif time.monotonic() >= self._next_say:
+                self._next_say = time.monotonic() + SAY_EVERY
+                line = summary(self.parameters)
+                self._say(f"           {line}")
+                for show in self._shows:
+                    show(line.split("  ")[0])
+
+
+# In the tracker's process
+
+
+def work(settings: TrackingSettings) -> None:
+    """Process messages until told to stop or until the run's process has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run sends the message to stop
+    os.nice(NICE)  # the acquisition has priority
+    context = zmq.Context()
+    socket = context.socket(zmq.PAIR)
+    socket.set(zmq.RCVHWM, WAITING)
+    socket.set(zmq.LINGER, 2000)
+    socket.bind(settings.endpoint)
+    try:
+        _serve(settings, socket)
+    except InputError as error:
+        socket.send_string(json.dumps({"kind": "failed", "message": str(error)}))
+    finally:
+        socket.close()
+        context.term()
+
+
+def _serve(settings: TrackingSettings, socket: zmq.Socket[bytes]) -> None:
+    tracker = Tracker(settings.rig, memory=settings.memory)
+    follower = Follower(settings.rig, tracker)
+    width = len(settings.rig.recorded)
+    parent = parent_process()
+    while True:
+        if not socket.poll(1000):
+            if parent is not None and not parent.is_alive():
+                return
+            continue
+        kind, *words = socket.recv_multipart()
+        if kind == b"block":
+            data = np.frombuffer(words[1], dtype="<f8").reshape(-1, width)
+            if follower.block(int(words[0]), data):
+                _reply(socket, "now", tracker)
+        elif kind == b"begin":
+            follower.begins(_head(json.loads(words[1])), *json.loads(words[0]))
+        elif kind == b"end":
+            start, ticks, state, name = (word.decode() for word in words)
+            follower.ends(int(start), int(ticks), state == "complete")
+            if state == "complete":
+                _reply(socket, "record", tracker, record=name)
+        else:
+            _reply(socket, "last", tracker)
+            return
+
+
+def _head(data: dict[str, Any]) -> RecordHead:
+    lists = ("locked", "channels", "lines")
+    fields: dict[str, Any] = {k: tuple(v) if k in lists else v for k, v in data.items()}
+    return RecordHead(**fields)
+
+
+def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) -> None:
+    estimates: dict[str, Estimate] = tracker.estimates()
+    known = {name: estimate_json(e) for name, e in estimates.items()}
+    if all(e["value"] is None for e in known.values()):
+        known = {}
+    left = {
+        family: [residual.rms, residual.size] for family, residual in tracker.residuals().items()
+    }
+    said = {"kind": kind, "parameters": known, "residuals": left, **more}
+    try:
+        socket.send_string(json.dumps(said), zmq.NOBLOCK)
+    except zmq.Again:
+        log.debug("the run does not read the estimates; they are dropped")

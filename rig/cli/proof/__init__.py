@@ -1,0 +1,1 @@
+"""Plans proved on the twin, and the errors predicted for them."""

@@ -1,0 +1,249 @@
+"""Predicted errors of a protocol's estimates, for the verbs `check` and `design`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.design.moves import Tone
+from analysis.design.optimise import Design, improve
+from analysis.design.predict import Prediction, predict, to_json
+from analysis.design.settings import DESIGN
+from analysis.design.twin_records import TwinStep
+from analysis.simulation.twin import simulate_commands
+from drivers.registry import driver_class
+from protocols.design.check import Twin, check
+from protocols.design.check_report import CheckReport
+from protocols.files import library
+from protocols.files.plan import Plan, resolve
+from protocols.files.writer import protocol_text
+from rig.cli.proof.planned import designed_protocol, designed_step, empty_lines, planned_steps
+from rig.cli.proof.twin_choice import TwinParameters
+from rig.cli.text.output import progress, table
+from rig.model.parse import InputError
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+
+CHECKED = 0.4  # share of the total time that the check of the limits takes
+
+
+@dataclass(frozen=True)
+class CheckedForecast:
+    """Limits of a protocol on the twin, and its predicted errors; None for the reason `why`."""
+
+    limits: CheckReport
+    prediction: Prediction | None
+    why: str = ""
+    stated: Wire | None = None
+
+
+@dataclass(frozen=True)
+class ForecastText:
+    """A forecast as plain data and as text."""
+
+    limits: CheckReport
+    plain: Mapping[str, Any]
+    text: str
+
+
+def forecast_text(
+    plan: Plan, parameters: TwinParameters, report: Callable[[float], None] | None = None
+) -> ForecastText:
+    """Check a plan and predict its errors; raises InputError if the twin cannot follow it."""
+    forecast = of_plan(plan, parameters.rig, report, parameters.twin, parameters.draws)
+    return ForecastText(
+        forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
+    )
+
+
+def jitter_of(rig: Rig) -> float | None:
+    """Return the standard deviation [s] of host-timed samples' times; None for a device's clock."""
+    if not driver_class(rig.wire.kind).host_timed:
+        return None
+    return DESIGN.jitter if rig.wire.jitter is None else rig.wire.jitter
+
+
+def lateness_text(forecast: CheckedForecast) -> str:
+    """Return the effect of late samples on the estimate of b, and its assumption, in one line."""
+    p, wire = forecast.prediction, forecast.stated
+    if p is None or p.lateness is None or wire is None:
+        return ""
+    cost = p.lateness
+    origin = (
+        "assumed, since the rig file states no wire.jitter; `bramah probe` measures it"
+        if wire.jitter is None
+        else "wire.jitter"
+    )
+    missing = f", {percent(cost.missing)} % of them missing," if cost.missing else ""
+    moved = (
+        f"move b by {100 * cost.shift:+.3g} % and scatter it by {percent(cost.scatter)} %; its "
+        "interval includes that"
+        if math.isfinite(cost.shift)
+        else "make b unidentifiable; lower the rig's sample_rate"
+    )
+    return (
+        f"host-timed ({wire.kind}): samples {1e3 * cost.jitter:.3g} ms late ({origin}), "
+        f"assigned to equidistant ticks{missing} {moved}"
+    )
+
+
+def of_plan(
+    plan: Plan,
+    rig: Rig,
+    report: Callable[[float], None] | None = None,
+    twin: Twin = simulate_commands,
+    draws: Sequence[Twin] = (),
+) -> CheckedForecast:
+    """Check a plan's limits and predict its errors, or state why they cannot be predicted.
+
+    Errors are predicted with the rig's nominal values, for the terms common to all models.
+    """
+
+    def part(begin: float, end: float) -> Callable[[float], None] | None:
+        return None if report is None else lambda share: report(begin + (end - begin) * share)
+
+    limits = check(plan, rig, twin, part(0.0, CHECKED), draws)
+    biases = {step.step: step.biases for step in limits.steps}
+    if not plan.steps:
+        return CheckedForecast(limits, None, "it takes no records of excited joints")
+    try:
+        steps = planned_steps(plan, biases)
+        predicted = predict(rig, steps, jitter=jitter_of(rig), progress=part(CHECKED, 1.0))
+        return CheckedForecast(limits, predicted, stated=rig.wire)
+    except InputError as error:
+        return CheckedForecast(limits, None, str(error))
+
+
+def as_dict(forecast: CheckedForecast) -> dict[str, Any]:
+    """Return the check and the prediction, or the reason for its absence, as plain data."""
+    document: dict[str, Any] = {"impossible": forecast.why}
+    if forecast.prediction is not None:
+        document = to_json(forecast.prediction)
+    return {**forecast.limits.as_dict(), "identification": document}
+
+
+def percent(value: float) -> str:
+    """Return a relative figure as a percentage with three digits, or a dash."""
+    return f"{100.0 * value:.3g}" if math.isfinite(value) else "—"
+
+
+def prediction_text(forecast: CheckedForecast) -> str:
+    """Return predicted errors, conditioning and undetermined parameters as text."""
+    p = forecast.prediction
+    if p is None:
+        return f"standard errors cannot be predicted: {forecast.why}"
+    rows = [
+        [name, f"{e.nominal:.4g}", percent(e.std), percent(e.half), percent(e.oil)]
+        for name, e in p.parameters.items()
+    ]
+    header = ["parameter", "value [SI]", "std. error %", "± 95 % %", "oil's swing %"]
+    lines = ["predicted from the stated sensor noise, relative to the value on the twin:"]
+    lines.append(table(header, rows))
+    for family, (rank, size) in p.rank.items():
+        condition = p.condition[family]
+        lines.append(f"{family}: rank {rank} of {size}, condition number {condition:.1f}")
+    if p.masked_share > 0:
+        lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
+    lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]
+    lines.append(f"worst known: {p.worst}")
+    lines += [lateness_text(forecast)] if p.lateness is not None else []
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class DesignedProtocol:
+    """A designed protocol: its file's text, the design, and the predictions before and after."""
+
+    text: str
+    plan: Plan
+    design: Design
+    before: CheckedForecast
+    after: CheckedForecast
+
+
+def _checker(
+    plan: Plan, parameters: TwinParameters
+) -> Callable[[TwinStep, Mapping[int, Tone]], bool]:
+    """Return the test of a step that `check` makes, with centring from zero bias."""
+
+    def passes(planned: TwinStep, tones: Mapping[int, Tone]) -> bool:
+        alone = {"steps": (designed_step(plan, planned, tones),)}
+        try:
+            trial = resolve(plan.protocol.model_copy(update=alone), parameters.rig)
+            return check(trial, parameters.rig, parameters.twin, draws=parameters.draws).ok
+        except InputError:
+            return False
+
+    return passes
+
+
+def design_protocol(
+    protocol: str, rig: str, criterion: str, budget: int, seed: int, parameters: TwinParameters
+) -> DesignedProtocol:
+    """Improve a protocol's multisines; raises InputError if that is impossible.
+
+    Limits and errors are predicted on the twin of `parameters`.
+    """
+    bench = parameters.rig
+    plan = resolve(library.load(protocol), bench)
+    before = of_plan(plan, bench, None, parameters.twin, parameters.draws)
+    biases = {step.step: step.biases for step in before.limits.steps}
+    design = improve(
+        bench, planned_steps(plan, biases), empty_lines(plan), criterion, budget,
+        np.random.default_rng(seed), progress, _checker(plan, parameters),
+    )  # fmt: skip
+    better = designed_protocol(plan, design, criterion)
+    after_plan = resolve(better, bench)
+    after = of_plan(after_plan, bench, None, parameters.twin, parameters.draws)
+    after.limits.require()
+    command = (
+        f"bramah design {protocol} --rig {rig} --criterion {criterion} --budget {budget} "
+        f"--seed {seed}"
+    )
+    return DesignedProtocol(
+        protocol_text(better, f"Made by: {command}"), after_plan, design, before, after
+    )
+
+
+def design_text(designed: DesignedProtocol, out: Path) -> str:
+    """Return the predicted errors before and after, and each step's share of its limits."""
+    before, after = designed.before.prediction, designed.after.prediction
+    assert before is not None  # the design needed the prediction, so it exists
+    assert after is not None
+    rows = []
+    for name, e in before.parameters.items():
+        later = after.parameters[name]
+        ratio = f"{later.std / e.std:.2f}" if e.std > 0 else "—"
+        rows.append([name, percent(e.std), percent(later.std), ratio])
+    lines = [table(["parameter", "before %", "after %", "ratio"], rows), ""]
+    for step, (share, limit) in designed.design.shares_after.items():
+        was, which = designed.design.shares_before[step]
+        lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
+    lines.append(
+        f"{designed.design.evaluated} trials, {designed.design.accepted} kept; written to {out}"
+    )
+    return "\n".join(lines)
+
+
+def design_json(designed: DesignedProtocol) -> dict[str, Any]:
+    """Return predicted relative standard errors before and after, and the shares of limits."""
+    before, after = designed.before.prediction, designed.after.prediction
+    assert before is not None
+    assert after is not None
+    return {
+        "parameters": {
+            name: {"before": e.std, "after": after.parameters[name].std}
+            for name, e in before.parameters.items()
+        },
+        "limits": {
+            step: {"limit": limit, "share": share}
+            for step, (share, limit) in designed.design.shares_after.items()
+        },
+        "tried": designed.design.evaluated,
+        "kept": designed.design.accepted,
+    }

@@ -1,0 +1,132 @@
+"""All stages on a simulated bench: run, record, identify, validate, trace, report."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
+from analysis.identify.result import to_json as identification_json
+from analysis.report.identification.report import render_report
+from analysis.report.page import write
+from analysis.simulation.model import save_model
+from analysis.simulation.validate import RecordValidation, validate
+from analysis.simulation.validate import to_json as validation_json
+from analysis.trace.engine import trace
+from analysis.trace.result import to_json as trace_json
+from protocols.files.plan import Overrides
+from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
+from rig.cli.simulated.simulated_bench import simulated_bench
+from rig.cli.simulated.truth_file import read_truth
+from rig.cli.text.output import Countdown, progress, write_json
+from rig.cli.text.render import identification_text, parameter_table, validation_text
+from rig.cli.text.reports import provenance
+from rig.model.records import Run
+from rig.runs.store import load_run
+
+IDENTIFY = "lock-and-excite-multisine"
+VALIDATE = "validate"
+RIG = "shinshu-2dof"
+HELD_OUT = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
+HIDDEN = "worn-seal"  # effects of the demo's bench, unknown to the analysis
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Runs of one simulated bench and their analysis; `truth` are the bench's true parameters.
+
+    `judged` are the runs for validation, `unseen` further hold-out runs for the trace.
+    """
+
+    runs: tuple[Run, ...]
+    judged: tuple[Run, ...]
+    unseen: tuple[Run, ...]
+    identification: Identification
+    validation: Sequence[RecordValidation]
+    truth: Mapping[str, float]
+
+
+def experiment(
+    folder: Path, seed: int, overrides: Overrides, say: Say, scenario: str | None = None
+) -> Experiment:
+    """Run the demo's protocols on a simulated bench of `seed` into `folder`; analyse the runs.
+
+    `scenario` (a bench's hidden effects) is passed to the bench alone; with one, a third run of
+    another waveform and amplitude is taken as a hold-out for the trace.
+    """
+    folder.mkdir(parents=True)
+    truth = folder / "truth.json"
+    say(f"starting the simulated bench {RIG}, seed {seed}")
+    with simulated_bench(RIG, seed=seed, truth=truth, scenario=scenario) as endpoint:
+        say(f"the simulated bench listens on {endpoint}")
+        first = run_protocol(
+            ProtocolJob(IDENTIFY, RIG, folder / "identify", endpoint, overrides), say
+        )
+        second = run_protocol(ProtocolJob(VALIDATE, RIG, folder / "validate", endpoint), say)
+        unseen: tuple[Path, ...] = ()
+        if scenario is not None:
+            third = ProtocolJob(IDENTIFY, RIG, folder / "other-wave", endpoint, HELD_OUT)
+            unseen = (run_protocol(third, say),)
+    runs, judged = (load_run(first),), (load_run(second),)
+    say("identifying the parameters from the first run")
+    identification = identify(runs)
+    say("validating the model on the second run, which is held out")
+    results = validate(identification.model, judged)
+    return Experiment(
+        runs, judged, tuple(map(load_run, unseen)), identification, results, read_truth(truth)
+    )
+
+
+def run_demo(out: Path, seed: int, repeats: int | None) -> None:
+    """Run the demo into a new folder of `out`, print its results and write its reports."""
+    from rig.cli.text.reports import write_trace
+
+    started = time.monotonic()
+    folder = out / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
+    done = experiment(folder, seed, Overrides(repeats=repeats), progress, HIDDEN)
+    write_json(folder / "identify.json", identification_json(done.identification))
+    write_json(folder / "validate.json", validation_json(done.validation))
+    progress("tracing missing effects, judged on held-out runs")
+    held_out = (*done.unseen, *done.judged)
+    traced = trace(done.runs, held_out, seed=seed, progress=Countdown("tracing"))
+    write_json(folder / "trace.json", trace_json(traced))
+    save_model(traced.model_after, folder / "model.json")
+    command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
+    write_experiment(folder / "report.html", done, command, seed)
+    write_trace(folder / "trace.html", held_out, traced)
+    for name in ("report.html", "trace.html"):
+        shutil.copyfile(folder / name, out / name)
+    print(identification_text(done.identification, done.truth))
+    print()
+    print(validation_text(done.validation))
+    print()
+    print(f"trace: {traced.verdict}. {traced.sentence}")
+    print()
+    print("parameters, identified again with the effects found:")
+    print(parameter_table(traced.model_after.parameters, done.truth))
+    print()
+    print(f"runs, model and results: {folder}")
+    print(f"report: {out / 'report.html'}")
+    print(f"trace: {out / 'trace.html'}")
+    progress(f"the whole loop took {time.monotonic() - started:.0f} s")
+
+
+def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
+    """Write the report of a whole loop on a simulated bench."""
+    text = render_report(
+        runs=done.runs,
+        identification=done.identification,
+        validation=done.validation,
+        validation_runs=done.judged,
+        truth=done.truth,
+        title="A simulated bench, identified and validated",
+        provenance=provenance(command, {"simulated bench": seed}),
+    )
+    write(path, text)

@@ -1,0 +1,164 @@
+"""The `sim` verb's work: build the plant, compile it, serve it until a signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.modbus_tcp import TcpSettings
+from hil_sim.device.server import CAN, SLCAN, TCP, VALVES, WIRES, EndpointError, serve, warm_up
+from hil_sim.faults import CLASSES
+from hil_sim.faults.wire import WireFault
+from hil_sim.link.link import FaultyLink
+from hil_sim.link.wires import faulty_link
+from hil_sim.plant.faulty import FaultyPlant
+from hil_sim.plant.plant import Plant
+from hil_sim.scenario.file import (
+    Scenario,
+    load_shipped,
+    parse_scenario,
+    shipped_scenarios,
+)
+from hil_sim.scenario.random_draw import RANDOM, draw
+from rig.cli.errors import WorkError
+from rig.cli.simulated.truth_file import write_truth
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+from rig.runs.files import read_text
+from rig.runs.rigs import load_bench
+
+USUAL_SHARE: Final = 0.01  # share of the frames that a fault given by its name affects
+VALVES_RATE: Final = (
+    1000.0  # [Hz], rate of the plant behind valves that the host samples at any time
+)
+
+
+@dataclass(frozen=True)
+class BenchRequest:
+    """Plant to simulate, and its wire.
+
+    `scenario`: a file of hidden effects, the name of a shipped one, or ``random``, drawn by
+    `seed`. `truth`: a file for the true parameters and hidden effects. `wire_faults`: a file of
+    faults, or the name of a fault of the wire that then affects one frame in a hundred.
+    """
+
+    rig: str
+    seed: int = 0
+    scenario: str | None = None
+    port: int | None = None
+    real_time: bool = False
+    truth: Path | None = None
+    parent: int | None = None
+    wire: str = TCP
+    wire_faults: str | None = None
+
+
+def _endpoint_first(endpoint: str) -> None:
+    # A script that starts the bench reads its endpoint from this line.
+    print(endpoint, flush=True)
+
+
+def hidden(what: BenchRequest, rig: Rig) -> Scenario:
+    """Return the scenario of a bench's hidden effects; raises InputError for a bad file."""
+    if what.scenario is None:
+        return Scenario()
+    if what.scenario == RANDOM:
+        return draw(rig, what.seed)
+    if what.scenario in shipped_scenarios():
+        return load_shipped(what.scenario)
+    return parse_scenario(read_text(Path(what.scenario), "a scenario"), what.scenario)
+
+
+def wire_faults(name: str | None) -> tuple[WireFault, ...]:
+    """Return the faults of the wire of a file or a name; raises InputError for others."""
+    if name is None:
+        return ()
+    known = {kind.fault_name(): kind for kind in CLASSES if issubclass(kind, WireFault)}
+    if name in known:
+        return (known[name].model_validate({"name": name, "probability": USUAL_SHARE}),)
+    path = Path(name)
+    if not path.suffix and not path.exists():
+        raise InputError(
+            f"--wire-faults {name}: expected a file, or one of: {' '.join(sorted(known))}"
+        )
+    scenario = parse_scenario(read_text(path, "a scenario"), name)
+    if scenario != Scenario(description=scenario.description, faults=scenario.wire_faults):
+        raise InputError(
+            f"--wire-faults {name}: expected faults of the wire only ({' '.join(sorted(known))}); "
+            "give everything else as --scenario"
+        )
+    return scenario.wire_faults
+
+
+def serve_bench(what: BenchRequest) -> None:
+    """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
+    if what.wire not in WIRES:
+        raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
+    rig = load_bench(what.rig)
+    if what.wire == VALVES:
+        # The rig's rate is the host's; the valves sample when SYNC arrives, not at fixed ticks.
+        rig = rig.model_copy(update={"sample_rate": max(VALVES_RATE, rig.sample_rate)})
+    scenario = hidden(what, rig)
+    faults = (*scenario.wire_faults, *wire_faults(what.wire_faults))
+    plant = FaultyPlant(rig, scenario, what.seed)
+    # Compiles before the first request, on a second plant so that the served one starts at rest.
+    warm_up(rig, Plant(rig, scenario, what.seed))
+    write_truth(what.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
+    place = _place(what, rig)
+    links: list[FaultyLink] = []
+
+    def ready(endpoint: str) -> None:
+        if faults:
+            links.append(
+                faulty_link(
+                    endpoint,
+                    faults,
+                    seed=what.seed,
+                    seconds=lambda: plant.tick / rig.sample_rate,
+                    port=place.get("port", 0),
+                )
+            )
+            endpoint = links[0].endpoint
+        _endpoint_first(endpoint)
+
+    try:
+        serve(
+            rig,
+            plant,
+            **(place | {"port": 0} if faults else place),
+            wire=what.wire,
+            realtime=what.real_time,
+            on_ready=ready,
+            parent=what.parent,
+            faults=scenario.device_faults,
+        )
+    except EndpointError as error:
+        raise WorkError(str(error)) from error
+    finally:
+        for link in links:
+            link.close()
+
+
+def _place(what: BenchRequest, rig: Rig) -> dict[str, Any]:
+    """Return the wire's keywords for `serve`; raises InputError for options it does not have."""
+    if what.wire == VALVES:
+        return {"port": what.port or 0}
+    if what.wire in (CAN, SLCAN):
+        return _bus(what, rig)
+    tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
+    return {"host": tcp.host, "port": tcp.port if what.port is None else what.port}
+
+
+def _bus(what: BenchRequest, rig: Rig) -> dict[str, Any]:
+    from drivers.can_port import SOCKETCAND, BusPlace
+    from drivers.can_stream import CanSettings, can_layout
+
+    if rig.wire.kind != CAN:
+        return {"port": what.port or 0}
+    at = CanSettings.of(rig.wire)
+    place = BusPlace.of(at.bus)
+    here = {"host": place.host, "port": place.port} if place.interface == SOCKETCAND else {}
+    if what.port is not None:
+        here["port"] = what.port
+    return {**here, "layout": can_layout(at, rig), "bitrate": at.bitrate}

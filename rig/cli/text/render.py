@@ -1,0 +1,159 @@
+"""Results as text for a terminal: SI values in the units people use, three significant digits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from analysis.effects.base import Shape
+from analysis.identify.result import Identification
+from analysis.report.format import MINUS, column_percent
+from analysis.simulation.model import Estimate
+from analysis.simulation.validate import RecordValidation
+from rig.cli.text.output import table
+from rig.model.units import RESIDUALS, RESULTS, DisplayUnit, typeset
+
+
+def _shown(estimate: Estimate) -> tuple[float, str]:
+    unit = DisplayUnit(1.0, estimate.unit)
+    if estimate.unit == "Pa":
+        unit = RESULTS[estimate.unit]
+    return unit.scale, typeset(unit.text)
+
+
+def _share(percent: float) -> str:
+    text = column_percent(percent).replace(MINUS, "-")  # three digits, as in all tables
+    return f"{text} %" if math.isfinite(percent) else "—"
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f} %" if math.isfinite(value) else "—"
+
+
+def parameter_table(
+    estimates: Mapping[str, Estimate], truth: Mapping[str, float] | None = None
+) -> str:
+    """Return the parameters with their 95 % half-widths and, on a simulated bench, the truth."""
+    header = ["parameter", "value", "± 95 %", "unit"]
+    rows = []
+    for name, estimate in estimates.items():
+        scale, unit = _shown(estimate)
+        if not estimate.identified:
+            row = [name, "—", "—", unit]
+        else:
+            low, high = estimate.ci95
+            half = 50.0 * (high - low) / abs(estimate.value)
+            row = [name, f"{scale * estimate.value:#.4g}", _share(half), unit]
+        if truth is not None:
+            known = truth.get(name, math.nan)
+            row += [
+                f"{scale * known:#.4g}" if math.isfinite(known) else "—",
+                _share(100.0 * (estimate.value / known - 1.0)) if known else "—",
+            ]
+        rows.append(row)
+    return table(header + ([] if truth is None else ["truth", "error"]), rows)
+
+
+def identification_text(result: Identification, truth: Mapping[str, float] | None = None) -> str:
+    """Return parameters, conditioning and every check in words."""
+    lines = [parameter_table(result.estimates, truth), ""]
+    for family, solution in result.solutions.items():
+        if not result.rows[family]:
+            continue  # a search solves no regression
+        lines.append(
+            f"{family}: {result.rows[family]} rows, condition number "
+            f"{solution.condition_number:.1f}"
+        )
+    lines.append(f"masked rows: {result.masked_rows}; solved in {result.solve_seconds:.3f} s")
+    if (estimator := result.model.provenance.get("estimator")) is not None:
+        lines.append(f"estimator: {estimator}")
+    lines += [
+        f"{'ok    ' if check.ok else 'NOT OK'} {check.name}: {check.detail}"
+        for check in result.checks
+    ]
+    lines += [f"note: {n}: {e.note}" for n, e in result.estimates.items() if e.note]
+    return "\n".join(lines)
+
+
+def shapes_text(shapes: Mapping[str, tuple[float, Shape]]) -> str:
+    """Return the effects' shape parameters, one per line; '' if there are none."""
+    lines = [f"shape: {name} = {value:.4g} {s.unit}" for name, (value, s) in shapes.items()]
+    return "".join(f"\n{line}" for line in lines)
+
+
+def validation_text(results: Sequence[RecordValidation]) -> str:
+    """Return FIT of the free run and RMSE of restarted windows, one row per record and channel."""
+    rows = []
+    for result in results:
+        for name, fit in result.fit.items():
+            si = result.units.get(name, "m" if name.startswith("piston") else "Pa")
+            unit = RESIDUALS[si]
+            rows.append(
+                [
+                    f"{result.record} {name}",
+                    _percent(fit),
+                    f"{unit.scale * result.rmse[name]:.3g}",
+                    f"{unit.scale * result.window_rmse[name]:.3g}",
+                    unit.text,
+                ]
+            )
+    lines = [table(["record and channel", "FIT", "RMSE", "0.25 s RMSE", "unit"], rows)]
+    lines += [f"{r.record}: the model failed: {r.failure}" for r in results if r.failure]
+    lines += [
+        f"{r.record}: {r.outside} samples with a chamber pressure outside 0 .. supply"
+        for r in results
+        if r.outside
+    ]
+    return "\n".join(lines)
+
+
+def method_text(result: Identification) -> str:
+    """Return the figures specific to the method as tables, '' if there are none."""
+    parts = []
+    if "sequential" in result.extra:
+        parts.append(_sequential(result.extra["sequential"]))
+    if "search" in result.extra:
+        parts.append(_search(result.extra["search"]))
+    return "".join(f"\n\n{part}" for part in parts)
+
+
+def _number(entry: Mapping[str, Any] | None) -> str:
+    return "—" if entry is None or entry["value"] is None else f"{entry['value']:.5g}"
+
+
+def _sequential(data: Mapping[str, Any]) -> str:
+    """Return each parameter's estimate from every single step and from E1 and E2, in SI."""
+    steps = data["steps"]
+    rows = []
+    for name, estimates in data["per_step"].items():
+        own = {e["step"]: e for e in estimates}
+        apart = data["disagreement"].get(name)
+        rows.append(
+            [
+                name,
+                *(_number(own.get(step)) for step in steps),
+                _number(data["E1"][name]),
+                _number(data["E2"][name]),
+                "" if apart is None else f"{apart:.1f}",
+            ]
+        )
+    header = ["parameter [SI]", *steps, "E1: the first", "E2: average", "apart [95 % intervals]"]
+    return "every step by itself\n" + table(header, rows)
+
+
+def _search(data: Mapping[str, Any]) -> str:
+    """Return the search's counts of candidates and its errors."""
+    rows = [
+        ["candidates", str(data["evaluations"])],
+        *([f"lost: {cause}", str(count)] for cause, count in data["lost"].items()),
+        [f"lost of the first {data['generation_sizes'][0]}", str(data["lost_first_generation"])],
+        ["best error of the first generation", _error(data["error_first_generation"])],
+        ["best error", _error(data["error"])],
+        ["seconds", f"{data['seconds']:.1f}"],
+    ]
+    return table([f"search on {data['record']}", ""], rows)
+
+
+def _error(value: float | None) -> str:
+    return "none lived" if value is None else f"{value:.4g}"

@@ -1,0 +1,157 @@
+"""A trace as text for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from analysis.trace.data.spectral_lines import largest_residual_lines
+from analysis.trace.loop_rounds import Round
+from analysis.trace.result import JudgedEffect, Trace
+from analysis.trace.words import quantity, shot_in_words, unit_of_equation
+from rig.cli.text.output import table
+from rig.model.channels import place_in_words
+from rig.model.units import RESIDUALS, display_unit, plain
+
+
+def trace_text(result: Trace) -> str:
+    """Return verdict, effects with their tests, errors, clues and the next experiment as text."""
+    lines = [f"verdict: {result.verdict}", "", result.sentence, ""]
+    for effect in result.effects:
+        lines += _effect(effect)
+    for effect in result.refused:
+        lines += ["fitted best, but not named:", *_effect(effect)]
+    rig = result.model_before.rig
+    rows = [
+        [
+            name, _number(result.noise_floor.get(name, math.nan), 2), _number(before, 2),
+            _number(result.after.get(name, math.nan), 2), unit_of_equation(rig, name),
+            *(_share(errors.get(name), result.size.get(name)) for errors in (
+                result.before, result.after)),
+        ]
+        for name, before in result.before.items()
+    ]  # fmt: skip
+    lines += [
+        table(
+            ["held-out error", "noise floor", "before", "after", "unit", "before", "after"], rows
+        ),
+        "",
+    ]
+    fits = [_free_run(result, name) for name in result.fit_before]
+    if fits:
+        lines += [
+            table(
+                [
+                    "held-out free run",
+                    "FIT before",
+                    "after",
+                    "RMSE before",
+                    "after",
+                    "in 0.25 s before",
+                    "after",
+                    "unit",
+                ],
+                fits,
+            ),
+            "",
+        ]
+    changed = _changed(result)
+    if changed:
+        lines += [table(["parameter", "before", "after", "change"], changed), ""]
+    lines += [
+        f"spectral lines: {lines_of_equation.text}"
+        for lines_of_equation in largest_residual_lines(result.lines)
+    ]
+    if result.depends_on:
+        moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
+        lines.append(f"the remaining residual depends on: {moves} (a clue, not a named effect)")
+    lines += [
+        f"a sparse fit of the remaining residual of {f.equation}: {f.text} "
+        f"({100 * f.share:.0f} % of its energy on held-out records; a clue, not a named effect)"
+        for f in result.formulas
+    ]
+    if result.next_experiment:
+        lines.append(f"next experiment: {result.next_experiment['text']}")
+    lines += [f"note: {note}" for note in result.notes]
+    lines.append(f"traced in {result.seconds:.1f} s")
+    return "\n".join(lines)
+
+
+def _share(error: float | None, size: float | None) -> str:
+    """Return an error in percent of the rms of the equation's right side."""
+    return f"{100 * error / size:.1f} %" if error is not None and size else ""
+
+
+def _effect(effect: JudgedEffect) -> list[str]:
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
+    lines = [f"{effect.name} at {effect.location}: {values}"]
+    if effect.shot:
+        lines.append(f"  {shot_in_words(effect)}")
+    lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in effect.gates]
+    lines += [
+        f"  rival {r.name} at {r.location}: {r.ratio:.2f} times the held-out rms"
+        + (" (cannot be separated)" if r.tied else "")
+        for r in effect.rivals
+    ]
+    return [*lines, ""]
+
+
+def _changed(result: Trace) -> list[list[str]]:
+    after = result.model_after.parameters
+    out = []
+    for name, estimate in result.model_before.parameters.items():
+        if result.model_after is result.model_before or name not in after:
+            continue
+        change = 100 * (after[name].value / estimate.value - 1) if estimate.value else math.nan
+        values = (_number(p.value, 4) for p in (estimate, after[name]))
+        out.append([name, *values, _percent(change, "+")])
+    return out
+
+
+def _percent(value: float, sign: str = "") -> str:
+    return f"{value:{sign}.1f} %" if math.isfinite(value) else "—"
+
+
+def _free_run(result: Trace, channel: str) -> list[str]:
+    """Return a channel's row: FIT and errors of the model before and after, and the unit."""
+    unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
+    errors = (
+        result.rmse_before, result.rmse_after, result.window_before, result.window_after,
+    )  # fmt: skip
+    return [
+        channel,
+        *(_percent(fit.get(channel, math.nan)) for fit in (result.fit_before, result.fit_after)),
+        *(_number(unit.scale * error.get(channel, math.nan)) for error in errors),
+        unit.text,
+    ]
+
+
+def _number(value: float, digits: int = 3) -> str:
+    return plain(value, digits) if math.isfinite(value) else "—"
+
+
+def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
+    """Return a loop's rounds as a table, the last trace, and why the loop stopped."""
+    rows = [
+        [
+            str(r.number), r.result.verdict, named(r.result), _figure(r.predicted),
+            _figure(r.achieved), plain(r.loudest, 2), plain(r.residual, 2),
+        ]
+        for r in rounds
+    ]  # fmt: skip
+    header = [
+        "round", "verdict", "named", "predicted", "achieved", "residual/noise", "held-out/noise",
+    ]  # fmt: skip
+    lines = [trace_text(rounds[-1].result), "", table(header, rows), "", f"stopped: {stopped}"]
+    return "\n".join(lines)
+
+
+def named(result: Trace) -> str:
+    """Return the effects of a trace in a few words, with those that cannot be separated."""
+    names = [f"{e.name} at {e.location}" for e in result.effects]
+    tied = ", ".join(f"{name} at {place_in_words(at)}" for name, at in result.tied_at)
+    return (", ".join(names) or "nothing") + (f" (or {tied})" if tied else "")
+
+
+def _figure(value: float | None) -> str:
+    return "—" if value is None else plain(value, 2)

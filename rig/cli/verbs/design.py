@@ -1,0 +1,57 @@
+"""The `design` verb."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import (
+    JsonOption,
+    ModelOption,
+    NominalOption,
+    ProtocolArgument,
+    RigOption,
+    writable_file,
+)
+
+
+def design(
+    protocol: ProtocolArgument,
+    rig: RigOption,
+    out: Annotated[Path, typer.Option(help="The protocol file to write.", callback=writable_file)],
+    criterion: Annotated[
+        str, typer.Option(help="D, E, or the name of the parameter to improve.")
+    ] = "E",
+    budget: Annotated[
+        int, typer.Option(min=1, max=5000, help="Number of simulations per step on the twin.")
+    ] = 300,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the search; the same seed gives the same result.")
+    ] = 0,
+    model: ModelOption = None,
+    nominal: NominalOption = False,
+    json: JsonOption = None,
+) -> None:
+    """Improve a protocol's multisines for better estimates, within the rig's limits.
+
+    Example: bramah design lock-and-excite-multisine --rig shinshu-2dof --criterion b --out b.yaml
+    """
+    from rig.cli.proof.predicted_errors import design_json, design_protocol, design_text
+    from rig.cli.proof.twin_choice import load_twin, twin_source
+    from rig.cli.text.output import progress, write_json
+    from rig.runs.files import write_text
+    from rig.runs.rigs import load_bench
+
+    bench = load_bench(rig)
+    parameters = load_twin(twin_source(bench, model, nominal), bench)
+    if parameters.warning:
+        progress(parameters.warning)
+    designed = design_protocol(protocol, rig, criterion, budget, seed, parameters)
+    write_text(out, designed.text)
+    write_json(json, design_json(designed))
+    if json != Path("-"):
+        typer.echo(
+            f"{design_text(designed, out)}\nlimits and errors predicted on: {parameters.text}"
+        )

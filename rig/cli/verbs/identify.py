@@ -1,0 +1,219 @@
+"""The `identify` verb: every parameter from all records of the runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.options import (
+    JsonOption,
+    RunsArgument,
+    writable_file,
+)
+from rig.cli.text.output import Countdown, printed_at_end, progress, write_json
+
+if TYPE_CHECKING:
+    from analysis.identify.result import Identification
+    from analysis.regression.rows import Filtering
+    from analysis.terms.base import Used
+    from rig.model.records import Record, Run
+
+
+def load_runs(folders: Sequence[Path]) -> list[Run]:
+    """Load run folders, each once; report progress if it takes long."""
+    from rig.runs.store import load_run, refuse_repeated
+
+    refuse_repeated(folders)
+    countdown, loaded = Countdown("loading"), []
+    for folder in folders:
+        loaded.append(load_run(folder))
+        countdown(len(loaded) / len(folders))
+    return loaded
+
+
+def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstrap: int) -> None:
+    """Raise InputError for settings that need the rows of all records in memory."""
+    from rig.model.parse import InputError
+
+    for name, asked, wanted in (
+        ("--method", method, "coupled"),
+        ("--estimator", estimator or "plain", "plain"),
+        ("--bootstrap", str(bootstrap), "0"),
+    ):
+        if asked != wanted:
+            raise InputError(
+                f"{name} {asked} needs all rows in memory and cannot be used with {option}: "
+                f"expected {name} {wanted}, or no {option}"
+            )
+
+
+def _streamed(
+    runs: Sequence[Path],
+    filtering: Callable[[Record], Filtering],
+    effects: Sequence[str],
+    like: Path | None,
+    cluster: str | None,
+) -> Identification:
+    from analysis.identify.streams.out_of_core import identify_folders
+    from analysis.simulation.model import load_model
+    from analysis.workers.cluster import DaskCluster
+    from analysis.workers.pool import Serial
+    from rig.runs.store import refuse_repeated
+
+    refuse_repeated(runs)
+    model = None if like is None else load_model(like)
+    # The workers read the folders, which need not exist on this computer.
+    with Serial() if cluster is None else DaskCluster(cluster) as pool:
+        return identify_folders(
+            [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects,
+            like=model, progress=Countdown("identifying"),
+        )  # fmt: skip
+
+
+def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Sequence[Used] | None:
+    """Return the terms of the options, with unset shapes fitted; None for the rig file's terms."""
+    from analysis.simulation.model import terms_like
+    from analysis.terms import with_effects
+    from analysis.terms.base import Used
+
+    if like is not None:
+        return terms_like(like, {run.source: run.rig for run in runs})
+    if not effects:
+        return None
+    from analysis.trace.search.shapes import with_shapes  # loads scipy.optimize, slowly
+
+    return with_shapes(runs, [Used(term) for term in with_effects(runs[0].rig, effects)])
+
+
+def _shapes_in(result: Identification) -> dict[str, Any]:
+    """Return the shapes of the model's effects by name; most models have none."""
+    if not any(used.shape for used in result.model.terms):
+        return {}
+    from analysis.trace.search.shapes import shapes_in  # loads scipy.optimize, slowly
+
+    return dict(shapes_in(result.model.rig, result.model.terms))
+
+
+def identify(
+    runs: RunsArgument,
+    method: Annotated[
+        str, typer.Option(help="coupled, sequential, simultaneous, pso or ga.")
+    ] = "coupled",
+    effects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with", help="Add an effect to the model: NAME (every joint) or 'NAME@joint 1'."
+        ),
+    ] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(help="Use the terms of this model file: its effects and their shapes."),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            help="ls, wls, iv, robust, output-error; auto: ls, or iv where noise in the "
+            "regressors biases ls significantly; plain: least squares alone.  "
+            "[default: auto; plain with --stream or --cluster]"
+        ),
+    ] = None,
+    bootstrap: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Bootstrap draws of whole repeats for the intervals; 0: from their scatter.",
+        ),
+    ] = 0,
+    filtering: Annotated[
+        str, typer.Option(help="Filter: default, moving-average (the paper's) or butterworth.")
+    ] = "default",
+    json: JsonOption = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Write the model file here.", callback=writable_file)
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Compare with the true parameters in this file of `bramah sim --truth`."),
+    ] = None,
+    physical: Annotated[
+        bool,
+        typer.Option("--physical", help="Constrain the parameters to physically consistent ones."),
+    ] = False,
+    evaluations: Annotated[
+        int, typer.Option(min=4, help="Number of candidates that pso or ga simulates.")
+    ] = 2000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of pso, ga and the bootstrap.")] = 0,
+    stream: Annotated[
+        bool,
+        typer.Option(
+            "--stream",
+            help="Keep one record in memory at a time, for large runs; coupled and plain "
+            "only (an --estimator's refinements need all rows in memory).",
+        ),
+    ] = False,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="Stream on the workers of the Dask scheduler at tcp://HOST:PORT."),
+    ] = None,
+) -> None:
+    """Identify every parameter from all records of the runs, by --method.
+
+    Example: bramah identify runs/monday --json parameters.json --model model.json
+    """
+    import numpy as np
+
+    from analysis.identify.identify import identify as identify_runs
+    from analysis.identify.methods import SearchOptions
+    from analysis.identify.result import to_json
+    from analysis.regression.rows import FILTERINGS
+    from rig.cli.proof.twin_choice import save_identified
+    from rig.cli.simulated.truth_file import read_truth
+    from rig.cli.text.render import identification_text, method_text, shapes_text
+    from rig.model.parse import InputError
+
+    if filtering not in FILTERINGS:
+        raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
+    filters = FILTERINGS[filtering]
+    known = None if truth is None else read_truth(truth)
+    if like is not None and effects:
+        raise InputError("--like uses the terms of a model unchanged: expected no --with beside it")
+    if stream or cluster is not None:
+        _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
+        result = _streamed(runs, filters, effects or (), like, cluster)
+    else:
+        loaded = load_runs(runs)
+        terms = _terms(loaded, effects or (), like)
+        result = identify_runs(
+            loaded,
+            method,
+            terms,
+            filters,
+            estimator=estimator or "auto",
+            bootstrap=bootstrap,
+            rng=np.random.default_rng(seed),
+            search=SearchOptions(evaluations=evaluations),
+            progress=Countdown("identifying"),
+        )
+    shapes = _shapes_in(result)
+    document, more = to_json(result), shapes_text(shapes) + method_text(result)
+    if shapes:
+        document["shapes"] = {n: {"value": v, "unit": s.unit} for n, (v, s) in shapes.items()}
+    if physical:
+        from rig.cli.identification.physical import make_physical
+
+        result, document, consistent = make_physical(result)
+        more += consistent
+    with printed_at_end(json, lambda: identification_text(result, known) + more):
+        if model is not None:
+            save_identified(result.model, model, progress)
+        write_json(json, document)
+        if report is not None:
+            from rig.cli.text.reports import write_identification
+
+            write_identification(report, load_runs(runs), result)

@@ -1,0 +1,129 @@
+"""The `loop` verb: run, identify, trace, design and run the next experiment, repeatedly."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.options import (
+    EndpointOption,
+    JsonOption,
+    RepeatsOption,
+    RigOption,
+    ScaleOption,
+    writable_file,
+)
+from rig.cli.text.output import printed_at_end, progress, write_json
+
+
+def loop(
+    rig: RigOption,
+    out: Annotated[
+        Path, typer.Option(help="A folder for the runs and the report, made if needed.")
+    ],
+    endpoint: EndpointOption = None,
+    unattended: Annotated[
+        bool, typer.Option("--unattended", help="Run designed experiments without asking.")
+    ] = False,
+    rounds: Annotated[int, typer.Option(min=0, help="Largest number of designed experiments.")] = 4,
+    protocol: Annotated[
+        str, typer.Option(help="Repeats per step of the first run.")
+    ] = "lock-and-excite-multisine",
+    repeats: RepeatsOption = None,
+    amplitude_scale: ScaleOption = 1.0,
+    until_visible: Annotated[
+        bool,
+        typer.Option(
+            "--until-visible",
+            help="Continue after clean while a relevant effect could be below the noise.",
+        ),
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the trace and of --simulate.")] = 0,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Start a simulated bench and use it.")
+    ] = False,
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario of --simulate, as for sim, such as random.")
+    ] = None,
+    json: JsonOption = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="The report of all rounds.  [default: OUT/loop.html]", callback=writable_file
+        ),
+    ] = None,
+    operator: Annotated[
+        str | None, typer.Option(help="Name written into the runs.  [default: the user]")
+    ] = None,
+) -> None:
+    """Close the loop: run, trace, design the experiment that separates, run it, trace again.
+
+    It stops when the remaining residual is noise, or no experiment predicts more than noise.
+
+    Example: bramah loop --rig shinshu-2dof --out loops/monday --unattended
+    """
+    from rig.model.parse import InputError
+
+    if simulate and endpoint is not None:
+        raise InputError("--simulate starts a new bench: expected either --simulate or --endpoint")
+    if scenario is not None and not simulate:
+        raise InputError("--scenario needs --simulate: it cannot change a bench that runs already")
+    if not unattended and not sys.stdin.isatty():
+        raise InputError(
+            "loop asks before each experiment that it designs; give --unattended where nobody "
+            "can answer"
+        )
+    # The analysis loads slowly: options are checked before it is imported.
+    from protocols.files.plan import Overrides
+    from rig.cli.execution.experiment_loop import Loop, LoopRequest, refuse_taken
+    from rig.cli.simulated.simulated_bench import simulated_bench
+
+    refuse_taken(out)
+    with ExitStack() as stack:
+        if simulate:
+            # The loop must not read the truth, so none is written.
+            endpoint = stack.enter_context(simulated_bench(rig, seed=seed, scenario=scenario))
+        ask = (lambda experiment: True) if unattended else _confirmed
+        sizes = Overrides(repeats=repeats, amplitude_scale=amplitude_scale)
+        request = LoopRequest(
+            rig, out, endpoint, protocol, sizes, rounds, seed, until_visible, operator, ask
+        )
+        experiments = Loop(request, progress)
+        try:
+            experiments.close()
+        except BaseException as error:
+            experiments.stopped = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            _show_result(experiments, json, report or out / "loop.html")
+
+
+def _confirmed(experiment: Mapping[str, Any]) -> bool:
+    return typer.confirm(f"Run the next experiment ({experiment['text']})?", err=True)
+
+
+def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
+    from analysis.trace.loop_rounds import rounds_json
+    from rig.cli.proof.twin_choice import save_identified
+    from rig.cli.text.reports import write_loop
+    from rig.cli.text.trace_text import rounds_text
+
+    if not experiments.rounds and not experiments.request.out.is_dir():
+        return  # the loop ended before its first record
+    document = rounds_json(experiments.rounds, experiments.stopped)
+    write_json(experiments.request.out / "loop.json", document)
+    write_json(json, document)
+    if not experiments.rounds:
+        return
+    last = experiments.rounds[-1].result.model_after
+    text = rounds_text(experiments.rounds, experiments.stopped)
+    with printed_at_end(json, lambda: f"{text}\nreport: {report}"):
+        save_identified(last, experiments.request.out / "model.json", progress)
+        write_loop(
+            report, experiments.train, experiments.judge, experiments.rounds, experiments.stopped
+        )

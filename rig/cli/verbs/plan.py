@@ -1,0 +1,40 @@
+"""The `plan` verb: a rig's lock-and-excite steps, with proof that they determine all parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import JsonOption, RigOption, writable_file
+from rig.cli.text.output import progress, write_json
+
+
+def plan(
+    rig: RigOption,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the protocol file here.", callback=writable_file)
+    ] = None,
+    validation: Annotated[
+        Path | None,
+        typer.Option(help="Write a protocol for validation data here.", callback=writable_file),
+    ] = None,
+    prove: Annotated[
+        str | None,
+        typer.Option(help="Prove this protocol (a name or a file) instead of generating one."),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Generate a rig's lock-and-excite steps and prove that they determine all parameters.
+
+    Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
+    """
+    from rig.cli.proof.step_planning import PlanRequest, plan_steps
+    from rig.cli.text.sheets import proof_text
+
+    request = PlanRequest(rig, out, validation, prove)
+    proof = plan_steps(request, progress)
+    write_json(json, proof.as_dict())
+    if json != Path("-"):
+        typer.echo(proof_text(proof))

@@ -1,0 +1,469 @@
+"""The `queue` verbs: a queue of runs on disk, and the process that runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.options import (
+    DurationOption,
+    EndpointOption,
+    JsonOption,
+    ModelOption,
+    NominalOption,
+    ProtocolArgument,
+    RepeatsOption,
+    RigOption,
+    ScaleOption,
+    StepOption,
+    WaveSeedOption,
+    writable_file,
+)
+from rig.cli.text.output import progress, table, write_json
+
+if TYPE_CHECKING:
+    from rig.queue.items import Item
+    from rig.queue.store import QueueStore
+
+QueueOption = Annotated[
+    Path | None,
+    typer.Option("--queue", help="The queue's file.  [default: queue.sqlite in BRAMAH_STATE]"),
+]
+WAIT_HOURS = 12  # longest wait [h] for --when without --not-after
+ItemArgument = Annotated[int, typer.Argument(help="The item's number.")]
+
+
+def _who() -> str:
+    from rig.runs.runstate import user_name
+
+    return user_name()
+
+
+def _path(queue: Path | None) -> Path:
+    from rig.bench.latch import state_folder
+
+    return (queue or state_folder() / "queue.sqlite").absolute()
+
+
+@contextmanager
+def _opened(queue: Path | None, *, create: bool = False) -> Iterator[QueueStore]:
+    from rig.queue.store import QueueStore
+
+    with QueueStore(_path(queue), create=create) as store:
+        yield store
+
+
+def _show(item: Item, json: Path | None, said: str) -> None:
+    write_json(json, item.as_dict())
+    if json != Path("-"):
+        typer.echo(f"item {item.id} {item.job.name}: {said}")
+
+
+def _absolute(name: str, shipped: tuple[str, ...]) -> str:
+    """Return a shipped name, or a file's absolute path: the runner starts in another folder."""
+    return name if name in shipped else str(Path(name).expanduser().absolute())
+
+
+def _arguments(*options: tuple[str, object]) -> tuple[str, ...]:
+    return tuple(
+        str(part) for name, value in options if value is not None for part in (name, value)
+    )
+
+
+def queue_group() -> None:
+    """Keep a queue of runs on disk and run it, one item at a time.
+
+    Example: bramah queue list
+    """
+
+
+def add(
+    context: typer.Context,
+    protocol: ProtocolArgument,
+    rig: RigOption,
+    out: Annotated[
+        Path | None, typer.Option(help="The run folder.  [default: runs/NUMBER-PROTOCOL here]")
+    ] = None,
+    endpoint: EndpointOption = None,
+    repeats: RepeatsOption = None,
+    duration: DurationOption = None,
+    amplitude_scale: ScaleOption = 1.0,
+    wave_seed: WaveSeedOption = None,
+    step: StepOption = None,
+    priority: Annotated[
+        int, typer.Option(min=-100, max=100, help="Items of higher priority start first.")
+    ] = 0,
+    not_before: Annotated[
+        str | None, typer.Option(help="Earliest start: 22:30 (the next one) or 2026-03-01T22:30.")
+    ] = None,
+    not_after: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Latest start; then it expires.  [default: with --when, {WAIT_HOURS} h later]"
+        ),
+    ] = None,
+    after: Annotated[
+        int | None, typer.Option(help="Start only after this earlier item has ended.")
+    ] = None,
+    wanted: Annotated[
+        str | None,
+        typer.Option(
+            "--if",
+            help="Condition on the item of --after: a state (done, failed, ..., ended: any) or an "
+            "identified value, such as 'b.rsd < 0.5 %'.  [default: done]",
+        ),
+    ] = None,
+    when: Annotated[
+        str | None,
+        typer.Option(help="Wait for a measured condition, such as 'oil_temperature > 40 degC'."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the item in lists.")] = None,
+    operator: Annotated[str | None, typer.Option(help="Name written into the run.")] = None,
+    model: ModelOption = None,
+    nominal: NominalOption = False,
+    identify: Annotated[bool, typer.Option(help="Identify from the run when it is done.")] = True,
+    queue: QueueOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Prove an item on the twin and queue it; further options of `bramah check` follow after `--`.
+
+    Example: bramah queue add lock-and-excite --rig shinshu-2dof --repeats 2 --not-before 22:00
+    """
+    from protocols.files.library import shipped_names
+    from rig.cli.execution.queue_add import prove
+    from rig.model.parse import InputError
+    from rig.queue.items import DONE, QueueJob, channel_condition, parse_time
+    from rig.runs.rigs import shipped_rigs
+    from rig.runs.store import refuse_occupied
+
+    now = datetime.now(UTC)
+    changed = _arguments(
+        ("--repeats", repeats), ("--duration", duration), ("--wave-seed", wave_seed),
+        ("--amplitude-scale", None if amplitude_scale == 1.0 else amplitude_scale),
+        *(("--step", step_name) for step_name in step or ()),
+        ("--model", None if model is None else model.absolute()),
+    )  # fmt: skip
+    changed += ("--nominal",) if nominal else ()
+    if wanted is not None and after is None:
+        raise InputError(
+            "--if is a condition on an earlier item: expected --after NUMBER beside it"
+        )
+    if when is not None:
+        channel_condition(when)
+    times = {
+        option: ""
+        if text is None
+        else parse_time(text, now, f"--{option.replace('_', '-')}").isoformat()
+        for option, text in (("not_before", not_before), ("not_after", not_after))
+    }
+    if when is not None and not_after is None:  # an item whose condition is never met expires
+        begin = datetime.fromisoformat(times["not_before"]) if not_before else now
+        times["not_after"] = (begin + timedelta(hours=WAIT_HOURS)).isoformat()
+    with _opened(queue, create=True) as store:
+        title = name or Path(protocol).stem
+        folder = (out or Path("runs", f"{store.next_number():03d}-{title}")).absolute()
+        refuse_occupied(folder)
+        job = QueueJob(
+            protocol=_absolute(protocol, shipped_names()),
+            rig=_absolute(rig, shipped_rigs()),
+            out=str(folder),
+            name=title,
+            endpoint=endpoint or "",
+            options=(*changed, *context.args),
+            run_options=("--operator", operator or _who()),
+            after=after,
+            wanted=wanted or DONE,
+            when=when or "",
+            identify=identify,
+            **times,
+        )
+        if after is not None:
+            _refuse_wanted(store.item(after), wanted or DONE)
+        progress(f"checking {title} on the twin")
+        item = store.add(job, priority, prove(job))
+    seconds = item.proof.get("seconds")
+    length = "" if seconds is None else f", about {seconds / 60.0:.1f} min of the device's time"
+    if item.proof.get("warning"):
+        progress(f"WARNING: {item.proof['warning']}")
+    _show(item, json, f"queued{length}; it will run into {item.job.out}")
+
+
+def _refuse_wanted(earlier: Item, wanted: str) -> None:
+    """Raise InputError where what is wanted of an earlier item can never be."""
+    from rig.model.parameters import parameter_names
+    from rig.model.parse import InputError
+    from rig.queue.items import ENDED, OVER, check_wanted
+    from rig.runs.rigs import load_bench
+
+    if wanted in (ENDED, *OVER):
+        return
+    check_wanted(wanted, parameter_names(len(load_bench(earlier.job.rig).joints)))
+    if not earlier.job.identify:
+        raise InputError(
+            f"--if {wanted!r}: item {earlier.id} was added with --no-identify, so that no "
+            "parameter is known after it; give --if a state, such as done"
+        )
+
+
+def _line(item: Item) -> tuple[str, ...]:
+    waits = [f"not before {_local(item.job.not_before)}"] if item.job.not_before else []
+    waits += [f"after {item.job.after} if {item.job.wanted}"] if item.job.after else []
+    waits += [f"when {item.job.when}"] if item.job.when else []
+    waits += [f"not after {_local(item.job.not_after)}"] if item.job.not_after else []
+    about = item.reason if item.over or not waits else "; ".join(waits)
+    seconds = item.proof.get("seconds")
+    length = "" if seconds is None else f"{seconds / 60.0:.1f}"
+    state = f"{item.state} (ending)" if item.cancel and not item.over else item.state
+    return str(item.id), str(item.priority), state, item.job.name, length, about
+
+
+def _local(time: str) -> str:
+    return datetime.fromisoformat(time).astimezone().strftime("%d %b %H:%M") if time else ""
+
+
+def list_items(
+    state: Annotated[
+        list[str] | None, typer.Option("--state", help="Only items in this state; repeatable.")
+    ] = None,
+    queue: QueueOption = None,
+    json: JsonOption = None,
+) -> None:
+    """List the items in the order in which they start.
+
+    Example: bramah queue list --state queued
+    """
+    from rig.model.parse import InputError
+    from rig.queue.items import STATES
+    from rig.queue.runner import runner_of
+
+    unknown = [word for word in state or () if word not in STATES]
+    if unknown:
+        raise InputError(f"--state {unknown[0]}: expected one of: {', '.join(STATES)}")
+    with _opened(queue) as store:
+        paused, items = store.paused, store.items()
+    shown = [item for item in items if not state or item.state in state]
+    pid = runner_of(_path(queue))
+    document = {"paused": paused, "runner": pid, "items": [item.as_dict() for item in shown]}
+    write_json(json, document)
+    if json == Path("-"):
+        return
+    if shown:
+        header = ("item", "priority", "state", "name", "min", "reason or condition")
+        typer.echo(
+            table(
+                header,
+                [_line(item) for item in shown],
+                left=("name", "state", "reason or condition"),
+            )
+        )
+    pending = [item for item in items if not item.over]
+    minutes = sum(item.proof.get("seconds") or 0.0 for item in pending) / 60.0
+    runner = f"run by process {pid}" if pid else "no process runs the queue"
+    typer.echo(
+        f"{len(pending)} of {len(items)} items have not ended, about {minutes:.0f} min of the "
+        f"device's time; {paused or runner}"
+    )
+
+
+def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
+    """Show one item with its history and the end of its log.
+
+    Example: bramah queue show 3
+    """
+    from dataclasses import asdict
+
+    from rig.queue.runner import log_of
+
+    with _opened(queue) as store:
+        entry, lines = store.item(item), store.history(item)
+    log = log_of(_path(queue), entry)
+    document: dict[str, Any] = entry.as_dict()
+    document |= {"history": [asdict(line) for line in lines], "log": str(log)}
+    write_json(json, document)
+    if json == Path("-"):
+        return
+    job = entry.job
+    typer.echo(f"item {entry.id} {job.name}: {entry.state}")
+    facts = {
+        "reason": entry.reason, "protocol": job.protocol, "rig": job.rig,
+        "endpoint": job.endpoint, "options": " ".join(job.options), "run": entry.run or job.out,
+        "log": str(log) if log.exists() else "",
+    }  # fmt: skip
+    for key, value in facts.items():
+        if value:
+            typer.echo(f"  {key:9s} {value}")
+    for line in lines:
+        typer.echo(f"  {_local(line.time)}  {line.event}{': ' if line.reason else ''}{line.reason}")
+    if entry.results.get("parameters"):
+        rows = [
+            (name, f"{p['value']:.5g}", f"{p['std']:.2g}" if p.get("std") else "—", p["unit"])
+            for name, p in entry.results["parameters"].items()
+            if p.get("value") is not None
+        ]
+        typer.echo(table(("parameter", "value", "std", "unit"), rows))
+
+
+def run(
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Keep waiting for further items, as a service.")
+    ] = False,
+    notify: Annotated[
+        str | None,
+        typer.Option(
+            help="Command that receives JSON on standard input at a trip, a failure and the end."
+        ),
+    ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the page of the night here when the queue ends.", callback=writable_file
+        ),
+    ] = None,
+    queue: QueueOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Run the queue, one item at a time; Ctrl-C zeroes the outputs, then ends the current item.
+
+    Exits 0 when all items are done, 1 when one has failed, 3 on a trip, 4 on a lost device.
+
+    Example: bramah queue run --notify 'mail -s bench me@example.org'
+    """
+    from rig.model.parse import InputError
+    from rig.queue.hook import Hook, parse_command
+    from rig.queue.runner import Runner, folder_of
+
+    command = parse_command(notify) if notify is not None else ()
+    with _opened(queue, create=serve) as store:
+        if store.paused and not serve:
+            raise InputError(
+                f"the queue is {store.paused}; continue it with `bramah queue pause --off`"
+            )
+        hook = Hook(command, folder_of(store.path) / "hook.log")
+        began = datetime.now(UTC)
+        with Runner(store, progress, hook, serve=serve) as runner:
+            report = runner.run()
+        if page is not None:
+            from rig.cli.text.night import write_page
+
+            try:
+                write_page(page, store, began)
+            except InputError as error:  # the exit code reports the queue, not its page
+                progress(f"bramah: {error}")
+    document = {
+        "code": report.code,
+        "reason": report.reason,
+        "ended": [item.as_dict() for item in report.ended],
+    }
+    write_json(json, document)
+    if json != Path("-"):
+        done = sum(item.state == "done" for item in report.ended)
+        typer.echo(f"{done} of {len(report.ended)} items done; {report.reason}")
+    if report.code > 1:
+        progress(f"bramah: {report.reason}")
+    raise typer.Exit(report.code)
+
+
+def write_night_page(
+    out: Annotated[
+        Path, typer.Option(help="The HTML file to write.", callback=writable_file)
+    ] = Path("night.html"),
+    since: Annotated[
+        str | None, typer.Option(help="Only since 2026-03-01T22:00, or 12h ago.")
+    ] = None,
+    queue: QueueOption = None,
+) -> None:
+    """Write a report of the queue: items run, parameters identified, trips, drift of parameters.
+
+    Example: bramah queue page --out night.html --since 12h
+    """
+    from rig.cli.text.night import write_page
+    from rig.cli.text.times import since as parse_since
+
+    begin = None if since is None else parse_since(since, datetime.now(UTC))
+    with _opened(queue) as store:
+        write_page(out, store, begin)
+    typer.echo(str(out))
+
+
+def pause(
+    off: Annotated[bool, typer.Option("--off", help="Continue the queue.")] = False,
+    queue: QueueOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Start no further item; the current one runs to its end. --off continues the queue.
+
+    Example: bramah queue pause
+    """
+    with _opened(queue) as store:
+        if off:
+            store.resume(_who())
+        else:
+            store.pause(_who())
+        active = [item.id for item in store.items() if item.state in ("checking", "running")]
+    write_json(json, {"paused": not off, "active": active})
+    if json != Path("-"):
+        still = f"; item {active[0]} runs to its end" if active and not off else ""
+        typer.echo("the queue continues" if off else f"paused{still}")
+
+
+def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
+    """Cancel an item; a running one is ended safely, its outputs zeroed first.
+
+    Example: bramah queue cancel 3
+    """
+    from rig.queue.runner import end_orphan, runner_of
+
+    with _opened(queue) as store:
+        cancelled = store.cancel(item, _who())
+        if not cancelled.over and runner_of(store.path) is None:
+            end_orphan(store.path, cancelled)
+    result = "cancelled" if cancelled.over else "asked to end; `bramah queue show` says how it ends"
+    _show(cancelled, json, result)
+
+
+def move(
+    item: ItemArgument,
+    before: Annotated[int | None, typer.Option(help="Place it before this item.")] = None,
+    last: Annotated[bool, typer.Option("--last", help="Place it last of its priority.")] = False,
+    priority: Annotated[
+        int | None, typer.Option(min=-100, max=100, help="Change its priority to this.")
+    ] = None,
+    queue: QueueOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Move a queued item: before another, or first (or --last) of its priority.
+
+    Example: bramah queue move 5 --before 2
+    """
+    from rig.model.parse import InputError
+
+    if before is not None and (last or priority is not None):
+        raise InputError(
+            "--before sets the priority too: expected no --last or --priority beside it"
+        )
+    with _opened(queue) as store:
+        moved = store.move(item, before=before, last=last, priority=priority)
+    _show(moved, json, f"priority {moved.priority}, place {moved.place:g}")
+
+
+def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
+    """Queue an ended item again; it keeps its place and runs into a new folder.
+
+    Example: bramah queue retry 3
+    """
+    with _opened(queue) as store:
+        retried = store.retry(item, _who())
+    _show(retried, json, f"queued again; it will run into {retried.next_folder()}")
+
+
+queue = typer.Typer(no_args_is_help=True, rich_markup_mode=None, callback=queue_group)
+queue.command(context_settings={"allow_extra_args": True})(add)
+queue.command("list")(list_items)
+queue.command("page")(write_night_page)
+for verb in (show, run, pause, cancel, move, retry):
+    queue.command()(verb)

@@ -1,0 +1,90 @@
+"""The `stop` verb: outputs set to zero at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+from rig.cli.execution.device import device_of, print_pressure
+from rig.cli.options import EndpointOption, RigOption
+from rig.cli.text.output import progress
+
+if TYPE_CHECKING:
+    from rig.bench.latch import Holder
+    from rig.model.parts import Wire
+
+# A stopped run records its outputs at zero, for at most 6 s and two answer times.
+RECORDS_ZERO: Final = 15.0  # [s]
+# The next law of another computer's run may overwrite a single zero command.
+ZEROS: Final = 6
+BETWEEN_ZEROS: Final = 0.2  # [s]
+
+
+def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
+    """Set all outputs to zero now, whoever is in control, and end the run that drives them.
+
+    Example: bramah stop --rig shinshu-2dof
+    """
+    from drivers.base import DeviceError
+    from rig.bench import probe as bench
+    from rig.bench.outputs import UNSURE
+
+    described, driver = device_of(rig, endpoint)
+    try:
+        driver.zero_outputs()  # before anything else
+        elsewhere = _holder(described.wire) is None
+        for _ in range(ZEROS - 1 if elsewhere else 0):
+            time.sleep(BETWEEN_ZEROS)
+            driver.zero_outputs()
+    except DeviceError as error:
+        watchdog = described.wire.watchdog
+        raise type(error)(
+            f"{UNSURE}: {error}; use the emergency stop (the device's watchdog "
+            f"zeroes the outputs {watchdog:g} s after the host's last message)"
+        ) from error
+    finally:
+        driver.close()
+    _end_run(described.wire)
+    typer.echo("outputs at zero, confirmed by the device")
+    try:
+        print_pressure(bench.pressurised(bench.probe(device_of(rig, endpoint)[1], described)))
+    except DeviceError as error:
+        progress(f"pressures not read: {error}")
+
+
+def _end_run(wire: Wire) -> None:
+    """End the process of this computer that drives the bench, or its next law moves joints again.
+
+    Raises DeviceBusy if the process does not end.
+    """
+    from drivers.base import DeviceBusy
+    from rig.bench.outputs import UNSURE
+
+    holder = _holder(wire)
+    if holder is None:
+        return
+    run = f", which writes {holder.run}," if holder.run else ""
+    progress(f"stopping process {holder.pid}{run} as well")
+    with suppress(ProcessLookupError):  # the process has ended by itself
+        os.kill(holder.pid, signal.SIGTERM)
+    deadline = time.monotonic() + RECORDS_ZERO
+    while _holder(wire) == holder:
+        if time.monotonic() > deadline:
+            raise DeviceBusy(
+                f"{UNSURE}: process {holder.pid}{run or ','} was told to stop but runs on; use the "
+                "emergency stop"
+            )
+        time.sleep(0.05)
+
+
+def _holder(wire: Wire) -> Holder | None:
+    """Return the other process of this computer that holds the bench, None if there is none."""
+    from rig.bench.latch import BenchState
+
+    holder = BenchState(wire).holder()
+    return None if holder is None or holder.pid == os.getpid() else holder
