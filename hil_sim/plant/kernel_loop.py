@@ -180,18 +180,18 @@ def sense(
 
 
 @jit
-def delayed(tick: int, c: int, lag: float, values: Any, slopes: Any) -> float:
-    """Return channel c at `lag` ticks before `tick`, from a ring of values and rates per tick.
+def delayed(now: int, c: int, lag: float, values: Any, slopes: Any) -> float:
+    """Return channel c at `lag` ticks before place `now` of a ring of values and rates per tick.
 
     Ahead of the tick (negative lag: the multiplexer's skew) along the tangent, behind it by cubic
     Hermite interpolation.
     """
-    ring = len(values)
     whole = int(max(lag, 0.0)) + 1
     t = whole - lag
     if lag <= 0.0:
         whole, t = 0, -lag
-    a, b = (tick - whole) % ring, (tick - whole + 1) % ring
+    a = now - whole if now >= whole else now - whole + len(values)
+    b = a + 1 if a + 1 < len(values) else 0
     v, d = values[a, c], slopes[a, c]
     bend = 0.0
     if whole > 0:
@@ -305,11 +305,11 @@ def run(
         sense(y, k[0], spool, heat, joints, bench, channels, period, values[ring], slopes[ring])
         for c in range(len(channels)):
             h = channels[c]
-            true = filtered(delayed(tick, c, h.lag / period, values, slopes), h, period)
+            true = filtered(delayed(ring, c, h.lag / period, values, slopes), h, period)
             if h.seen > 0:
                 source = h.seen - 1
                 lag = channels[source].lag / period
-                true += seen(delayed(tick, source, lag, values, slopes), h, period)
+                true += seen(delayed(ring, source, lag, values, slopes), h, period)
             read = h.gain * true + h.offset + h.noise * noise[row, c]
             code = min(max(np.rint((read - h.low) * h.scale), 0.0), h.top)
             measured[row, c] = int(code)

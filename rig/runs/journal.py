@@ -53,7 +53,7 @@ CREATE TABLE mark (
 
 
 JOURNAL_FILES: Final = ("", "-wal", "-shm", "-tail")  # behind the journal's name
-TAIL_BLOCKS: Final = 16  # moved into the database at once
+TAIL_BLOCKS: Final = 32  # moved into the database at once
 TAIL_BYTES: Final = 1 << 16
 _ENTRY = struct.Struct("<4sII")  # begin, length of the body, its checksum
 _ENTRY_BEGIN = b"BLK1"

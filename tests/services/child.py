@@ -125,7 +125,7 @@ def prepare(mode: str, number: int) -> dict[str, Any]:
 
 def run(mode: str, number: int) -> int:
     """Take two records of 0.3 s (longer for a limit) and what is around them."""
-    blocks = {"serve": number, "file limit": 300, "disk full": 300}.get(mode, 30)
+    blocks = {"serve": number, "file limit": 400, "disk full": 400}.get(mode, 30)
     driver = FakeDriver(RIG, log=RUN.with_suffix(".device"), **prepare(mode, number))
     publisher = Publisher(RIG.name) if mode == "serve" else None
     ack = os.open(RUN.with_suffix(".ack"), os.O_WRONLY | os.O_CREAT)
