@@ -54,7 +54,7 @@ def summarise(folder: Path) -> RunSummary:
     counted = _UNKNOWN
     try:
         counted = _count(folder)
-    except (InputError, sqlite3.Error) as error:
+    except (InputError, OSError, sqlite3.Error) as error:
         message = f"{message}; {error}".removeprefix("; ")
     total = counted.samples + counted.lost_samples + counted.outside
     known = counted.samples >= 0
@@ -101,7 +101,7 @@ def _count(folder: Path) -> Written:
 
 
 def _count_journal(path: Path) -> Written:
-    """Count the contents of a journal, even one being written; raises sqlite3.Error."""
+    """Count the contents of a journal, even one being written; raises sqlite3.Error or OSError."""
     uri = f"{path.absolute().as_uri()}?mode=ro"
     with closing(sqlite3.connect(uri, uri=True, timeout=5.0)) as db:
         blocks = db.execute("SELECT stream, tick, samples, id FROM block").fetchall()
