@@ -1,8 +1,8 @@
 """Effects on the pressures at the valves' ports: supply sag, return pressure.
 
 Both depend on the total flow of all valves. The rows compute that flow from the chambers'
-continuity, A s' + V p' / b with the rig's nominal b, or a usual one where the rig states none (the
-correction of a correction); the simulation solves the orifices for it.
+continuity, A s' + V p' / b, with the b that an identification without these effects gives; the
+simulation solves the orifices for it.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
 LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in the line
 # Of the pump's flow: the steepest line searched loses all of the pressure at this flow.
 LEAST_FLOW: Final = 0.05
+BULK: Final = "b"  # the parameter's name
 BULK_MODULUS: Final = 1e9  # [Pa] with hoses and some air (Jelali and Kroll 2003, section 2.3)
 WHOLE: Final = 0.5  # of the pump's flow: records that reach it need no remark on the drop there
 NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
@@ -73,8 +74,11 @@ class PortEffect(Effect):
 
 
 def bulk_modulus(rig: Rig) -> float:
-    """Return the rig's nominal bulk modulus [Pa], or a usual one of oil in hoses."""
-    return rig.nominal.get("b", BULK_MODULUS)
+    """Return the rig's nominal bulk modulus [Pa], or a usual one of oil in hoses.
+
+    `analysis.identify.port_flows` sets the nominal one to the identified one.
+    """
+    return rig.nominal.get(BULK, BULK_MODULUS)
 
 
 def line_drop(name: str, rig: Rig, shares: tuple[float, ...]) -> Shape:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, ordered
 from analysis.effects.payload import Payload
 from analysis.identify import checks as ck
+from analysis.identify.coupled import coupled
 from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
 from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.identify.geometry import wider
-from analysis.identify.identify import identify
+from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import Identification, by_geometry
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.simulation.model import Model
@@ -116,19 +117,27 @@ def trace(
     )
     stated = iter(with_loads_stated([*runs, *holdout, *judge]))
     train, unseen, judging = (tuple(next(stated) for _ in x) for x in (runs, holdout, judge))
+    train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
+    with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(train, unseen, judging, tuple(families))
-    result = _traced(rig, records, options, progress or _no_progress)
+    result = _of_rig(rig, _traced(with_b, records, options, progress or _no_progress))
     load = None
     if result.verdict == UNEXPLAINED and MECHANICAL in families and options.may_be_load:
-        load = undeclared_load(rig, known, train, unseen, judging)
+        load = undeclared_load(with_b, known, train, unseen, judging)
     if load is None:
         return result
     records = TraceRuns(load.train, load.holdout, load.judge, records.families)
-    again = _traced(rig, records, options, _no_progress)
+    again = _of_rig(rig, _traced(with_b, records, options, _no_progress))
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
         seconds = time.perf_counter() - started
         return replace(again, notes=(load.words, *again.notes), seconds=seconds)
     return replace(result, notes=(*result.notes, load.words)) if load.resists else result
+
+
+def _of_rig(rig: Rig, result: Trace) -> Trace:
+    """Return a trace whose models are of the rig as stated in its file."""
+    before, after = (replace(m, rig=rig) for m in (result.model_before, result.model_after))
+    return replace(result, model_before=before, model_after=after)
 
 
 @dataclass(frozen=True)
@@ -427,7 +436,7 @@ def _identified(
     def filtering(record: Record) -> Filtering:
         return replace(default_filtering(record), in_motion=in_motion, lines=lines)
 
-    return identify(runs, terms=own, filtering=filtering, estimator=ESTIMATOR)
+    return coupled(runs, own, filtering, estimator=ESTIMATOR)
 
 
 def _with_tolerances(effect: JudgedEffect, from_tolerances: Mapping[str, float]) -> JudgedEffect:

@@ -6,6 +6,7 @@ The bench is `foreign_bench`, none of whose forms is the catalogue's.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from analysis.effects.mechanics import BaseInclination, JointSpring
+from analysis.identify.identify import identify
 from analysis.simulation.model import load_model, save_model
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
@@ -304,3 +306,20 @@ def test_a_supply_that_sags_in_proportion_to_the_flow_is_named(rig: Rig, drop: f
     result = traced(rig, Hidden(sag=drop))
     assert result.verdict == "explained"
     assert [(e.name, e.where) for e in result.effects] == [("supply_sag", "bench")]
+
+
+def test_a_sag_is_named_and_identified_whatever_b_the_rig_file_states(rig: Rig) -> None:
+    """The flow drawn fills compressible oil too, with the b that the records show."""
+    train, held_out = pair_of_runs(rig, Hidden(sag=2e6))
+    nominal = {**rig.nominal, "b": 0.25 * rig.nominal["b"]}
+    wrong = rig.model_copy(update={"nominal": nominal})
+    result = trace([replace(train, rig=wrong)], [replace(held_out, rig=wrong)], look_ahead=False)
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["supply_sag"]
+    assert result.model_after.rig.nominal == nominal
+    own, stated = (
+        identify([run], terms=result.model_after.terms).estimates["b"].value
+        for run in (train, replace(train, rig=wrong))
+    )
+    assert stated == pytest.approx(own, rel=1e-9)
+    assert stated == pytest.approx(TRUTH["b"], rel=0.02)
