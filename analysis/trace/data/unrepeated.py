@@ -31,10 +31,14 @@ def unrepeated_notes(data: RegressionData) -> list[str]:
 
 
 def unrepeated_floors(data: RegressionData) -> dict[str, Floor]:
-    """Return the floor with the largest ratio to the stated noise, of each equation to be noted."""
+    """Return the floor with the largest ratio to the stated noise, of each equation to be noted.
+
+    Floors of steps whose rows are left out do not count.
+    """
+    there = {(s.group, s.equation) for s in data.segments}
     loudest: dict[str, Floor] = {}
     for floor in data.floors:
-        measured = floor.source in (REPEATS, PERIODS)
+        measured = floor.source in (REPEATS, PERIODS) and (floor.group, floor.equation) in there
         if measured and floor.noise > DATA.unrepeated_ratio * floor.stated:
             best = loudest.get(floor.equation)
             if best is None or floor.noise / floor.stated > best.noise / best.stated:

@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.options import JsonOption
 from rig.cli.text.output import progress, write_json
+from rig.model.parse import InputError
 from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersOption
 
 if TYPE_CHECKING:
@@ -50,8 +51,13 @@ def foreign(
     )
     from tests.studies.pool import Kept, performed
 
+    crashed: list[str] = []
+
     def report(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
-        line = f"seed {job.seed}: {found}" if isinstance(found, Exception) else line_of(found)
+        line = line_of(found) if isinstance(found, Outcome) else f"seed {job.seed}: {found}"
+        if isinstance(found, Exception) and not isinstance(found, (InputError, RuntimeError)):
+            line = f"seed {job.seed}: {type(found).__name__} {found}"
+            crashed.append(line)
         progress(f"{done}/{of} {line}")
 
     kept = Kept(keep, _name, asdict, loaded) if keep else None
@@ -66,6 +72,8 @@ def foreign(
     typer.echo(text(outcomes))
     if better:
         typer.echo(weakened(found))
+    if crashed:
+        raise RuntimeError(f"the trace failed on {len(crashed)} benches: {'; '.join(crashed)}")
 
 
 def _name(job: Job) -> str:

@@ -46,6 +46,10 @@ class Answer:
     loudness: float
     seconds: float
 
+    def differs(self, other: Answer) -> bool:
+        """Return whether verdict or names differ, in whatever order the names are."""
+        return (self.verdict, set(self.named)) != (other.verdict, set(other.named))
+
 
 class Kept:
     """Results of slow functions by their arguments, kept for one bench."""

@@ -42,7 +42,7 @@ def ablations(
             progress(f"{done}/{of} seed {job}: no records ({found})")
             return
         base = next(a for a in found if a.rule == ALL)
-        others = [a for a in found if (a.verdict, a.named) != (base.verdict, base.named)]
+        others = [a for a in found if a.differs(base)]
         seconds = sum(a.seconds for a in found)
         progress(
             f"{done}/{of} seed {job} {base.label}: {base.answer}; {len(others)} rules change it, "
