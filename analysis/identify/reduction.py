@@ -31,6 +31,7 @@ from analysis.signals.locks import moving_joints
 from analysis.signals.settings import SIGNALS
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model import channels as ch
+from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
 from rig.runs.stream import open_record
@@ -269,12 +270,20 @@ def solve_reductions(
     reductions: Sequence[RecordReduction],
     reject_noise: bool = True,
 ) -> dict[str, Solution]:
-    """Solve each family once from the triangles of all records."""
+    """Solve each family once from the triangles of all records.
+
+    Raises InputError where no record has rows of a family.
+    """
     out = {}
     for family in FAMILIES:
         names = parameters_of(rig, terms, family)
         if names:
             clusters, noise = clusters_of(reductions, family), noise_of(reductions, family)
+            if not clusters:
+                raise InputError(
+                    f"no rows of the {family} equations remain: the records are too short for the "
+                    "filters, or all their samples are masked; take longer records"
+                )
             linear = solve(names, clusters, noise, reject_noise)
             out[family] = reduced(rig, terms, linear, clusters, noise, reject_noise)
     return out
