@@ -7,6 +7,7 @@ The files of a damaged journal are not changed. Lost samples are: the gaps betwe
 
 from __future__ import annotations
 
+import itertools
 import logging
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -150,7 +151,7 @@ def rebuild(path: Path, rig: Rig, what: str) -> tuple[Journal, Salvage]:
         kept_marks += marks(raw)
         for row in block_rows(raw):
             _keep(made, _as_block(row.values, rig), row.number, places)
-    for values in (*_rows_by_number(path), *_tail_rows(path)):
+    for values in itertools.chain(_rows_by_number(path), _tail_rows(path)):
         _keep(made, _as_block(values, rig), int(values[0]), places)
     chosen = best_marks(kept_marks)
     for mark in chosen:
