@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from analysis.effects.supply import PortEffect
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
 from analysis.identify.estimation import refuse_unknown
 from analysis.identify.geometry import tolerances_ignored
 from analysis.identify.methods import SearchOptions, identify_by
-from analysis.identify.port_flows import depends_on_port_flows, with_identified_bulk_modulus
+from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering
@@ -56,7 +57,7 @@ def identify(
     if method != "coupled":
         result = identify_by(method, runs, used, filtering, reject_noise, rng, search)
         return result if result.geometry is not None else _with_exact_geometry(rig, result)
-    if depends_on_port_flows(used):
+    if any(isinstance(u.term, PortEffect) for u in used):
         (runs,) = with_identified_bulk_modulus(runs, used)
     result = coupled(runs, used, filtering, reject_noise, estimator, bootstrap, rng, progress)
     return replace(result, model=replace(result.model, rig=rig))

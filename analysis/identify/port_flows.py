@@ -15,11 +15,6 @@ from analysis.terms.base import Used
 from rig.model.records import Run
 
 
-def depends_on_port_flows(terms: Sequence[Used]) -> bool:
-    """Return whether a term's rows need the flow from the supply or to the tank."""
-    return any(isinstance(used.term, PortEffect) for used in terms)
-
-
 def with_identified_bulk_modulus(
     runs: Sequence[Run], terms: Sequence[Used], *more: Sequence[Run]
 ) -> tuple[tuple[Run, ...], ...]:
@@ -30,7 +25,7 @@ def with_identified_bulk_modulus(
     """
     every = (tuple(runs), *map(tuple, more))
     rig = runs[0].rig
-    own = tuple(used for used in terms if not depends_on_port_flows([used]))
+    own = tuple(used for used in terms if not isinstance(used.term, PortEffect))
     if not any(c.parameter == BULK for used in own for c in used.term.parameters(rig)):
         return every
     b = coupled(runs, own, estimator="ls").estimates.get(BULK)

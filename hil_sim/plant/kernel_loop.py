@@ -258,7 +258,7 @@ def output(law: Any, waves: Any, tick: int, s: float, joint: Any) -> int:
 def hold_waves(tick: int, time: float, period: float, joints: Any, laws: Any) -> None:
     """Set each joint's periodic torque to its value `time` [s] after a tick.
 
-    Held over a step at its middle: the step is short beside any such wave.
+    It is constant over an integration step, which is short compared with the wave's period.
     """
     for i in range(len(joints)):
         if joints[i].wave_torque > 0.0:

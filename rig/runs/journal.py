@@ -146,7 +146,7 @@ class JournalTail:
         return True
 
     def clear(self) -> None:
-        """Write the next row in place of the first; the numbers of older rows are then too low."""
+        """Begin at the first place again; `read_tail` leaves out older rows by their numbers."""
         self._end = 0
 
     def close(self) -> None:
