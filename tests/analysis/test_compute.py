@@ -143,11 +143,12 @@ def test_a_study_on_a_cluster_goes_on_when_a_job_fails(scheduler: str, tmp_path:
     told: list[object] = []
     kept = Kept(tmp_path, lambda job: f"{job}.json", lambda root: root, lambda job, root: root)
     for again in (False, True):
-        found = performed(
-            [4.0, -1.0, 9.0], math.sqrt, scheduler, lambda *words: told.append(words[2:]), kept,
-            left_out=(ValueError,),
-        )  # fmt: skip
-        assert list(found) == [(4.0, 2.0), (9.0, 3.0)]
+        jobs = performed(
+            [4.0, -1.0, 9.0], math.sqrt, scheduler, lambda *words: told.append(words[2:]), kept
+        )
+        assert [next(jobs), next(jobs)] == [(4.0, 2.0), (9.0, 3.0)]
+        with pytest.raises(RuntimeError, match=r"1 of \d jobs failed:\n-1.0: ValueError: "):
+            next(jobs)  # an error that no bad input explains is not passed over
         # What was found is not done again; what failed is tried anew.
         assert [job for job, _ in told] == ([-1.0] if again else [4.0, -1.0, 9.0])
         assert isinstance(dict(told)[-1.0], ValueError)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from analysis.workers.cluster import DaskCluster
 from rig.model.parse import InputError
@@ -18,7 +18,7 @@ from rig.model.parse import InputError
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Workers = int | str  # processes of this machine, or tcp://HOST:PORT of a Dask scheduler
-Errors = tuple[type[Exception], ...]
+NO_RESULT: Final = (InputError, RuntimeError)  # e.g. a simulated plant that leaves its limits
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,12 @@ def performed(
     workers: Workers,
     report: Callable[[int, int, Job, Result | Exception], None],
     kept: Kept[Job, Result] | None = None,
-    left_out: Errors = (InputError, RuntimeError),
 ) -> Iterator[tuple[Job, Result]]:
     """Perform jobs on `workers`; returns each with its result, in the order they end.
 
     What was kept comes first and is not done again. `report` receives how many jobs of how many
-    are done, the job, and its result or the error of the kinds `left_out` that leaves it out;
-    others are raised.
+    are done, the job, and its result or its error. A job with an error of `NO_RESULT` is left out;
+    any other error is a defect: the remaining jobs are done, then RuntimeError lists such errors.
     """
     if kept is not None:
         kept.folder.mkdir(parents=True, exist_ok=True)
@@ -65,22 +64,27 @@ def performed(
             yield job, kept.read(job)
         else:
             left.append(job)
-    for done, (job, found) in enumerate(_results(left, perform, workers, left_out), start=1):
+    defects = []
+    for done, (job, found) in enumerate(_results(left, perform, workers), start=1):
         report(done, len(left), job, found)
         if isinstance(found, Exception):
+            if not isinstance(found, NO_RESULT):
+                defects.append(f"{job}: {type(found).__name__}: {found}")
             continue
         if kept is not None:
             kept.write(job, found)
         yield job, found
+    if defects:
+        raise RuntimeError(f"{len(defects)} of {len(left)} jobs failed:\n" + "\n".join(defects))
 
 
 def _results(
-    work: Sequence[Job], perform: Callable[[Job], Result], workers: Workers, left_out: Errors
+    work: Sequence[Job], perform: Callable[[Job], Result], workers: Workers
 ) -> Iterator[tuple[Job, Result | Exception]]:
-    """Yield jobs with what they gave or, of the kinds `left_out`, raised."""
+    """Yield jobs with what they returned or raised."""
     if isinstance(workers, str):
         with DaskCluster(workers) as pool:
-            yield from zip(work, pool.map(_Caught(perform, left_out), work), strict=True)
+            yield from zip(work, pool.map(_Caught(perform), work), strict=True)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
@@ -90,7 +94,7 @@ def _results(
                 found: Result | Exception = future.result()
             except BrokenExecutor:  # a RuntimeError, but of the machine and not of this job
                 raise
-            except left_out as error:
+            except Exception as error:  # the other jobs go on
                 found = error
             yield waiting[future], found
 
@@ -100,12 +104,11 @@ class _Caught(Generic[Job, Result]):
     """A job's work that gives back its error instead of raising it: on a cluster it ends no map."""
 
     perform: Callable[[Job], Result]
-    kinds: Errors
 
     def __call__(self, job: Job) -> Result | Exception:
         try:
             return self.perform(job)
-        except self.kinds as error:
+        except Exception as error:  # the other jobs go on
             return error
 
 

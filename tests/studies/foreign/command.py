@@ -9,7 +9,6 @@ import typer
 
 from rig.cli.options import JsonOption
 from rig.cli.text.output import progress, write_json
-from rig.model.parse import InputError
 from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersOption
 
 if TYPE_CHECKING:
@@ -51,13 +50,8 @@ def foreign(
     )
     from tests.studies.pool import Kept, performed
 
-    crashed: list[str] = []
-
     def report(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
         line = line_of(found) if isinstance(found, Outcome) else f"seed {job.seed}: {found}"
-        if isinstance(found, Exception) and not isinstance(found, (InputError, RuntimeError)):
-            line = f"seed {job.seed}: {type(found).__name__} {found}"
-            crashed.append(line)
         progress(f"{done}/{of} {line}")
 
     kept = Kept(keep, _name, asdict, loaded) if keep else None
@@ -66,14 +60,12 @@ def foreign(
         for k in range(count)
         for how in ("", *(BETTER if better else ()))
     ]
-    found = dict(performed(work, perform, cluster or workers, report, kept, left_out=(Exception,)))
+    found = dict(performed(work, perform, cluster or workers, report, kept))
     outcomes = [found[job] for job in work if job in found]
     write_json(json, [asdict(o) for o in outcomes])
     typer.echo(text(outcomes))
     if better:
         typer.echo(weakened(found))
-    if crashed:
-        raise RuntimeError(f"the trace failed on {len(crashed)} benches: {'; '.join(crashed)}")
 
 
 def _name(job: Job) -> str:
@@ -103,7 +95,7 @@ def intervals(
 
     kept = Kept(keep, lambda j: f"{j[0]} {j[1]}.json", asdict, loaded) if keep else None
     work = [(seed + stride * k, estimator) for k in range(count)]
-    done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
+    done = performed(work, perform, cluster or workers, report, kept)
     outcomes = sorted((o for _, o in done), key=lambda o: o.seed)
     write_json(json, [asdict(o) for o in outcomes])
     typer.echo(text(outcomes))

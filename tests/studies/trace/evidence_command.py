@@ -51,7 +51,7 @@ def ablations(
 
     kept = Kept(keep, lambda job: f"{job}.json", as_json, loaded) if keep else None
     work = [seed + 2 * k for k in range(count)]
-    done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
+    done = performed(work, perform, cluster or workers, report, kept)
     found = dict(sorted(done, key=lambda pair: pair[0]))
     write_json(json, {str(k): as_json(v) for k, v in found.items()})
     _show("Answers of the trace without each of its rules", sections(found, _command(
@@ -99,7 +99,7 @@ def baselines(
 
     kept = Kept(keep, lambda job: f"{job}.json", as_json, loaded) if keep else None
     work = [seed + 2 * k for k in range(count)]
-    done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
+    done = performed(work, perform, cluster or workers, report, kept)
     found = dict(sorted(done, key=lambda pair: pair[0]))
     write_json(json, {str(k): as_json(v) for k, v in found.items()})
     _show("The trace compared with two plain methods", sections(found, _command(

@@ -143,7 +143,7 @@ def all_of(
             say(f"{done}/{of} {line_of(found)}")
 
     kept = Kept(folder, name_of, asdict, _outcome) if folder else None
-    done = performed(work, perform, workers, report, kept, left_out=(Exception,))
+    done = performed(work, perform, workers, report, kept)
     return (outcome for _, outcome in done)
 
 
