@@ -20,7 +20,7 @@ from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import UnseenRows, set_aside
 from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.unrepeated import unrepeated_floors
-from analysis.trace.free_forms import explained_by_free_form, mechanism_count
+from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
 from analysis.trace.judge.unlocked import Line, judged_line
 from analysis.trace.judgement import Judgement, has_tied_rival
@@ -384,7 +384,7 @@ def _try_free_forms(
     hypotheses, winner = found.hypotheses, found.winner
     explained = found.verdict != UNEXPLAINED
     to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
-    if explained and (mechanism_count(winner) < 2 or to_noise):
+    if explained and (len(winner.laws) < 2 or to_noise):
         return None
     return explained_by_free_form(hypotheses, free, winner, holdout_data, rng, explained)
 

@@ -14,7 +14,7 @@ from analysis.trace.judge.curves import rows_within_curves
 from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.remaining import remainders
 from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
-from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis import Hypothesis, law_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 
@@ -62,14 +62,11 @@ def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -
     out: list[Hypothesis] = []
     for start in _sets_to_extend(wide, winner, fewer):
         for single in wide.extensions(start, free=True):
-            # A curve beside a name of its mechanism would be a form of that name's error. One that
-            # removes too little would be dropped beside a further effect.
-            beside_its_name = mechanism_count(single) == mechanism_count(start)
-            if beside_its_name or wide.removes_too_little(start, single):
+            if wide.removes_too_little(start, single):  # a further effect would make it needless
                 continue
             enough = wide.within_form_tolerance(single)
             hypothesis = single if enough else _with_further_effect(wide, single)
-            simpler = mechanism_count(hypothesis) < mechanism_count(winner)
+            simpler = len(hypothesis.laws) < len(winner.laws)
             less = simpler and hypothesis.total < SEARCH.free_form_ratio * winner.total
             explains = wide.within_form_tolerance(hypothesis)
             if explains and not wide.physical_problem(hypothesis) and (less or not fewer):
@@ -93,11 +90,6 @@ def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothe
     return wide.extended_in(hypothesis, loud) or hypothesis
 
 
-def mechanism_count(hypothesis: Hypothesis) -> int:
-    """Return the number of mechanisms in a set of effects; one at two places counts twice."""
-    return len({(u.term.mechanism, u.term.where) for u in hypothesis.effects})  # type: ignore[attr-defined]
-
-
 def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
     """Return the sets that a free form may join: the winner, and it without one mechanism.
 
@@ -105,10 +97,8 @@ def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> lis
     """
     if fewer:
         return [wide.empty]
-    out = {winner.keys: winner}
-    for used in winner.effects:
-        same = (used.term.mechanism, used.term.where)  # type: ignore[attr-defined]
-        kept = [u for u in winner.effects if (u.term.mechanism, u.term.where) != same]  # type: ignore[attr-defined]
-        start = wide.refined(kept) if kept else wide.empty
-        out[start.keys] = start
-    return list(out.values())
+    out = [winner]
+    for law in dict.fromkeys(map(law_of, winner.effects)):
+        kept = [u for u in winner.effects if law_of(u) != law]
+        out.append(wide.refined(kept) if kept else wide.empty)
+    return list({o.keys: o for o in out}.values())

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.refinement import ExactFit
@@ -36,9 +37,20 @@ class Hypothesis:
         return frozenset((u.term.name, u.term.where) for u in self.effects)
 
     @property
+    def laws(self) -> frozenset[Key]:
+        """Mechanisms and places of its effects; names of one mechanism at one place are one law."""
+        return frozenset(map(law_of, self.effects))
+
+    @property
     def total(self) -> float:
         """Energy above noise of all equations, each counted as at least zero."""
         return sum(max(0.0, e) for e in self.excess_energy.values())
+
+
+def law_of(used: Used) -> Key:
+    """Return the mechanism and the place of an effect."""
+    assert isinstance(used.term, Effect)
+    return used.term.mechanism, used.term.where
 
 
 @dataclass(frozen=True)

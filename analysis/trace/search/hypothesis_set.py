@@ -30,6 +30,7 @@ from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
     energy_above_noise,
+    law_of,
     noise_band,
     parameter_values,
     within_band,
@@ -290,12 +291,17 @@ class HypothesisSet:
     ) -> list[Hypothesis]:
         """Return the best sets with one more effect, found on data with the set in their model.
 
-        `equations` restricts the search to their rows, `free` to free mechanisms.
+        `equations` restricts the search to their rows, `free` to free mechanisms. A free mechanism
+        is not added to a set that names it at the same place: its curve would be that name's form
+        error.
         """
         data = rebased(self.train_data, now.fit)
-        taken = now.keys
-        tried = self._variants(data, now.fit.residual)
-        tried = [v for v in tried if v.key not in taken and (v.effect.free or not free)]
+        tried = [
+            v
+            for v in self._variants(data, now.fit.residual)
+            if v.key not in now.keys
+            and (law_of(v.used) not in now.laws if v.effect.free else not free)
+        ]
         columns = variant_columns(data, tried)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
