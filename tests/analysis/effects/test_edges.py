@@ -55,3 +55,15 @@ def test_a_shape_without_a_corner_is_that_of_clearance(
     names = [c.parameter for c in effect.coefficients(rig)]
     values = dict.fromkeys(names, 1.0)
     assert np.array_equal(effect.pack(rig, values, plain), effect.pack(rig, values, [*plain, 0.0]))
+
+
+@pytest.mark.parametrize(("rounding", "c", "closes"), [(0.0, 0.0, True), (0.008, 2.0, True),
+                                                       (0.02, 10.0, False)])  # fmt: skip
+def test_edges_that_do_not_close_are_no_dead_band(
+    rig: Rig, rounding: float, c: float, closes: bool
+) -> None:
+    # With the rounding as wide as the overlap the valve has half its gain there, and no band.
+    problem = ValveDeadband("joint 2").problem(rig, {}, (0.02, 0.02, rounding, c))
+    assert (not problem) == closes
+    if not closes:
+        assert problem.startswith("the edges do not close: the gain at the null is 4")

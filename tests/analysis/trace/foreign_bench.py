@@ -37,8 +37,8 @@ TANH, SIGMOID, KARNOPP = range(3)
 (
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
-    STIFFER, BACK_POWER, SPRING_REST,
-) = range(24)  # fmt: skip
+    STIFFER, BACK_POWER, SPRING_REST, KNEE,
+) = range(25)  # fmt: skip
 MIDDLE = -1.44  # [rad] where springs are at rest
 
 
@@ -57,7 +57,8 @@ class Hidden:
     begins with the record, its sine raised to `hum_power`; `leak_root` [m^3/(s Pa^0.5)]; `taper`
     [1/V]: an opening of x + taper x |x|; `play` [V] of the spool behind its sensor, half of it
     either way; `back` [Pa] is the return's pressure at the pump's flow, which rises with the flow
-    to the `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure.
+    to the `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure;
+    within `knee` [V] of the null the edges have half their gain.
     """
 
     ahead: float = 0.0
@@ -84,6 +85,7 @@ class Hidden:
     stiffer: float = 0.0
     back_power: float = 1.0
     spring_rest: float = MIDDLE
+    knee: float = 0.0
 
     @property
     def array(self) -> Array:
@@ -144,10 +146,11 @@ def _root(x):
 
 @njit(cache=True)
 def _opening(u, held, hidden):
-    """Opening behind play (half of it either way) and taper."""
+    """Opening behind play (half of it either way), by taper and knee."""
     half = 0.5 * hidden[PLAY]
     x = min(max(held, u - half), u + half) if half > 0.0 else u
-    return x + hidden[TAPER] * x * abs(x), x
+    slow = min(max(x, -hidden[KNEE]), hidden[KNEE])
+    return x - 0.5 * slow + hidden[TAPER] * x * abs(x), x
 
 
 @njit(cache=True)
