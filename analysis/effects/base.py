@@ -327,8 +327,8 @@ NO_KERNEL: Kernel = _nothing  # of effects that do not act on the plant
 def open_shapes(rig: Rig, used: Used) -> bool:
     """Return whether a term is an effect that needs a shape and has none.
 
-    A contact's presliding distance is optional: without one the friction is dry.
+    A contact's presliding distance and details of a form are optional.
     """
     if len(used.shape) or not isinstance(used.term, Effect):
         return False
-    return any(not s.resolution for s in used.term.shapes(rig))
+    return any(not (s.resolution or s.detail) for s in used.term.shapes(rig))

@@ -1,18 +1,24 @@
-"""Laminar leakage past the piston and out of the chambers.
+"""Leakage past the piston and out of the chambers, over the pressure difference dp across it.
 
-Flow in proportion to the pressure across a narrow gap (Merritt 1967, chapter 3; Jelali and Kroll
-2003): Q = c dp.
+Through a narrow gap the flow is in proportion to dp, through an opening with sharp edges to its
+root (Merritt 1967, chapter 3; Jelali and Kroll 2003). With an exponent n between the two
+
+    Q = c dp (|dp| / p_r)^(n - 1),  p_r = 1 MPa,
+
+so that c is the flow over dp at 1 MPa. n is a detail of the form: without it the leak is laminar,
+Q = c dp. Below 1 kPa the slope of an exponent is kept finite.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
+from numba import njit
 
-from analysis.effects.base import Array, Effect, beyond
+from analysis.effects.base import Array, Effect, Shape, beyond
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -29,7 +35,11 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-UNIT = "m^3/(s*Pa)"
+UNIT: Final = "m^3/(s*Pa)"
+EXPONENT_BOUNDS: Final = (0.4, 1.0)  # 0.5 of a sharp edge, 1 of a narrow gap
+EXPONENT_START: Final = 0.7  # where a search begins
+REFERENCE: Final = 1e6  # [Pa] where c is the flow over dp whatever the exponent
+FINITE: Final = 1e3  # [Pa] below it the flow is in proportion to dp
 
 
 @dataclass(frozen=True)
@@ -41,16 +51,59 @@ class _Leakage(Effect):
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
+    @property
+    def _mark(self) -> str:
+        """The end of its parameters' names, such as `internal_1`."""
+        raise NotImplementedError
+
+    @property
+    def _parameter(self) -> str:
+        return f"c_{self._mark}"
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return c [m^3/(s Pa)]."""
+        return (Coefficient(self._parameter, UNIT, "fluid"),)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the exponent."""
+        return (f"exponent_{self._mark}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the exponent n [-]."""
+        name = f"exponent_{self._mark}"
+        return (Shape(name, "", *EXPONENT_BOUNDS, (EXPONENT_START,), detail=True),)
+
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a leak that pumps, and one of more than half the pump at full pressure."""
-        limit = 0.5 * rig.supply.flow / rig.supply.pressure
-        name = self.coefficients(rig)[0].parameter
-        return beyond(name, values[name], UNIT, limit)
+        most = float(flow_form(rig.supply.pressure, exponent(shape)))
+        return beyond(self._parameter, values[self._parameter], UNIT, 0.5 * rig.supply.flow / most)
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the exponent and where c holds, of a leak that is not laminar."""
+        if not len(shape):
+            return ""
+        return (
+            f"the flow goes with the pressure difference to the power of {shape[0]:.2g}; "
+            f"{self._parameter} is the flow over the pressure difference at 1 MPa"
+        )
+
+
+def exponent(shape: Sequence[float]) -> float:
+    """Return the exponent of a leak's shape, 1 of a shape without it."""
+    return float(shape[0]) if len(shape) else 1.0
+
+
+@njit(cache=True)
+def flow_form(drop, n):  # type: ignore[no-untyped-def]
+    """Return dp (|dp| / p_r)^(n - 1) [Pa] of pressure differences dp [Pa] (see the module)."""
+    if n == 1.0:
+        return drop
+    return drop * ((drop * drop + FINITE**2) / REFERENCE**2) ** (0.5 * (n - 1.0))
 
 
 @dataclass(frozen=True)
 class InternalLeakage(_Leakage):
-    """Q = c (p_cap - p_rod) past the piston, out of the cap side and into the rod side.
+    """Leak over dp = p_cap - p_rod past the piston, out of the cap side and into the rod side.
 
     Without it the bulk modulus is biased: 2e-12 m^3/(s Pa) make b of the seed bench 9 to 16 % too
     large.
@@ -74,19 +127,19 @@ class InternalLeakage(_Leakage):
         """The compiled contribution."""
         return _internal
 
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return c [m^3/(s Pa)]."""
-        return (Coefficient(f"c_internal_{self.joint + 1}", UNIT, "fluid"),)
+    @property
+    def _mark(self) -> str:
+        return f"internal_{self.joint + 1}"
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return -(p_cap - p_rod) for the cap side, the opposite for the rod side."""
-        i, name = self.joint, f"c_internal_{self.joint + 1}"
-        across = signals.p_cap[:, i] - signals.p_rod[:, i]
-        return {equation("flow_cap", i): {name: -across}, equation("flow_rod", i): {name: across}}
+        """Return the flow per unit c, out of the cap side and into the rod side."""
+        i, name = self.joint, self._parameter
+        flow = flow_form(signals.p_cap[:, i] - signals.p_rod[:, i], exponent(shape))
+        return {equation("flow_cap", i): {name: -flow}, equation("flow_rod", i): {name: flow}}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, c."""
-        return np.array([self.joint, values[f"c_internal_{self.joint + 1}"]])
+        """Return joint, c, n."""
+        return np.array([self.joint, values[self._parameter], exponent(shape)])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return p_cap - p_rod [Pa]."""
@@ -96,7 +149,7 @@ class InternalLeakage(_Leakage):
 
 @dataclass(frozen=True)
 class ExternalLeakage(_Leakage):
-    """Q = c (p - p_tank) out of one chamber, or of both with one c where `where` names none."""
+    """Leak over dp = p - p_tank out of one chamber, or of both with one c if `where` names none."""
 
     name: ClassVar[str] = "external_leakage"
     element: ClassVar[str] = "chamber"
@@ -128,27 +181,24 @@ class ExternalLeakage(_Leakage):
         return (self.side,) if self.side else ("cap", "rod")
 
     @property
-    def _parameter(self) -> str:
-        return f"c_external_{self.joint + 1}" + (f"_{self.side}" if self.side else "")
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return c [m^3/(s Pa)]."""
-        return (Coefficient(self._parameter, UNIT, "fluid"),)
+    def _mark(self) -> str:
+        return f"external_{self.joint + 1}" + (f"_{self.side}" if self.side else "")
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return -(p - p_tank) for each leaking chamber."""
-        pressures = {"cap": signals.p_cap, "rod": signals.p_rod}
+        """Return the flow per unit c out of each leaking chamber."""
+        pressures, n = {"cap": signals.p_cap, "rod": signals.p_rod}, exponent(shape)
         return {
             equation(f"flow_{side}", self.joint): {
-                self._parameter: signals.p_tank - pressures[side][:, self.joint]
+                self._parameter: flow_form(signals.p_tank - pressures[side][:, self.joint], n)
             }
             for side in self._chambers
         }
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, c of the cap side, c of the rod side."""
+        """Return joint, c of the cap side, c of the rod side, n."""
         c = values[self._parameter]
-        return np.array([self.joint, *(c * (side in self._chambers) for side in ("cap", "rod"))])
+        leaks = (c * (side in self._chambers) for side in ("cap", "rod"))
+        return np.array([self.joint, *leaks, exponent(shape)])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return each leaking chamber's pressure [Pa]."""
@@ -163,7 +213,7 @@ class ExternalLeakage(_Leakage):
 def _internal(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        flow = par[1] * (x[P_CAP, i] - x[P_ROD, i])
+        flow = par[1] * flow_form(x[P_CAP, i] - x[P_ROD, i], par[2])
         out[FLOW_CAP, i] -= flow
         out[FLOW_ROD, i] += flow
 
@@ -172,8 +222,8 @@ def _internal(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
 def _external(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        out[FLOW_CAP, i] -= par[1] * (x[P_CAP, i] - bench[P_TANK])
-        out[FLOW_ROD, i] -= par[2] * (x[P_ROD, i] - bench[P_TANK])
+        out[FLOW_CAP, i] -= par[1] * flow_form(x[P_CAP, i] - bench[P_TANK], par[3])
+        out[FLOW_ROD, i] -= par[2] * flow_form(x[P_ROD, i] - bench[P_TANK], par[3])
 
 
 TERMS = (InternalLeakage, ExternalLeakage)

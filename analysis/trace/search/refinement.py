@@ -228,7 +228,7 @@ def _with_term(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ..
 
 def _with_details(rig: Rig, used: Used) -> Used:
     """Return a term with the details of its form at the values where their search starts."""
-    if not isinstance(used.term, Effect) or not len(used.shape):
+    if not isinstance(used.term, Effect):
         return used
     return Used(used.term, used.term.in_detail(rig, used.shape))
 

@@ -38,7 +38,9 @@ CONTRACT = {
 
 
 # Forms of edge, line and seal, no sizes.
-DETAILS = ("return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition")
+DETAILS = (
+    "return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition", "exponent",
+)  # fmt: skip
 
 
 def effects(rig: Rig) -> list[Effect]:

@@ -248,14 +248,24 @@ def test_a_tapered_metering_edge_is_a_curve_over_the_spool(rig: Rig) -> None:
 
 
 @pytest.mark.slow
-def test_a_leak_by_the_root_of_the_pressure_is_a_curve_and_not_two_names(rig: Rig) -> None:
+def test_edges_with_half_their_gain_about_the_null_are_no_dead_band(rig: Rig) -> None:
+    result = traced(rig, Hidden(knee=0.02))
+    assert result.verdict == "explained"
+    assert [(e.name, e.free) for e in result.effects] == [("metering_curve", True)]
+
+
+def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -> None:
     result = traced(rig, Hidden(leak_root=5e-9))
     assert result.verdict == "explained"
-    assert [(e.name, e.free) for e in result.effects] == [("leakage_curve", True)]
-    (line,) = result.effects[0].curves
-    wide = line.x > 0.2 * line.x[-1]
-    assert line.y[wide] == pytest.approx(5e-9 * np.sqrt(line.x[wide]), rel=0.05)
-    assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.02)
+    (leak,) = result.effects
+    assert (leak.name, leak.where) == ("internal_leakage", "joint 2")
+    # 5e-9 sqrt(dp) m^3/s are 5e-12 m^3/(s Pa) at 1 MPa.
+    size, power = leak.parameters["c_internal_2"], leak.parameters["exponent_internal_2"]
+    assert power.value == pytest.approx(0.5, abs=0.03)
+    assert size.value == pytest.approx(5e-12, rel=0.03)
+    assert any("to the power of 0.5" in note for note in result.notes)
+    assert max(result.after[e] / result.noise_floor[e] for e in result.after) < 1.15
+    assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,7 @@ def _play(rng: np.random.Generator, i: int) -> Wrong:
 
 
 def _leak(rng: np.random.Generator) -> tuple[str, int, float]:
+    """Draw a leak's form in words and number, and its flow over the pressure [SI] at 1 MPa."""
     form = int(rng.integers(2))
     return ("laminar", "turbulent")[form], form, _size(rng, 2e-13, 4e-12)
 
@@ -198,7 +199,7 @@ def _internal(rng: np.random.Generator, i: int) -> Wrong:
     word, form, c = _leak(rng)
     return Wrong("internal_leakage", f"joint {i + 1}", f"{c:.2g} {word}",
                  joint=(i, {"internal": c, "internal_form": form}),
-                 sizes={} if form else {"c_internal": c}, curve=DRAWN[form])  # fmt: skip
+                 sizes={"c_internal": c}, curve=DRAWN[form])  # fmt: skip
 
 
 def _external(rng: np.random.Generator, i: int) -> Wrong:
@@ -206,7 +207,7 @@ def _external(rng: np.random.Generator, i: int) -> Wrong:
     side = ("cap", "rod")[int(rng.integers(2))]
     return Wrong("external_leakage", f"joint {i + 1} {side}", f"{c:.2g} {word}",
                  joint=(i, {f"{side}_leak": c, "external_form": form}),
-                 sizes={} if form else {"": c}, curve=DRAWN[form])  # fmt: skip
+                 sizes={"": c}, curve=DRAWN[form])  # fmt: skip
 
 
 def _sag(rng: np.random.Generator, i: int) -> Wrong:

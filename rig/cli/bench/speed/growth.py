@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
+from analysis.effects.base import Effect
 from analysis.identify.identify import identify
 from analysis.simulation.simulate import compiled, simulate
-from analysis.terms import BASELINE, known, with_effects
+from analysis.terms import known, with_effects
 from analysis.terms.base import Used
 from rig.cli.bench.analysis import bench_run
 from rig.cli.bench.figure import Figure
@@ -60,19 +61,22 @@ def _joints() -> Iterator[tuple[str, Callable[[], Any]]]:
         )
 
 
-def _linear_effects() -> list[str]:
-    """Return the names of the joint effects without shape parameters, in catalogue order."""
+def _linear_effects(rig: Rig) -> list[str]:
+    """Return the names of the joint effects that need no shape parameters, in catalogue order."""
+    joint_effects = {
+        name: kind("joint 1")
+        for name, kind in known().items()
+        if issubclass(kind, Effect) and kind.per_joint
+    }
     return sorted(
-        name
-        for name, term in known().items()
-        if term.per_joint and name not in BASELINE and not term("joint 1").shape_names()
+        name for name, effect in joint_effects.items() if all(s.detail for s in effect.shapes(rig))
     )
 
 
 def _candidates(rig: Rig) -> Iterator[tuple[str, Callable[[], Any]]]:
     run = bench_run(rig, repeats=2)
     for count in range(0, CANDIDATES + 1, 2):
-        used = [Used(term) for term in with_effects(rig, _linear_effects()[:count])]
+        used = [Used(term) for term in with_effects(rig, _linear_effects(rig)[:count])]
         yield (
             f"identify, 6 records, {count} effects of every joint beside the model",
             lambda u=used: identify([run], terms=u),  # type: ignore[misc]
