@@ -120,29 +120,28 @@ def _pair(
 ) -> dict[str, Any]:  # fmt: skip
     unit = unit_of_equation(rig, equation)
     noise = result.noise_floor[equation]
-    model = result.model_after
-    changed = model is not result.model_before
-    x = trace_plots.abscissae(rig, here, effect, variable, equation, model)
+    x = trace_plots.abscissae(rig, here, effect, variable, equation, result.model_after)
     label = variable
     if effect is None:
         label = f"{variable} [{trace_plots.unit_of_variable(rig, variable)}]"
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
-        "against": trace_plots.against(x, here, noise, unit, label, f"{key}x", changed),
-        "time": trace_plots.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
+        "against": trace_plots.against(x, here, noise, unit, label, f"{key}x", result.changed),
+        "time": trace_plots.in_time(longest, noise, unit, f"{key}t", result.changed)
+        if timed
+        else None,
         "record": longest.conditioned.record.name,
     }
 
 
 def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
     """Return the lines of the largest residuals: figures and captions."""
-    changed = result.model_after is not result.model_before
     return [
         {
             "text": lines.text,
             "figure": trace_plots.spectrum(
-                lines, unit_of_equation(rig, lines.equation), f"l{k}", changed
+                lines, unit_of_equation(rig, lines.equation), f"l{k}", result.changed
             ),
         }
         for k, lines in enumerate(largest_residual_lines(result.lines))
@@ -186,7 +185,7 @@ def _effect(effect: JudgedEffect, key: str) -> dict[str, Any]:
 
 
 def _parameters(result: Trace) -> list[tuple[str, ...]]:
-    if result.verdict == CLEAN or result.model_after is result.model_before:
+    if result.verdict == CLEAN or not result.changed:
         return []
     after = result.model_after.parameters
     out: list[tuple[str, ...]] = []

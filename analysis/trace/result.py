@@ -255,6 +255,11 @@ class Trace:
     detection_limits: tuple[DetectionLimit, ...] = ()
 
     @property
+    def changed(self) -> bool:
+        """Whether the model after has other terms than the model before."""
+        return self.model_after.terms != self.model_before.terms
+
+    @property
     def tied_at(self) -> list[tuple[str, str]]:
         """Name and catalogue place (with sensor or chamber) of the rivals of `tied`."""
         return sorted({(r.name, r.at or r.where) for e in self.effects for r in e.rivals if r.tied})

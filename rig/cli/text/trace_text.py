@@ -55,7 +55,7 @@ def trace_text(result: Trace) -> str:
             ),
             "",
         ]
-    changed = _changed(result)
+    changed = _changed(result) if result.changed else []
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
     lines += [
@@ -100,7 +100,7 @@ def _changed(result: Trace) -> list[list[str]]:
     after = result.model_after.parameters
     out = []
     for name, estimate in result.model_before.parameters.items():
-        if result.model_after is result.model_before or name not in after:
+        if name not in after:
             continue
         change = 100 * (after[name].value / estimate.value - 1) if estimate.value else math.nan
         values = (_number(p.value, 4) for p in (estimate, after[name]))

@@ -69,6 +69,7 @@ def test_drag_by_the_square_of_the_speed_is_read_off(quiet: tuple[Run, Run]) -> 
 
 def test_it_is_told_as_a_clue_and_no_name(sprung: Trace) -> None:
     assert sprung.effects == ()
+    assert "parameter  " not in trace_text(sprung)  # nothing changed: no table of changes
     assert "2e+07 piston_2³" in sprung.sentence
     assert "a clue, not a named effect" in trace_text(sprung)
     (told,) = to_json(sprung)["unexplained"]["formulas"]
