@@ -68,14 +68,14 @@ class SignalCache:
 
 
 class RowCache:
-    """The caches of one set of records: `rows`, `signals`, `parts` of rows.
+    """The caches of one set of records: `rows`, `signals`, `parts` of rows, `fits` of models.
 
     `families` holds the families of rows that each term acts on.
     """
 
     def __init__(self) -> None:
         self.rows, self.signals = Cache(DATA.cached_row_bytes), Cache(DATA.cached_signal_bytes)
-        self.parts = SignalCache()
+        self.parts, self.fits = SignalCache(), Cache(DATA.cached_row_bytes)
         self.families: dict[Term, frozenset[str]] = {}
 
 

@@ -9,6 +9,7 @@ number of repeats: noise then adds 1 per row to a residual's energy, whatever un
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +23,7 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import Used
+from analysis.terms.base import Used, family_of
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
@@ -77,13 +78,22 @@ class RegressionData:
     rows: tuple[Mapping[str, Rows], ...]
     cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
-    @property
+    @functools.cached_property
     def mean_residual(self) -> Array:
         """The averaged residual (M,) over its own noise, that of one record over root repeats."""
         weights = np.zeros(self.residual.shape[1])
         for segment in self.segments:
             weights[segment.where] = np.sqrt(segment.repeats)
         return np.asarray(np.nanmean(self.residual, axis=0) * weights)
+
+    @functools.cached_property
+    def family_rows(self) -> dict[str, NDArray[np.int64]]:
+        """The numbers of each family's rows, in the order of the segments."""
+        parts: dict[str, list[NDArray[np.int64]]] = {}
+        for s in self.segments:
+            rows = np.arange(s.where.start, s.where.stop)
+            parts.setdefault(family_of(s.equation), []).append(rows)
+        return {family: np.concatenate(rows) for family, rows in parts.items()}
 
     @property
     def row_counts(self) -> Counter[str]:

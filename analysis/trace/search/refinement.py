@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,8 @@ from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.regression.rows import in_common
-from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import shared_rows
+from analysis.terms.base import Used, family_of
+from analysis.trace.data.conditioned_record import families_of, shared_rows
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import SEARCH, TRACE
@@ -83,52 +84,117 @@ def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     removes a residual by moving signals to where the equations do not hold (but see
     `DesignMatrix.residual`).
     """
-    built = [shared_rows(data.rig, terms, record, data.cache) for record in data.records]
-    names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
-    M = data.base.shape[0]
-    X, y = np.zeros((M, len(names))), data.mean_residual.copy()
-    index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
+    names = coefficient_names(data.rig, terms)
+    X, y = np.zeros((data.base.shape[0], len(names))), data.mean_residual.copy()
+    cavitating: list[tuple[Indices, Indices]] = []
+    for family, rows in data.family_rows.items():
+        own = _family_design(data, family, _acting(data, family, terms))
+        columns = np.array([names.index(n) for n in own.names], dtype=np.int64)
+        X[np.ix_(rows, columns)] = own.matrix
+        y[rows] = own.rhs
+        cavitating += [(rows[others], rows[outside]) for others, outside in own.cavitating]
+    return DesignMatrix(names, X, y, tuple(cavitating))
+
+
+def coefficient_names(rig: Rig, terms: Sequence[Used], family: str = "") -> tuple[str, ...]:
+    """Return the coefficients of terms, each once, in the terms' order; of one family if given."""
+    every = (c for u in terms for c in u.term.coefficients(rig))
+    return tuple(dict.fromkeys(c.parameter for c in every if not family or c.family == family))
+
+
+def _acting(data: RegressionData, family: str, terms: Sequence[Used]) -> tuple[Used, ...]:
+    """Return the terms that have columns in a family's rows or change their signals."""
+    known = data.cache.families
+    for u in terms:
+        if u.term not in known:
+            known[u.term] = families_of(data.rig, u.term)
+    return tuple(u for u in terms if family in known[u.term])
+
+
+def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> DesignMatrix:
+    """Return `design_matrix` of one family's rows (`RegressionData.family_rows`) and terms."""
+    names = coefficient_names(data.rig, terms, family)
+    built = {
+        record.group: (
+            rows,
+            shared_rows(data.rig, terms, replace(record, families=(family,)), data.cache),
+        )
+        for record, rows in zip(data.records, data.rows, strict=True)
+    }
+    own_rows = data.family_rows[family]
+    X, y = np.zeros((len(own_rows), len(names))), data.mean_residual[own_rows]
     kept: dict[str, list[Indices]] = {}
+    every: dict[str, list[Indices]] = {}
+    start = 0
     for segment in data.segments:
-        k = index[segment.group]
-        rows, before = built[k][segment.equation], data.rows[k][segment.equation]
+        if family_of(segment.equation) != family:
+            continue
+        before, rows = (side[segment.equation] for side in built[segment.group])
         here, there = in_common(before, rows)
         size = np.linalg.norm(before.rhs[here]) / max(
             float(np.linalg.norm(rows.rhs[there])), 1e-300
         )
         weight = np.sqrt(segment.repeats) / segment.noise * size
-        at = segment.where.start + here
-        columns = [names.index(n) for n in rows.names]
+        at = start + here
+        columns = np.array([names.index(n) for n in rows.names], dtype=np.int64)
         X[np.ix_(at, columns)] = rows.matrix[there] * weight
         y[at] = rows.rhs[there] * weight
         kept.setdefault(segment.equation, []).append(at)
-    return DesignMatrix(names, X, y, _cavitating(data, kept))
+        every.setdefault(segment.equation, []).append(start + np.arange(len(before.rhs)))
+        start += len(before.rhs)
+    return DesignMatrix(names, X, y, _cavitating(kept, every))
 
 
 def _cavitating(
-    data: RegressionData, kept: Mapping[str, Sequence[Indices]]
+    kept: Mapping[str, Sequence[Indices]], every: Mapping[str, Sequence[Indices]]
 ) -> tuple[tuple[Indices, Indices], ...]:
-    """Return the rows `kept` by a model and those it masks, of each equation with masked rows."""
+    """Return the rows `kept` by a model and the others of all, of equations that have others."""
     out = []
     for equation, parts in kept.items():
-        own = [s.where for s in data.segments if s.equation == equation]
-        if sum(map(len, parts)) == sum(where.stop - where.start for where in own):
-            continue  # nearly always
-        here = np.concatenate(parts)
-        every = np.concatenate([np.arange(where.start, where.stop) for where in own])
-        out.append((here, np.setdiff1d(every, here)))
+        if sum(map(len, parts)) < sum(map(len, every[equation])):  # seldom
+            here = np.concatenate(parts)
+            out.append((here, np.setdiff1d(np.concatenate(every[equation]), here)))
     return tuple(out)
 
 
-def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
-    """Return the least-squares fit of a model's coefficients, with its shapes as given."""
-    rows = design_matrix(data, terms)
+@dataclass(frozen=True)
+class _FamilyFit:
+    """Coefficients `values` (k,), residual (m,) and information (k, k) of one family's rows."""
+
+    names: tuple[str, ...]
+    values: Array
+    residual: Array
+    information: Array
+
+
+def _family_fit(data: RegressionData, family: str, terms: Sequence[Used]) -> _FamilyFit:
+    rows = _family_design(data, family, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(rows.matrix / scale)
-    value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
-    beta = dict(zip(rows.names, value, strict=True))
-    return ExactFit(tuple(terms), beta, rows.residual(beta), (R * scale).T @ (R * scale))
+    values = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
+    residual = rows.residual(dict(zip(rows.names, values, strict=True)))
+    return _FamilyFit(rows.names, values, residual, (R * scale).T @ (R * scale))
+
+
+def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
+    """Return the least-squares fit of a model's coefficients, with its shapes as given.
+
+    No coefficient is shared between families of rows, so that each family is fitted by itself, and
+    one in which no shape acts is not fitted again.
+    """
+    names = coefficient_names(data.rig, terms)
+    values, information = np.zeros(len(names)), np.zeros((len(names), len(names)))
+    residual = np.zeros(data.base.shape[0])
+    for family, rows in data.family_rows.items():
+        acting = _acting(data, family, terms)
+        own: _FamilyFit = data.cache.fits.get(
+            (family, data.terms, acting), partial(_family_fit, data, family, acting)
+        )
+        at = [names.index(n) for n in own.names]
+        values[at], residual[rows] = own.values, own.residual
+        information[np.ix_(at, at)] = own.information
+    return ExactFit(tuple(terms), dict(zip(names, values, strict=True)), residual, information)
 
 
 def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
