@@ -24,7 +24,10 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 DRIVING: Final = 0.1  # of the larger slope that the other may be below zero: its uncertainty
-DIFFERENCE: Final = 0.1  # of the mean slope: with a smaller difference they count as equal
+# Of the mean slope: beside dry friction, whose form has an error of its own in each direction,
+# slopes with a smaller difference count as equal.
+DIFFERENCE: Final = 0.1
+DRY: Final = ("Fc", "Fs", "F_ext_", "F_ret_", "k_friction_")  # its numbers, without the joint's
 
 
 @dataclass(frozen=True)
@@ -91,12 +94,13 @@ class AsymmetricViscousFriction(Effect):
         return np.array([self.joint, own[0], own[1] if len(own) == 2 else -own[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a direction that drives the joint, and directions that do not differ."""
+        """Reject a slope that drives the joint, and near-equal slopes beside dry friction."""
         slopes = self.slopes(rig, values)
         for way, slope in zip(("extending", "retracting"), slopes, strict=True):
             if slope < -DRIVING * max(slopes):
                 return f"a slope of {slope:.3g} N s/m {way} would drive the joint"
-        if abs(slopes[0] - slopes[1]) < DIFFERENCE * 0.5 * sum(slopes):
+        beside_dry = any(f"{name}{self.joint + 1}" in values for name in DRY)
+        if beside_dry and abs(slopes[0] - slopes[1]) < DIFFERENCE * 0.5 * sum(slopes):
             return "the slopes of the two directions differ by less than a tenth"
         return ""
 

@@ -145,6 +145,18 @@ def test_slopes_by_direction_are_asymmetric_viscous_friction(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
 
 
+def test_slopes_that_differ_little_are_named_where_no_dry_friction_is_beside_them(
+    rig: Rig,
+) -> None:
+    result = traced(rig, Hidden(drag_ahead=50.0), noise=0.3)
+    assert result.verdict == "explained"
+    (slopes,) = result.effects
+    assert slopes.name == "asymmetric_viscous_friction"
+    # The whole slope is about 600 N s/m: they differ by a twelfth.
+    ahead, astern = (slopes.parameters[name].value for name in ("c_ext_2", "c_ret_2"))
+    assert ahead - astern == pytest.approx(50.0, rel=0.05)
+
+
 @pytest.mark.parametrize("frequency", [3.14, pytest.param(7.3, marks=pytest.mark.slow)])
 def test_a_hum_that_begins_with_the_record_is_a_periodic_disturbance(
     rig: Rig, frequency: float
