@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib
 import pkgutil
@@ -36,8 +37,10 @@ def make(name: str, where: str = "bench") -> Term:
     try:
         return known()[name](where)
     except KeyError:
+        near = difflib.get_close_matches(name.replace(" ", "_"), known(), 1)
+        meant = f"did you mean {near[0]!r}? " if near else ""
         raise InputError(
-            f"unknown term {name!r}; this version knows: {' '.join(sorted(known()))}"
+            f"unknown term {name!r}; {meant}this version knows: {' '.join(sorted(known()))}"
         ) from None
 
 

@@ -76,7 +76,10 @@ def readable(path: Path) -> Iterator[None]:
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: not a readable records.h5: {error}") from error
+        raise InputError(
+            f"{path}: not a readable records.h5; take the file from a backup, or leave this run "
+            f"out ({error})"
+        ) from error
 
 
 def open_archive(path: Path) -> h5py.File:

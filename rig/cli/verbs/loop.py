@@ -32,7 +32,7 @@ def loop(
     ] = False,
     rounds: Annotated[int, typer.Option(min=0, help="Largest number of designed experiments.")] = 4,
     protocol: Annotated[
-        str, typer.Option(help="Repeats per step of the first run.")
+        str, typer.Option(help="Protocol of the first run: a shipped one or a file.")
     ] = "lock-and-excite-multisine",
     repeats: RepeatsOption = None,
     amplitude_scale: ScaleOption = 1.0,
