@@ -222,7 +222,18 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     effects = tuple(
         with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
     )
-    return _Fitted(winner, after, effects)
+    return _Fitted(winner, with_curve_values(after, effects), effects)
+
+
+def with_curve_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:
+    """Return the model with a value for each number of a free curve that it lacks.
+
+    The records determine the curve as a whole, even where one of its values is mostly noise;
+    without that value the model could not be simulated. It is the effect's, with its interval.
+    """
+    known = {n: e for f in effects if f.free for n, e in f.parameters.items()}
+    parameters = {n: e if e.identified else known.get(n, e) for n, e in model.parameters.items()}
+    return replace(model, parameters=parameters)
 
 
 def _traced(
