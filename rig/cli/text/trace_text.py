@@ -11,7 +11,7 @@ from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.text.output import table
 from rig.model.channels import place_in_words
-from rig.model.units import RESIDUALS, display_unit, plain
+from rig.model.units import RESIDUALS, display_unit, plain, typeset
 
 
 def trace_text(result: Trace) -> str:
@@ -33,7 +33,16 @@ def trace_text(result: Trace) -> str:
     ]  # fmt: skip
     lines += [
         table(
-            ["held-out error", "noise floor", "before", "after", "unit", "before", "after"], rows
+            [
+                "held-out error",
+                "noise floor",
+                "before",
+                "after",
+                "unit",
+                "relative before",
+                "after",
+            ],
+            rows,
         ),
         "",
     ]
@@ -57,7 +66,7 @@ def trace_text(result: Trace) -> str:
         ]
     changed = _changed(result) if result.changed else []
     if changed:
-        lines += [table(["parameter", "before", "after", "change"], changed), ""]
+        lines += [table(["parameter", "before", "after", "unit", "change"], changed), ""]
     lines += [
         f"spectral lines: {lines_of_equation.text}"
         for lines_of_equation in largest_residual_lines(result.lines)
@@ -104,12 +113,15 @@ def _changed(result: Trace) -> list[list[str]]:
             continue
         change = 100 * (after[name].value / estimate.value - 1) if estimate.value else math.nan
         values = (_number(p.value, 4) for p in (estimate, after[name]))
-        out.append([name, *values, _percent(change, "+")])
+        out.append([name, *values, typeset(estimate.unit), _percent(change, "+")])
     return out
 
 
 def _percent(value: float, sign: str = "") -> str:
-    return f"{value:{sign}.1f} %" if math.isfinite(value) else "—"
+    if not math.isfinite(value):
+        return "—"
+    shown = round(value, 1) + 0.0  # never -0.0
+    return f"{shown:{sign if shown else ''}.1f} %"
 
 
 def _free_run(result: Trace, channel: str) -> list[str]:
