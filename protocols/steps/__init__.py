@@ -36,7 +36,7 @@ else:
         Discriminator(
             _tag_of_step,
             custom_error_type="step_kind",
-            custom_error_message=f"no kind of step; expected one of the keys: {', '.join(STEPS)}",
+            custom_error_message=f"a key that names the kind of step ({', '.join(STEPS)})",
         ),
     ]
     for _kind in STEPS.values():

@@ -9,7 +9,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from difflib import get_close_matches
+from typing import Any, ClassVar, Final, Protocol
 
 from pydantic import Field
 
@@ -19,6 +20,7 @@ from protocols.steps.parts import Place
 from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
 from rig.model.rig import Rig
 
+MISSPELT: Final = 0.8  # similarity (difflib) from which an unknown key is a kind's, misspelt
 NAME = r"^[a-z0-9]+(?:_[a-z0-9]+)*$"
 
 
@@ -169,10 +171,16 @@ def by_rank(kind: type[StepKind]) -> tuple[int, str]:
 
 
 def choose_kind(data: Any, kinds: Mapping[str, type[StepKind]]) -> str | None:
-    """Return the key of the first kind whose key is in a step's data; None for no kind."""
+    """Return the key of the first kind whose key is in a step's data; None for no kind.
+
+    A misspelt key of a kind is none: the step's other keys would be read as those of another kind.
+    """
     if isinstance(data, StepKind):
         return data.key
     if not isinstance(data, dict):
+        return None
+    known = {name for kind in kinds.values() for name in kind.model_fields}
+    if any(get_close_matches(str(key), kinds, 1, MISSPELT) for key in data if key not in known):
         return None
     return next((key for key in kinds if key in data), None)
 

@@ -187,7 +187,9 @@ def problem_text(problem: ErrorDetails) -> str:
         text = f"text that matches {context['pattern']}"
     text = text.removeprefix("Input should be ")
     wanted = next((wanted for kind, wanted in WANTED.items() if problem["type"] in kind), text)
-    return f"expected {wanted}, found {shorten(repr(problem['input']), FOUND_AT_MOST)}"
+    value = problem["input"]
+    found = f"the keys {', '.join(map(str, value))}" if value and isinstance(value, dict) else ""
+    return f"expected {wanted}, found {shorten(found or repr(value), FOUND_AT_MOST)}"
 
 
 def parse_model(model: type[Model], text: str, source: str) -> Model:

@@ -223,7 +223,9 @@ def test_yes_and_no_of_yaml_are_answers() -> None:
         ("wait_until: __import__('os')\n    timeout: 1 s", "is no comparison"),
         ("wait_until: piston_9 > 1 mm\n    timeout: 1 s", "has no channel 'piston_9'"),
         ("wait_until: R13 > 1 kg*m^2\n    timeout: 1 s", "has no parameter 'R13'"),
-        ("jump: 3", "no kind of step; expected one of the keys: excite"),
+        ("jump: 3", "expected a key that names the kind of step (excite, hold,"),
+        # A misspelt kind is one mistake, though its other keys fit another kind.
+        ("name: s\n    exite: []\n    warm_up: 1", "found the keys name, exite, warm_up"),
         ("hold: 5 s\n    lock: [{joint: 1, at: end_min}]", "expected 'at: closed'"),
         ("prompt: x\n    timeout: 1 s\n    default: maybe", "'maybe' is none of: yes, no"),
         ("repeat_until: b.rsd < 1 %\n    at_most: 3\n    steps: []", "steps.0.steps"),
