@@ -19,6 +19,7 @@ from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.model.channels import place_in_words
 from rig.model.records import Run
 from rig.model.rig import Rig
+from rig.model.units import RESIDUALS, display_unit
 
 TEMPLATE = "trace.html"
 TITLES = {
@@ -58,28 +59,25 @@ def body(
         "effects": [_effect(e, f"d{k}") for k, e in enumerate(result.effects)],
         "refused": [_effect(e, f"n{k}") for k, e in enumerate(result.refused)],
         "parameters": _parameters(result),
-        "fits": [
-            (
-                name,
-                fm.fit(value),
-                fm.fit(result.fit_after.get(name)),
-                *(
-                    fm.significant(errors.get(name, math.nan))
-                    for errors in (
-                        result.rmse_before,
-                        result.rmse_after,
-                        result.window_before,
-                        result.window_after,
-                    )
-                ),
-                rig.unit_of(name),
-            )
-            for name, value in result.fit_before.items()
-        ],
+        "fits": [_free_run(result, channel) for channel in result.fit_before],
         "floors": result.floors,
         "spectra": _spectra(rig, result),
         "fm": fm,
     }
+
+
+def _free_run(result: Trace, channel: str) -> tuple[str, ...]:
+    """Return a channel's row: FIT and errors of the model before and after, and the unit."""
+    unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
+    errors = (
+        result.rmse_before, result.rmse_after, result.window_before, result.window_after,
+    )  # fmt: skip
+    return (
+        channel,
+        *(fm.fit(fit.get(channel)) for fit in (result.fit_before, result.fit_after)),
+        *(fm.significant(unit.scale * error.get(channel, math.nan)) for error in errors),
+        unit.text,
+    )
 
 
 def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:

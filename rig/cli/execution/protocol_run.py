@@ -134,7 +134,8 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     proof.report.require()
     for note in proof.report.notes:
         say(f"note: {note}")
-    say(f"running {len(plan.records)} records, about {plan.seconds:.0f} s of the device's time")
+    records = f"{len(plan.records)} record{'s' * (len(plan.records) != 1)}"
+    say(f"running {records}, about {plan.seconds:.0f} s of the device's time")
     recorder = Recorder(
         job.out,
         rig,

@@ -11,7 +11,7 @@ from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.text.output import table
 from rig.model.channels import place_in_words
-from rig.model.units import RESIDUALS, display_unit, plain, typeset
+from rig.model.units import RESIDUALS, RESULTS, display_unit, plain, typeset
 
 
 def trace_text(result: Trace) -> str:
@@ -112,8 +112,9 @@ def _changed(result: Trace) -> list[list[str]]:
         if name not in after:
             continue
         change = 100 * (after[name].value / estimate.value - 1) if estimate.value else math.nan
-        values = (_number(p.value, 4) for p in (estimate, after[name]))
-        out.append([name, *values, typeset(estimate.unit), _percent(change, "+")])
+        unit = display_unit(estimate.unit, RESULTS)
+        values = (_number(unit.scale * p.value, 4) for p in (estimate, after[name]))
+        out.append([name, *values, typeset(unit.text), _percent(change, "+")])
     return out
 
 
