@@ -42,7 +42,8 @@ from rig.model.rig import Rig
 
 ONLY_HELD_OUT_MISSED = (
     "the training records are met to within the noise, the held-out ones are not: train on "
-    "records with as much excitation as the held-out ones"
+    "records with as much excitation as the held-out ones; if these have it, the machine has "
+    "changed between the runs: train on records taken after the change"
 )
 
 
