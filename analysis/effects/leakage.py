@@ -80,17 +80,18 @@ class _Leakage(Effect):
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the exponent and where c holds, of a leak that is not laminar."""
-        if not len(shape):
+        n = exponent(shape)
+        if n == 1.0:
             return ""
         return (
-            f"the flow goes with the pressure difference to the power of {shape[0]:.2g}; "
+            f"the flow goes with the pressure difference to the power of {n:.2g}; "
             f"{self._parameter} is the flow over the pressure difference at 1 MPa"
         )
 
 
 def exponent(shape: Sequence[float]) -> float:
-    """Return the exponent of a leak's shape, 1 of a shape without it."""
-    return float(shape[0]) if len(shape) else 1.0
+    """Return the exponent of a leak's shape, 1 of a shape without it (none, or 0)."""
+    return float(shape[0]) if len(shape) and shape[0] else 1.0
 
 
 @njit(cache=True)
