@@ -32,11 +32,16 @@ class StopFlag:
             self.reason = reason
 
     def install(self) -> None:
-        """Install the handlers; does nothing outside Python's main thread, which alone can."""
+        """Install the handlers; does nothing outside Python's main thread, which alone can.
+
+        A signal that the previous handler has `heard`, and that ended nothing, is a request too.
+        """
         if threading.current_thread() is not threading.main_thread() or self._previous:
             return
         for number in _SIGNALS:
-            self._previous[number] = signal.signal(number, self._heard)
+            previous = self._previous[number] = signal.signal(number, self._heard)
+            if getattr(previous, "heard", False):
+                self.request(_REASONS[number])
 
     def restore(self) -> None:
         """Restore the previous signal handlers."""

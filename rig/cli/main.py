@@ -135,8 +135,19 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(name)
 
 
-def _as_ctrl_c(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+class Interruption:
+    """A signal's handler that raises KeyboardInterrupt, and keeps that it was called (`heard`).
+
+    A library that calls Python may swallow the exception; `rig.bench.stops` then still stops.
+    """
+
+    def __init__(self) -> None:
+        self.heard = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Raise KeyboardInterrupt."""
+        self.heard = True
+        raise KeyboardInterrupt
 
 
 def run(arguments: list[str] | None = None) -> None:
@@ -148,7 +159,9 @@ def run(arguments: list[str] | None = None) -> None:
     handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
     # Verbs then clean up as after Ctrl-C; while driving, a bench installs its own handlers.
-    signal.signal(signal.SIGTERM, _as_ctrl_c)
+    signal.signal(signal.SIGTERM, Interruption())
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
+        signal.signal(signal.SIGINT, Interruption())
     verb = next((word for word in _typed(words) if not word.startswith("-")), "")
 
     def work() -> int | None:

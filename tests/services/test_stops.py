@@ -1,0 +1,46 @@
+"""A signal stops a run even where a library has swallowed the exception that it raised."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from rig.bench.stops import StopFlag
+from rig.cli.main import Interruption
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Put this process's own handlers back afterwards."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, Interruption())
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [(signal.SIGINT, "stopped by operator (Ctrl-C)"), (signal.SIGTERM, "stopped by SIGTERM")],
+)
+def test_a_swallowed_signal_stops_the_bench_that_is_driven_next(
+    number: signal.Signals, reason: str
+) -> None:
+    with pytest.raises(KeyboardInterrupt):  # as a serialiser would that goes on after an error
+        signal.raise_signal(number)
+    flag = StopFlag()
+    flag.install()
+    assert flag.reason == reason
+    flag.restore()
+
+
+@pytest.mark.usefixtures("handlers")
+def test_without_a_signal_nothing_stops() -> None:
+    flag = StopFlag()
+    flag.install()
+    assert flag.reason is None
+    flag.restore()
