@@ -70,7 +70,7 @@ class _Leakage(Effect):
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the exponent n [-]."""
-        name = f"exponent_{self._mark}"
+        (name,) = self.shape_names()
         return (Shape(name, "", *EXPONENT_BOUNDS, (EXPONENT_START,), detail=True),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:

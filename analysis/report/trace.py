@@ -15,11 +15,10 @@ from analysis.report.plots import place_plot, trace_plots
 from analysis.trace.clues.frequency import FREQUENCY
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
-from analysis.trace.words import quantity, shot_in_words, unit_of_equation
+from analysis.trace.words import free_run_row, quantity, shot_in_words, unit_of_equation
 from rig.model.channels import place_in_words
 from rig.model.records import Run
 from rig.model.rig import Rig
-from rig.model.units import RESIDUALS, display_unit
 
 TEMPLATE = "trace.html"
 TITLES = {
@@ -67,17 +66,8 @@ def body(
 
 
 def _free_run(result: Trace, channel: str) -> tuple[str, ...]:
-    """Return a channel's row: FIT and errors of the model before and after, and the unit."""
-    unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
-    errors = (
-        result.rmse_before, result.rmse_after, result.window_before, result.window_after,
-    )  # fmt: skip
-    return (
-        channel,
-        *(fm.fit(fit.get(channel)) for fit in (result.fit_before, result.fit_after)),
-        *(fm.significant(unit.scale * error.get(channel, math.nan)) for error in errors),
-        unit.text,
-    )
+    fits, errors, unit = free_run_row(result, channel)
+    return channel, *map(fm.fit, fits), *map(fm.significant, errors), unit
 
 
 def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
@@ -117,7 +107,7 @@ def _pair(
     variable: str, equation: str, key: str, timed: bool,
 ) -> dict[str, Any]:  # fmt: skip
     unit = unit_of_equation(rig, equation)
-    noise = result.noise_floor[equation]
+    noise, changed = result.noise_floor[equation], result.changed
     x = trace_plots.abscissae(rig, here, effect, variable, equation, result.model_after)
     label = variable
     if effect is None:
@@ -125,10 +115,8 @@ def _pair(
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
-        "against": trace_plots.against(x, here, noise, unit, label, f"{key}x", result.changed),
-        "time": trace_plots.in_time(longest, noise, unit, f"{key}t", result.changed)
-        if timed
-        else None,
+        "against": trace_plots.against(x, here, noise, unit, label, f"{key}x", changed),
+        "time": trace_plots.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
         "record": longest.conditioned.record.name,
     }
 

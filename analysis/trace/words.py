@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from analysis.simulation.model import Estimate
@@ -10,7 +12,7 @@ from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Tr
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
-from rig.model.units import plain, typeset, with_interval
+from rig.model.units import RESIDUALS, display_unit, plain, typeset, with_interval
 
 UNITS = {"torque": "N·m", "flow_cap": "m³/s", "flow_rod": "m³/s"}
 
@@ -21,6 +23,19 @@ def unit_of_equation(rig: Rig, equation: str) -> str:
     if kind == "torque" and getattr(rig, "prismatic", False):
         return "N"
     return UNITS.get(kind, "")
+
+
+def free_run_row(result: Trace, channel: str) -> tuple[list[float], list[float], str]:
+    """Return a channel's FIT [%], its RMSE over records and over 0.25 s, and the unit of these.
+
+    Each is of the model before and after, NaN where it could not be simulated.
+    """
+    unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
+    errors = (
+        result.rmse_before, result.rmse_after, result.window_before, result.window_after,
+    )  # fmt: skip
+    fits = [fit.get(channel, math.nan) for fit in (result.fit_before, result.fit_after)]
+    return fits, [unit.scale * error.get(channel, math.nan) for error in errors], unit.text
 
 
 def sentence(result: Trace) -> str:

@@ -96,6 +96,18 @@ def families_of(rig: Rig, term: Term) -> frozenset[str]:
     return frozenset((*altered, *(c.family for c in term.coefficients(rig))))
 
 
+def acting_on(rig: Rig, terms: Iterable[Used], family: str, cache: RowCache) -> tuple[Used, ...]:
+    """Return the terms that have columns in a family's rows or change their signals."""
+    known = cache.families
+    out = []
+    for u in terms:
+        if u.term not in known:
+            known[u.term] = families_of(rig, u.term)
+        if family in known[u.term]:
+            out.append(u)
+    return tuple(out)
+
+
 def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.regression.rows.record_rows`)."""
     return record_rows(
@@ -148,13 +160,9 @@ def shared_rows(
     no signal are filtered separately and appended to the rows of the other terms.
     """
     here = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
-    families = cache.families
-    for u in here:
-        if u.term not in families:
-            families[u.term] = families_of(rig, u.term)
     out: dict[str, Rows] = {}
     for family in conditioned.families:
-        acting = [u for u in here if family in families[u.term]]
+        acting = acting_on(rig, here, family, cache)
         added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))

@@ -295,12 +295,11 @@ class HypothesisSet:
         is not added to a set that names it at the same place: its curve would be that name's form
         error.
         """
-        data = rebased(self.train_data, now.fit)
+        data, taken, laws = rebased(self.train_data, now.fit), now.keys, now.laws
         tried = [
             v
             for v in self._variants(data, now.fit.residual)
-            if v.key not in now.keys
-            and (law_of(v.used) not in now.laws if v.effect.free else not free)
+            if v.key not in taken and (law_of(v.used) not in laws if v.effect.free else not free)
         ]
         columns = variant_columns(data, tried)
         mask = np.ones(len(now.fit.residual))

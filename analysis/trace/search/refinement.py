@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shapes_of
-from analysis.regression.rows import in_common
+from analysis.regression.rows import in_common, parameters_of
 from analysis.terms.base import Used, family_of
-from analysis.trace.data.conditioned_record import families_of, shared_rows
+from analysis.trace.data.conditioned_record import acting_on, shared_rows
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import SEARCH, TRACE
@@ -84,11 +84,11 @@ def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     removes a residual by moving signals to where the equations do not hold (but see
     `DesignMatrix.residual`).
     """
-    names = coefficient_names(data.rig, terms)
-    X, y = np.zeros((data.base.shape[0], len(names))), data.mean_residual.copy()
+    names = _coefficient_names(data.rig, terms)
+    X, y = np.zeros((data.base.shape[0], len(names))), np.zeros(data.base.shape[0])
     cavitating: list[tuple[Indices, Indices]] = []
     for family, rows in data.family_rows.items():
-        own = _family_design(data, family, _acting(data, family, terms))
+        own = _family_design(data, family, acting_on(data.rig, terms, family, data.cache))
         columns = np.array([names.index(n) for n in own.names], dtype=np.int64)
         X[np.ix_(rows, columns)] = own.matrix
         y[rows] = own.rhs
@@ -96,24 +96,14 @@ def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     return DesignMatrix(names, X, y, tuple(cavitating))
 
 
-def coefficient_names(rig: Rig, terms: Sequence[Used], family: str = "") -> tuple[str, ...]:
-    """Return the coefficients of terms, each once, in the terms' order; of one family if given."""
-    every = (c for u in terms for c in u.term.coefficients(rig))
-    return tuple(dict.fromkeys(c.parameter for c in every if not family or c.family == family))
-
-
-def _acting(data: RegressionData, family: str, terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms that have columns in a family's rows or change their signals."""
-    known = data.cache.families
-    for u in terms:
-        if u.term not in known:
-            known[u.term] = families_of(data.rig, u.term)
-    return tuple(u for u in terms if family in known[u.term])
+def _coefficient_names(rig: Rig, terms: Sequence[Used]) -> tuple[str, ...]:
+    """Return the coefficients of terms, each once, in the terms' order."""
+    return tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(rig)))
 
 
 def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> DesignMatrix:
     """Return `design_matrix` of one family's rows (`RegressionData.family_rows`) and terms."""
-    names = coefficient_names(data.rig, terms, family)
+    names = parameters_of(data.rig, terms, family)
     built = {
         record.group: (
             rows,
@@ -183,11 +173,11 @@ def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     No coefficient is shared between families of rows, so that each family is fitted by itself, and
     one in which no shape acts is not fitted again.
     """
-    names = coefficient_names(data.rig, terms)
+    names = _coefficient_names(data.rig, terms)
     values, information = np.zeros(len(names)), np.zeros((len(names), len(names)))
     residual = np.zeros(data.base.shape[0])
     for family, rows in data.family_rows.items():
-        acting = _acting(data, family, terms)
+        acting = acting_on(data.rig, terms, family, data.cache)
         own: _FamilyFit = data.cache.fits.get(
             (family, data.terms, acting), partial(_family_fit, data, family, acting)
         )
@@ -212,7 +202,8 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
             continue
         fit = _in_best_form(data, fit, k, steps)
         used = fit.terms[k]
-        opened = _with_details(data.rig, used)
+        assert isinstance(used.term, Effect)
+        opened = Used(used.term, used.term.in_detail(data.rig, used.shape))
         asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
         # Half, since the linear prediction is less than what a detail removes.
         if opened == used or _predicted_gain(data, fit, used, opened) < 0.5 * asked:
@@ -290,13 +281,6 @@ def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Use
 def _with_term(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
     """Return the terms with `other` in place of `used`."""
     return tuple(other if u is used else u for u in terms)
-
-
-def _with_details(rig: Rig, used: Used) -> Used:
-    """Return a term with the details of its form at the values where their search starts."""
-    if not isinstance(used.term, Effect):
-        return used
-    return Used(used.term, used.term.in_detail(rig, used.shape))
 
 
 def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:

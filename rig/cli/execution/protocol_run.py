@@ -134,8 +134,10 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     proof.report.require()
     for note in proof.report.notes:
         say(f"note: {note}")
-    records = f"{len(plan.records)} record{'s' * (len(plan.records) != 1)}"
-    say(f"running {records}, about {plan.seconds:.0f} s of the device's time")
+    many = "" if len(plan.records) == 1 else "s"
+    say(
+        f"running {len(plan.records)} record{many}, about {plan.seconds:.0f} s of the device's time"
+    )
     recorder = Recorder(
         job.out,
         rig,

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.loop_rounds import Round
 from analysis.trace.result import JudgedEffect, Trace
-from analysis.trace.words import quantity, shot_in_words, unit_of_equation
+from analysis.trace.words import free_run_row, quantity, shot_in_words, unit_of_equation
 from rig.cli.text.output import table
 from rig.model.channels import place_in_words
-from rig.model.units import RESIDUALS, RESULTS, display_unit, plain, typeset
+from rig.model.units import RESULTS, display_unit, plain, typeset
 
 
 def trace_text(result: Trace) -> str:
@@ -126,17 +126,8 @@ def _percent(value: float, sign: str = "") -> str:
 
 
 def _free_run(result: Trace, channel: str) -> list[str]:
-    """Return a channel's row: FIT and errors of the model before and after, and the unit."""
-    unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
-    errors = (
-        result.rmse_before, result.rmse_after, result.window_before, result.window_after,
-    )  # fmt: skip
-    return [
-        channel,
-        *(_percent(fit.get(channel, math.nan)) for fit in (result.fit_before, result.fit_after)),
-        *(_number(unit.scale * error.get(channel, math.nan)) for error in errors),
-        unit.text,
-    ]
+    fits, errors, unit = free_run_row(result, channel)
+    return [channel, *map(_percent, fits), *map(_number, errors), unit]
 
 
 def _number(value: float, digits: int = 3) -> str:
