@@ -13,15 +13,18 @@ import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
+from threading import Thread
 
 import aiohttp
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from textual.app import App
 
 from rig.runs.listing.summary import summarise
 from rig.tui.web.access import NAMES, host_name, refusal
 from rig.tui.web.attached_screen import CLOSED
+from rig.tui.web.page_driver import PageDriver
 from tests.cli.bench import LONG, SHORT, bramah, simulated, started, wait_for
 from tests.tui.test_attached import sockets, start
 from tests.tui.web_page import OpenPage, WebServer, page_of, web_server
@@ -341,6 +344,34 @@ async def test_a_screen_that_hangs_outlives_neither_its_page_nor_a_killed_server
             for screen in hanging:
                 with suppress(ProcessLookupError):
                     os.kill(screen, signal.SIGKILL)
+
+
+@pytest.mark.timeout(PATIENCE)
+async def test_a_frame_never_splits_a_piece_of_a_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys, page = os.pipe(), os.pipe()
+    with (
+        open(keys[0], "rb") as stdin,
+        open(keys[1], "wb"),
+        open(page[0], "rb") as received,
+        open(page[1], "wb") as stdout,
+    ):
+        monkeypatch.setattr(sys, "__stdin__", stdin)
+        monkeypatch.setattr(sys, "__stdout__", stdout)
+        driver = PageDriver(App())
+        sent = [(b"P", b"report " * 9000, 30), (b"D", b"frame " * 700, 300)]
+
+        def write(kind: bytes, payload: bytes, count: int) -> None:
+            for _ in range(count):
+                driver._write(kind + len(payload).to_bytes(4, "big") + payload)
+
+        threads = [Thread(target=write, args=job, daemon=True) for job in sent]
+        for thread in threads:
+            thread.start()
+        payloads = {kind: payload for kind, payload, _ in sent}
+        for _ in range(sum(count for *_, count in sent)):
+            kind = received.read(1)
+            assert int.from_bytes(received.read(4), "big") == len(payloads[kind])
+            assert received.read(len(payloads[kind])) == payloads[kind]
 
 
 @pytest.mark.timeout(2 * PATIENCE)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from threading import Timer
+from functools import partial
+from threading import Lock, Timer
 from typing import Any, Final
 
 from textual import events, messages
@@ -20,6 +21,23 @@ GRACE: Final = 2.0  # time in which a screen that was asked to end does so by it
 
 class PageDriver(WebDriver):
     """Reads keys from its server and writes frames to it, over two pipes."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._writing = Lock()
+        self._write = partial(self._write_packet)  # in place of Textual's bare os.write
+
+    def _write_packet(self, packet: bytes) -> int:
+        """Write a whole packet before any other thread's.
+
+        The screen's loop writes frames, the thread of the keys writes pieces of reports; a pipe
+        keeps only writes of up to 4 kB in one piece.
+        """
+        with self._writing:
+            rest = memoryview(packet)
+            while rest:
+                rest = rest[os.write(self.fileno, rest) :]
+        return len(packet)
 
     def start_application_mode(self) -> None:
         """Start drawing on the page, with colours legible from two metres."""
