@@ -1,4 +1,4 @@
-"""Flows as free curves: metering edges over the spool, leakage, compressibility of the oil.
+"""Flows as free curves: metering edges over the spool, compressibility of the oil.
 
 Named effects are special cases of these curves.
 """
@@ -18,7 +18,6 @@ from analysis.effects.curve import (
     curve_at,
     knot_shapes,
     packed,
-    refuse_large,
     shown,
     spline,
     spread_knots,
@@ -49,9 +48,8 @@ from rig.model.rig import Rig
 
 OPENINGS: Final = 5  # knots of |u|, the first at the null; that and the last have no value
 SOFTENS: Final = 0.2  # of a bulk modulus curve's range that it may soften by: its uncertainty
-DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
 PRESSURES: Final = 4  # knots of the oil's pressure; the last has no value: it is 1/b
-BACKWARDS: Final = 0.05  # of its largest flow that an edge or a leak may reverse: uncertainty
+BACKWARDS: Final = 0.05  # of its largest flow that an edge may reverse: uncertainty
 EDGES: Final = ("pp", "pm", "mp", "mm")
 
 
@@ -163,112 +161,6 @@ class MeteringCurve(Effect):
         """Return the spool [V]."""
         u = signals.u[:, self.joint]
         return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
-
-
-@dataclass(frozen=True)
-class LeakageCurve(Effect):
-    """Q = f(|dp|) sign(dp): a leak over the pressure across it, f a curve with f(0) = 0.
-
-    Between the chambers, or out of one of them to the tank.
-    """
-
-    name: ClassVar[str] = "leakage_curve"
-    family: ClassVar[str] = "fluid"
-    mechanism: ClassVar[str] = "leakage_curve"
-    element: ClassVar[str] = "piston"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    hydraulic: ClassVar[bool] = True
-    variable: ClassVar[str] = "the pressure across the leak"
-    confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
-    separated_by: ClassVar[str] = (
-        "a load that drives the pressures far apart while the piston hardly moves"
-    )
-    per_joint: ClassVar[bool] = True
-    where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _leak
-
-    @classmethod
-    def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return each joint, between its chambers, then each of its chambers."""
-        return tuple(
-            f"{joint}{side}" for joint in super().all_places(rig) for side in ("", " cap", " rod")
-        )
-
-    @property
-    def _mark(self) -> str:
-        return f"{self.joint + 1}" + (f"_{self.side}" if self.side else "")
-
-    def across(self, signals: Signals) -> Array:
-        """Return the pressure across the leak (n,) [Pa]."""
-        cap, rod = signals.p_cap[:, self.joint], signals.p_rod[:, self.joint]
-        if not self.side:
-            return np.asarray(cap - rod)
-        return np.asarray((cap if self.side == "cap" else rod) - signals.p_tank)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the knots."""
-        return tuple(f"leak_{self._mark}_knot_{k}" for k in range(1, DROPS + 1))
-
-    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the knots [Pa]."""
-        return knot_shapes(self.shape_names(), "Pa", 0.0, rig.supply.pressure)
-
-    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return knots at quantiles of the pressure across the leak."""
-        drop = evidence.of_joint(self.joint, lambda x: np.abs(self.across(x)))
-        knots = spread_knots(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
-        return (tuple(map(float, knots)),) if len(knots) else ()
-
-    def _names(self) -> tuple[str, ...]:
-        return tuple(f"Q_leak_{self._mark}_{k}" for k in range(2, DROPS + 1))
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return the flows at the knots [m^3/s]."""
-        return tuple(Coefficient(name, "m^3/s", "fluid") for name in self._names())
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the curve's basis, out of the chamber that leaks and into the other."""
-        drop = self.across(signals)
-        basis = spline(self.shape_of(rig, shape), np.abs(drop))[:, 1:]
-        out = dict(zip(self._names(), (np.sign(drop) * basis.T), strict=True))
-        given = {name: -column for name, column in out.items()}
-        i = self.joint
-        if self.side:
-            return {equation(f"flow_{self.side}", i): given}
-        return {equation("flow_cap", i): given, equation("flow_rod", i): out}
-
-    def _values(self, values: Mapping[str, float]) -> Array:
-        return np.array([0.0, *(values[name] for name in self._names())])
-
-    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, side (0 for between the chambers, 1 cap, 2 rod), curve."""
-        side = ("", "cap", "rod").index(self.side)
-        curve = packed(self.shape_of(rig, shape), self._values(values))
-        return np.array([self.joint, side, *curve])
-
-    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
-        """Return the flow [m^3/s] over the pressure [Pa]."""
-        at = shown(shape)
-        weights = dict(zip(self._names(), spline(shape, at)[:, 1:].T, strict=True))
-        return (Branch("leakage over pressure", at, weights, "Pa", "m^3/s"),)
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a leak that pumps, and one of more than half the pump's flow."""
-        knots = self.shape_of(rig, shape)
-        flow = spline(knots, shown(knots)) @ self._values(values)
-        if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
-            return "the leak would pump"
-        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak")
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the pressure across the leak [Pa]."""
-        kinds = (f"flow_{self.side}",) if self.side else ("flow_cap", "flow_rod")
-        return {equation(kind, self.joint): self.across(signals) for kind in kinds}
 
 
 @dataclass(frozen=True)
@@ -385,25 +277,6 @@ def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    i = int(par[0])
-    side = int(par[1])
-    cap, rod = x[P_CAP, i], x[P_ROD, i]
-    drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
-    flow = curve_at(abs(drop), par, 2, 5)
-    flow = flow if drop > 0.0 else -flow
-    if side == 0:
-        out[FLOW_CAP, i] -= flow
-        out[FLOW_ROD, i] += flow
-    elif side == 1:
-        out[FLOW_CAP, i] -= flow
-    else:
-        out[FLOW_ROD, i] -= flow
-
-
-@kernel
 def _softness(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         for i in range(x.shape[1]):
@@ -411,4 +284,4 @@ def _softness(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
             out[COMP_ROD, i] += x[V_ROD, i] * curve_at(x[P_ROD, i], par, 0, 4)
 
 
-TERMS = (MeteringCurve, LeakageCurve, BulkModulusCurve)
+TERMS = (MeteringCurve, BulkModulusCurve)

@@ -43,6 +43,7 @@ from rig.model.rig import Rig
 
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
 PLACES: Final = 6  # knots of s
+GROWS: Final = 0.3  # of the friction at mid-stroke, at the end: where a search begins
 ALIKE: Final = 0.03  # of gravity that a curve of s cannot fit: below, the records have one pose
 DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its uncertainty
 # Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
@@ -53,10 +54,12 @@ LEVEL: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=np.f
 
 @dataclass(frozen=True)
 class FrictionCurve(Friction):
-    """F_f = z f(|s'|) + |z| g(|s'|): friction over speed, f shared by both directions.
+    """F_f = (1 + k x) (z f(|s'|) + |z| g(|s'|)): friction over speed, f shared by both directions.
 
     z is the contact's state (`contact`), f and g are curves (`curve`); g is the extra
     friction of extending. On an electric joint the slope of f over the records' speeds is Fv.
+    The growth k over the distance x from mid-stroke is a detail of the form: a bore or a seal that
+    is tighter towards one end.
     """
 
     name: ClassVar[str] = "friction_curve"
@@ -68,6 +71,7 @@ class FrictionCurve(Friction):
     confounders: ClassVar[tuple[str, ...]] = ("position_force",)
     separated_by: ClassVar[str] = "slow and fast motion about several places of the stroke"
     before: ClassVar[int] = SPEEDS
+    after: ClassVar[int] = 1
 
     @property
     def kernel(self) -> Kernel:
@@ -79,13 +83,47 @@ class FrictionCurve(Friction):
         return tuple(f"friction_{self.joint + 1}_knot_{k}" for k in range(1, SPEEDS + 1))
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name knots, presliding distance and transition speed."""
-        return (*self.knot_names(), *super().shape_names())
+        """Name knots, presliding distance, transition speed and growth."""
+        return (*self.knot_names(), *super().shape_names(), f"growth_{self.joint + 1}")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return knots [m/s], presliding distance [m] and transition speed [m/s]."""
+        """Return knots [m/s], presliding distance [m], transition speed [m/s] and growth [1/m]."""
         speed = rig.joints[self.joint].limits.speed
-        return (*knot_shapes(self.knot_names(), "m/s", 0.0, speed), *super().shapes(rig))
+        most = 1.0 / self._half(rig)  # the friction vanishes at one end of the stroke
+        growth = Shape(self.shape_names()[-1], "1/m", -most, most, (GROWS * most,), detail=True)
+        return (*knot_shapes(self.knot_names(), "m/s", 0.0, speed), *super().shapes(rig), growth)
+
+    def _half(self, rig: Rig) -> float:
+        """Return half of the stroke [m]."""
+        low, high = rig.joints[self.joint].position_range
+        return 0.5 * (high - low)
+
+    def _middle(self, rig: Rig) -> float:
+        """Return the middle of the stroke [m]."""
+        return 0.5 * float(sum(rig.joints[self.joint].position_range))
+
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape with a growth along the stroke."""
+        missing = self._speed_place() + 1 - len(shape)
+        return (
+            (*shape, *(0.0,) * missing, GROWS / self._half(rig)) if missing >= 0 else tuple(shape)
+        )
+
+    def _growth(self, shape: Sequence[float]) -> float:
+        """Return the growth [1/m] of a shape, 0 where it has none."""
+        return shape[-1] if len(shape) == len(self.shape_names()) else 0.0
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State between what shares of its value at mid-stroke the friction changes."""
+        growth = self._growth(shape)
+        if growth == 0.0 or not signals:
+            return ""
+        places = [f(x.s[:, self.joint]) for x in signals for f in (np.min, np.max)]
+        ends = sorted(1.0 + growth * (p - self._middle(rig)) for p in (min(places), max(places)))
+        return (
+            f"along the stroke of the records the friction is {ends[0]:.2f} to {ends[1]:.2f} times "
+            "that at mid-stroke, which the curve shows"
+        )
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the joint's speed, each with some presliding distances."""
@@ -111,7 +149,8 @@ class FrictionCurve(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G z and G |z| times the curves' bases."""
         i, given = self.joint, self.shape_of(rig, shape)
-        z = self.contact(rig, signals, given)
+        along = 1.0 + self._growth(given) * (signals.s[:, i] - self._middle(rig))
+        z = along * self.contact(rig, signals, given)
         basis = spline(given[:SPEEDS], np.abs(signals.sd[:, i]))
         shared, own = self._names(rig)
         odd = (signals.G[:, i] * z)[:, None] * (basis @ self._shared(rig))
@@ -119,14 +158,15 @@ class FrictionCurve(Friction):
         return self.row(dict(zip((*shared, *own), (*odd.T, *even.T), strict=True)))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, distance, transition speed, then the two curves."""
+        """Return joint, distance, transition speed, both curves, growth, middle of the stroke."""
         given = self.shape_of(rig, shape)
         shared, own = self._names(rig)
         f = self._shared(rig) @ np.array([values[name] for name in shared])
         g = np.array([values[name] for name in own])
         distance, _, speed = self.contact_of(given)
         knots = given[:SPEEDS]
-        return np.array([self.joint, distance, speed, *packed(knots, f), *packed(knots, g)])
+        along = self._growth(given), self._middle(rig)
+        return np.array([self.joint, distance, speed, *packed(knots, f), *packed(knots, g), *along])
 
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
         """Return friction [N] over speed [m/s], the joint's Fv at mid-stroke included."""
@@ -159,7 +199,7 @@ def _over_speed(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped
         v = x[SD, i]
         state, dz[0] = slide(v, z[0], par[1], 0.0, par[2])
         force = state * curve_at(abs(v), par, 3, 4) + abs(state) * curve_at(abs(v), par, 15, 4)
-        out[TORQUE, i] -= x[G, i] * force
+        out[TORQUE, i] -= x[G, i] * force * (1.0 + par[27] * (x[S, i] - par[28]))
 
 
 @dataclass(frozen=True)

@@ -209,7 +209,12 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         if opened == used or _predicted_gain(data, fit, used, opened) < 0.5 * asked:
             continue
         more = _with_searched_shapes(data, _with_term(fit.terms, used, opened), steps)
-        if fit.energy - more.energy > asked and _determines_shapes(data, more, more.terms[k]):
+        if fit.energy - more.energy <= asked:
+            continue
+        # With the details another form may fit better: a distance that stood for them is gone.
+        if not _determines_shapes(data, more, more.terms[k]):
+            more = _in_best_form(data, more, k, steps)
+        if _determines_shapes(data, more, more.terms[k]):
             fit = more
     return fit
 

@@ -156,7 +156,7 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))
         return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
     if e.family == "friction":
-        distance, *stiffening = shape[4:] if e.name == "friction_curve" else shape
+        distance, *stiffening = shape[4:5] if e.name == "friction_curve" else shape
         path = worked(s, signals.sd[:, e.joint], sum(stiffening))
         return np.asarray(distance * contact_state(path, distance))
     if e.name in ("spool_lag", "spool_hysteresis"):

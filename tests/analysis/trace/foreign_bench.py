@@ -37,8 +37,9 @@ TANH, SIGMOID, KARNOPP = range(3)
 (
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
-    STIFFER, BACK_POWER, SPRING_REST, KNEE,
-) = range(25)  # fmt: skip
+    STIFFER, BACK_POWER, SPRING_REST, KNEE, TIGHTER,
+    WORN,
+) = range(27)  # fmt: skip
 MIDDLE = -1.44  # [rad] where springs are at rest
 
 
@@ -58,7 +59,9 @@ class Hidden:
     [1/V]: an opening of x + taper x |x|; `play` [V] of the spool behind its sensor, half of it
     either way; `back` [Pa] is the return's pressure at the pump's flow, which rises with the flow
     to the `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure;
-    within `knee` [V] of the null the edges have half their gain.
+    within `knee` [V] of the null the edges have half their gain; the levels of dry friction grow by
+    e with every 1 / `tighter` [m] of the stroke; at mid-stroke, about 1 cm wide, the leak is 1 +
+    `worn` times as large.
     """
 
     ahead: float = 0.0
@@ -86,6 +89,8 @@ class Hidden:
     back_power: float = 1.0
     spring_rest: float = MIDDLE
     knee: float = 0.0
+    tighter: float = 0.0
+    worn: float = 0.0
 
     @property
     def array(self) -> Array:
@@ -94,14 +99,15 @@ class Hidden:
 
 
 @njit(cache=True)
-def _dry(v, force, hidden):
-    """Friction [N] at the speed v under the other forces' sum; Karnopp's holds within its band."""
+def _dry(v, s, force, hidden):
+    """Friction [N] at speed and place under the other forces' sum; Karnopp's holds in its band."""
     level = hidden[AHEAD] if v > 0.0 else hidden[ASTERN]
     level += hidden[BREAKAWAY] / (1.0 + (v / hidden[STRIBECK]) ** 2)
     if hidden[FORM] == KARNOPP:
         if abs(v) < hidden[WIDTH]:
             return min(max(force, -hidden[ASTERN]), hidden[AHEAD])
         return level if v > 0.0 else -level
+    level *= math.exp(hidden[TIGHTER] * s)
     x = v / hidden[WIDTH]
     return level * (x / math.sqrt(1.0 + x * x) if hidden[FORM] == SIGMOID else math.tanh(x))
 
@@ -199,7 +205,7 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
         out[4] = (hidden[SAG] * flow / PUMP - y[4]) / hidden[SAG_LAG]
     p_t = _return(cap, rod, u, par, hidden) if hidden[BACK] > 0.0 else 0.0
     across = cap - rod
-    leak = hidden[LEAK] * across
+    leak = hidden[LEAK] * across * (1.0 + hidden[WORN] / (1.0 + (s / 0.01) ** 2))
     if hidden[LEAK_ROOT] > 0.0:
         leak += hidden[LEAK_ROOT] * across / math.sqrt(abs(across) + 1e3)
     if u > 0.0:
@@ -216,7 +222,7 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
         sign = 1.0 if wave_now > 0.0 else -1.0
         torque += hidden[HUM] * sign * abs(wave_now) ** hidden[HUM_POWER]
     torque -= G * _drag(v, hidden)
-    friction = _dry(v, torque / G, hidden)
+    friction = _dry(v, s, torque / G, hidden)
     out[0], out[1] = w, (torque - G * friction) / par[0]
     stiff_cap = par[3] * (1.0 + hidden[STIFFER] * cap)
     stiff_rod = par[3] * (1.0 + hidden[STIFFER] * rod)

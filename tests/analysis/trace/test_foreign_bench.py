@@ -197,6 +197,25 @@ def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
     assert {k["unit"] for n, k in knots.items() if "knot" in n} == {"m/s"}
 
 
+def test_dry_friction_that_grows_along_the_stroke_is_a_curve_that_grows(rig: Rig) -> None:
+    """The level of 80 N grows by 1 % a millimetre, where Coulomb's law has one level."""
+    result = traced(rig, Hidden(80.0, 80.0, tighter=10.0))
+    assert result.verdict == "explained"
+    (curve,) = result.effects
+    assert (curve.name, curve.where, curve.free) == ("friction_curve", "joint 2", True)
+    growth = curve.parameters["growth_2"]
+    assert growth.unit == "1/m"
+    assert growth.value == pytest.approx(10.0, rel=0.1)
+    (line,) = curve.curves
+    slope = 4.43 / abs(rig.joints[1].geometry(0.0)[1]) ** 2
+    fast = np.abs(line.x) > 2e-2
+    there = 80.0 * np.sign(line.x) + slope * line.x
+    assert line.y[fast] == pytest.approx(there[fast], rel=0.04)
+    assert any("times that at mid-stroke" in note for note in result.notes)
+    assert result.after["torque_2"] < 1.2 * result.noise_floor["torque_2"]
+    assert result.model_after.values["W2"] == pytest.approx(TRUTH["W2"], rel=0.01)
+
+
 def test_a_preloaded_spring_rests_where_the_joint_does_not_come(rig: Rig) -> None:
     """The joint reaches from -1.83 to -0.96 rad."""
     result = traced(rig, Hidden(spring=30.0, spring_rest=-0.7), free_forms=False)
@@ -277,6 +296,18 @@ def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -
     assert size.value == pytest.approx(5e-12, rel=0.03)
     assert any("to the power of 0.5" in note for note in result.notes)
     assert max(result.after[e] / result.noise_floor[e] for e in result.after) < 1.15
+    assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.01)
+
+
+def test_a_worn_bore_leaks_most_where_it_is_worn(rig: Rig) -> None:
+    result = traced(rig, Hidden(leak=1e-12, worn=3.0))
+    assert result.verdict == "explained"
+    (leak,) = result.effects
+    assert (leak.name, leak.where) == ("leakage_along_stroke", "joint 2")
+    assert (leak.mechanism, leak.free) == ("leakage_curve", True)
+    (line,) = leak.curves
+    there = 1e-12 * (1.0 + 3.0 / (1.0 + (line.x / 0.01) ** 2))
+    assert line.y == pytest.approx(there, abs=0.03 * there.max())
     assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.01)
 
 

@@ -1,0 +1,261 @@
+"""Leakage as free curves: over the pressure across it, over the position of the piston.
+
+Named leaks are special cases of these curves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
+from analysis.effects.curve import (
+    LAST,
+    curve_at,
+    knot_shapes,
+    packed,
+    refuse_large,
+    shown,
+    spline,
+    spread_knots,
+)
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    FLOW_CAP,
+    FLOW_ROD,
+    P_CAP,
+    P_ROD,
+    P_TANK,
+    Coefficient,
+    Columns,
+    Kernel,
+    S,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
+PLACES: Final = 9  # knots of the piston's position: wear is local
+BACKWARDS: Final = 0.05  # of its largest flow that a leak may reverse: its uncertainty
+
+
+@dataclass(frozen=True)
+class LeakageCurve(Effect):
+    """Q = f(|dp|) sign(dp): a leak over the pressure across it, f a curve with f(0) = 0.
+
+    Between the chambers, or out of one of them to the tank.
+    """
+
+    name: ClassVar[str] = "leakage_curve"
+    family: ClassVar[str] = "fluid"
+    mechanism: ClassVar[str] = "leakage_curve"
+    element: ClassVar[str] = "piston"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    hydraulic: ClassVar[bool] = True
+    variable: ClassVar[str] = "the pressure across the leak"
+    confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
+    separated_by: ClassVar[str] = (
+        "a load that drives the pressures far apart while the piston hardly moves"
+    )
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _leak
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return each joint, between its chambers, then each of its chambers."""
+        return tuple(
+            f"{joint}{side}" for joint in super().all_places(rig) for side in ("", " cap", " rod")
+        )
+
+    @property
+    def _mark(self) -> str:
+        return f"{self.joint + 1}" + (f"_{self.side}" if self.side else "")
+
+    def across(self, signals: Signals) -> Array:
+        """Return the pressure across the leak (n,) [Pa]."""
+        cap, rod = signals.p_cap[:, self.joint], signals.p_rod[:, self.joint]
+        if not self.side:
+            return np.asarray(cap - rod)
+        return np.asarray((cap if self.side == "cap" else rod) - signals.p_tank)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        return tuple(f"leak_{self._mark}_knot_{k}" for k in range(1, DROPS + 1))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the knots [Pa]."""
+        return knot_shapes(self.shape_names(), "Pa", 0.0, rig.supply.pressure)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the pressure across the leak."""
+        drop = evidence.of_joint(self.joint, lambda x: np.abs(self.across(x)))
+        knots = spread_knots(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
+        return (tuple(map(float, knots)),) if len(knots) else ()
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(f"Q_leak_{self._mark}_{k}" for k in range(2, DROPS + 1))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the flows at the knots [m^3/s]."""
+        return tuple(Coefficient(name, "m^3/s", "fluid") for name in self._names())
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the curve's basis, out of the chamber that leaks and into the other."""
+        drop = self.across(signals)
+        basis = spline(self.shape_of(rig, shape), np.abs(drop))[:, 1:]
+        out = dict(zip(self._names(), (np.sign(drop) * basis.T), strict=True))
+        given = {name: -column for name, column in out.items()}
+        i = self.joint
+        if self.side:
+            return {equation(f"flow_{self.side}", i): given}
+        return {equation("flow_cap", i): given, equation("flow_rod", i): out}
+
+    def _values(self, values: Mapping[str, float]) -> Array:
+        return np.array([0.0, *(values[name] for name in self._names())])
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, side (0 for between the chambers, 1 cap, 2 rod), curve."""
+        side = ("", "cap", "rod").index(self.side)
+        curve = packed(self.shape_of(rig, shape), self._values(values))
+        return np.array([self.joint, side, *curve])
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the flow [m^3/s] over the pressure [Pa]."""
+        at = shown(shape)
+        weights = dict(zip(self._names(), spline(shape, at)[:, 1:].T, strict=True))
+        return (Branch("leakage over pressure", at, weights, "Pa", "m^3/s"),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Reject a leak that pumps, and one of more than half the pump's flow."""
+        knots = self.shape_of(rig, shape)
+        flow = spline(knots, shown(knots)) @ self._values(values)
+        if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
+            return "the leak would pump"
+        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak")
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the pressure across the leak [Pa]."""
+        kinds = (f"flow_{self.side}",) if self.side else ("flow_cap", "flow_rod")
+        return {equation(kind, self.joint): self.across(signals) for kind in kinds}
+
+
+@dataclass(frozen=True)
+class LeakageAlongStroke(Effect):
+    """Q = f(s) dp: a laminar leak past the piston over its position, f a curve (`curve`).
+
+    A bore that is worn where the piston moves most leaks more there.
+    """
+
+    name: ClassVar[str] = "leakage_along_stroke"
+    family: ClassVar[str] = "fluid"
+    mechanism: ClassVar[str] = "leakage_curve"
+    element: ClassVar[str] = "piston"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    hydraulic: ClassVar[bool] = True
+    variable: ClassVar[str] = "the pressure difference across the piston, by its position"
+    confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "internal_leakage")
+    separated_by: ClassVar[str] = "the same motion about several places of the stroke"
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _along_stroke
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        return tuple(f"leak_{self.joint + 1}_place_knot_{k}" for k in range(1, PLACES + 1))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the knots [m]."""
+        return knot_shapes(self.shape_names(), "m", *rig.joints[self.joint].position_range)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the piston's position."""
+        place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
+        knots = spread_knots(place, np.linspace(1.0 - LAST, LAST, PLACES).tolist())
+        return (tuple(map(float, knots)),) if len(knots) else ()
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(f"c_internal_{self.joint + 1}_at_{k}" for k in range(1, PLACES + 1))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the flow over the pressure difference at the knots [m^3/(s Pa)]."""
+        return tuple(Coefficient(name, "m^3/(s*Pa)", "fluid") for name in self._names())
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the curve's basis times the pressure difference, out of cap and into rod side."""
+        i = self.joint
+        drop = signals.p_cap[:, i] - signals.p_rod[:, i]
+        flows = (drop[:, None] * spline(self.shape_of(rig, shape), signals.s[:, i])).T
+        into_rod = dict(zip(self._names(), flows, strict=True))
+        into_cap = {name: -flow for name, flow in into_rod.items()}
+        return {equation("flow_cap", i): into_cap, equation("flow_rod", i): into_rod}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, curve."""
+        at_knots = np.array([values[name] for name in self._names()])
+        return np.array([self.joint, *packed(self.shape_of(rig, shape), at_knots)])
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the flow over the pressure difference [m^3/(s Pa)] over the position [m]."""
+        at = shown(shape)
+        weights = dict(zip(self._names(), spline(shape, at).T, strict=True))
+        return (Branch("leakage over position", at, weights, "m", "m^3/(s*Pa)"),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Reject a leak that pumps, and one of more than half the pump's flow."""
+        knots = self.shape_of(rig, shape)
+        size = spline(knots, shown(knots)) @ np.array([values[name] for name in self._names()])
+        if np.min(size) < -BACKWARDS * float(np.max(np.abs(size))):
+            return "the leak would pump"
+        return refuse_large(size * rig.supply.pressure, 0.5 * rig.supply.flow, "the leak")
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the piston's position [m]."""
+        place = signals.s[:, self.joint]
+        return {equation(kind, self.joint): place for kind in ("flow_cap", "flow_rod")}
+
+
+@kernel
+def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i = int(par[0])
+    side = int(par[1])
+    cap, rod = x[P_CAP, i], x[P_ROD, i]
+    drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
+    flow = curve_at(abs(drop), par, 2, 5)
+    flow = flow if drop > 0.0 else -flow
+    if side == 0:
+        out[FLOW_CAP, i] -= flow
+        out[FLOW_ROD, i] += flow
+    elif side == 1:
+        out[FLOW_CAP, i] -= flow
+    else:
+        out[FLOW_ROD, i] -= flow
+
+
+@kernel
+def _along_stroke(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        flow = curve_at(x[S, i], par, 1, PLACES) * (x[P_CAP, i] - x[P_ROD, i])
+        out[FLOW_CAP, i] -= flow
+        out[FLOW_ROD, i] += flow
+
+
+TERMS = (LeakageCurve, LeakageAlongStroke)
