@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from analysis.simulation.model import Estimate
+from analysis.terms import make
 from analysis.trace.clues.formula import surest_formula
-from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Trace
+from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Curve, JudgedEffect, Trace
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
@@ -45,7 +46,7 @@ def sentence(result: Trace) -> str:
             "No residual exceeds the noise: the baseline model explains these records; no effect "
             "is named."
         )
-    named = "; ".join(_effect(e) for e in result.effects)
+    named = "; ".join(_effect(e, result.model_before.rig) for e in result.effects)
     errors = " ".join([_errors(result), *_remarks(result), *_tolerated(result)]).strip()
     if result.verdict == EXPLAINED:
         return f"{_variables_in_words(result.effects)}: {named}. {errors}"
@@ -95,12 +96,24 @@ def _constant(variable: str) -> bool:
     return variable.startswith("nothing")
 
 
-def _effect(effect: JudgedEffect) -> str:
-    values = ", ".join(
-        f"{n} not determined: {quantity(e)}" if _undetermined(effect, n) else f"{n} = {quantity(e)}"
-        for n, e in effect.parameters.items()
-    )
-    return f"{effect.name.replace('_', ' ')} at {effect.location} ({values})"
+def _effect(effect: JudgedEffect, rig: Rig) -> str:
+    """Return name, place and numbers; of a free curve its range instead of values at knots."""
+    values, hidden = [_curve_range(c) for c in effect.curves if effect.free], set[str]()
+    if values:
+        hidden = {c.parameter for c in make(effect.name, effect.at).coefficients(rig)}
+    for n, e in effect.parameters.items():
+        if n not in hidden:
+            link = " not determined: " if _undetermined(effect, n) else " = "
+            values.append(f"{n}{link}{quantity(e)}")
+    return f"{effect.name.replace('_', ' ')} at {effect.location} ({', '.join(values)})"
+
+
+def _curve_range(curve: Curve) -> str:
+    """Return between which values a curve lies, and over which range of its variable."""
+    low, high = (f"{plain(v, 3)}" for v in (np.min(curve.y), np.max(curve.y)))
+    first, last = (f"{plain(v, 3)}" for v in (curve.x[0], curve.x[-1]))
+    y, x = typeset(curve.unit_y), typeset(curve.unit_x)
+    return f"{curve.label}: {low} to {high} {y} between {first} and {last} {x}"
 
 
 def _undetermined(effect: JudgedEffect, name: str) -> bool:
