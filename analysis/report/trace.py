@@ -59,7 +59,7 @@ def body(
         "refused": [_effect(e, f"n{k}") for k, e in enumerate(result.refused)],
         "parameters": _parameters(result),
         "fits": [_free_run(result, channel) for channel in result.fit_before],
-        "floors": result.floors,
+        "floors": [(f, unit_of_equation(rig, f.equation)) for f in result.floors],
         "spectra": _spectra(rig, result),
         "fm": fm,
     }

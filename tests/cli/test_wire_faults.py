@@ -44,8 +44,14 @@ def test_a_cable_pulled_out_in_a_run_ends_it_by_name_and_keeps_what_came(
     assert (run / "state").read_text().strip() == "aborted"
 
 
-def test_a_wire_fault_nobody_knows_is_refused_before_anything_is_served() -> None:
-    done = bramah_here("sim", "--rig", RIG, "--port", 0, "--wire-faults", "frame_gone")
+@pytest.mark.parametrize(
+    ("option", "unknown", "known"),
+    [("--wire-faults", "frame_gone", "frame_lost"), ("--scenario", "worn-seals", "worn-seal")],
+)
+def test_a_name_nobody_knows_is_refused_before_anything_is_served(
+    option: str, unknown: str, known: str
+) -> None:
+    done = bramah_here("sim", "--rig", RIG, "--port", 0, option, unknown)
     assert done.returncode == 2
-    assert "frame_gone" in done.stderr
-    assert "frame_lost" in done.stderr
+    assert f"{option} {unknown}: expected a file, or one of: " in done.stderr
+    assert known in done.stderr.replace(unknown, "").split()

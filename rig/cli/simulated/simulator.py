@@ -67,7 +67,11 @@ def hidden(what: BenchRequest, rig: Rig) -> Scenario:
         return draw(rig, what.seed)
     if what.scenario in shipped_scenarios():
         return load_shipped(what.scenario)
-    return parse_scenario(read_text(Path(what.scenario), "a scenario"), what.scenario)
+    path = Path(what.scenario)
+    if not path.suffix and not path.exists():
+        known = " ".join(sorted((RANDOM, *shipped_scenarios())))
+        raise InputError(f"--scenario {path}: expected a file, or one of: {known}")
+    return parse_scenario(read_text(path, "a scenario"), what.scenario)
 
 
 def wire_faults(name: str | None) -> tuple[WireFault, ...]:
