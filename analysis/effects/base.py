@@ -96,7 +96,7 @@ class Branch:
 class Evidence:
     """Records for an effect that chooses its starting points by the data.
 
-    `signals` are those of each averaged record in which a joint moves, as the model sees them;
+    `signals` are those of each averaged record, as the model sees them;
     `residuals` holds its residual by equation: instants (m,) [s] and whitened residual (m,).
     """
 
@@ -104,8 +104,8 @@ class Evidence:
     residuals: Sequence[Mapping[str, tuple[Array, Array]]]
 
     def of_joint(self, joint: int, values: Callable[[Signals], Array]) -> Array:
-        """Return values (n,) of all records in which a joint moves."""
-        parts = [values(s) for s in self.signals if s.moving is None or s.moving[joint]]
+        """Return values (n,) of all records in which a joint is excited: others have no rows."""
+        parts = [values(s) for s in self.signals if s.excited[joint]]
         return np.concatenate(parts) if parts else np.zeros(0)
 
 

@@ -154,7 +154,8 @@ class LeakageCurve(Effect):
 class LeakageAlongStroke(Effect):
     """Q = f(s) dp: a laminar leak past the piston over its position, f a curve (`curve`).
 
-    A bore that is worn where the piston moves most leaks more there.
+    A bore that is worn where the piston moves most leaks more there. Beyond the outer knots f keeps
+    its value there: a straight line would soon pump.
     """
 
     name: ClassVar[str] = "leakage_along_stroke"
@@ -198,9 +199,10 @@ class LeakageAlongStroke(Effect):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the curve's basis times the pressure difference, out of cap and into rod side."""
-        i = self.joint
+        i, knots = self.joint, self.shape_of(rig, shape)
         drop = signals.p_cap[:, i] - signals.p_rod[:, i]
-        flows = (drop[:, None] * spline(self.shape_of(rig, shape), signals.s[:, i])).T
+        place = np.clip(signals.s[:, i], knots[0], knots[-1])
+        flows = (drop[:, None] * spline(knots, place)).T
         into_rod = dict(zip(self._names(), flows, strict=True))
         into_cap = {name: -flow for name, flow in into_rod.items()}
         return {equation("flow_cap", i): into_cap, equation("flow_rod", i): into_rod}
@@ -253,7 +255,8 @@ def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
 def _along_stroke(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        flow = curve_at(x[S, i], par, 1, PLACES) * (x[P_CAP, i] - x[P_ROD, i])
+        place = min(max(x[S, i], par[1]), par[PLACES])
+        flow = curve_at(place, par, 1, PLACES) * (x[P_CAP, i] - x[P_ROD, i])
         out[FLOW_CAP, i] -= flow
         out[FLOW_ROD, i] += flow
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.effects.base import SUPPLY, Effect, ordered
+from analysis.effects.base import SUPPLY, Effect, Evidence, ordered
 from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth
@@ -102,6 +102,22 @@ def state(rig: Rig) -> Signals:
     qd = 0.2 * 2 * np.pi * 3 * np.cos(2 * np.pi * 3 * t[:, None] + phase[:1])
     qdd = -((2 * np.pi * 3) ** 2) * (q - middle)
     return replace(signals_of(rig, q, qd, qdd, rng), t=t)
+
+
+def test_knots_are_placed_where_the_joint_is_excited(rig: Rig, state: Signals) -> None:
+    """A locked joint that yields a little moves too, but its equations have no rows."""
+    yielding = replace(
+        state,
+        excited=np.array([True, False]),
+        moving=np.array([True, True]),
+        s=state.s + 0.03,
+        sd=1e-3 * state.sd,
+    )
+    for e in effects(rig):
+        if e.by_data and e.where.startswith("joint 2"):
+            alone = e.points(rig, Evidence([replace(state, moving=yielding.moving)], []))
+            both = e.points(rig, Evidence([state, yielding], []))
+            assert np.array(both) == pytest.approx(np.array(alone)), e
 
 
 def test_preparing_alters_the_rows_of_no_family_but_those_that_an_effect_names(

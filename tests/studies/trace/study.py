@@ -28,7 +28,7 @@ TRAIN, JUDGE = "lock-and-excite-multisine", "validate"
 DRAWN: Final = {
     "piston acceleration": "position_force",
     "piston velocity": "friction_curve",
-    "piston pressure_difference cap_pressure rod_pressure": "leakage_curve",
+    "piston pressure_difference cap_pressure rod_pressure": "leakage_along_stroke",
 }
 JUDGE_STEPS: Final = ("step1_1hz", "step2_3hz", "step3_1hz", "both_1hz")
 
