@@ -199,8 +199,8 @@ class DeadVolume(Effect):
 
 
 def _exponent(shape: Sequence[float]) -> float:
-    """Return n, 1 of a model without a shape."""
-    return shape[0] if len(shape) else EXPONENTS[0]
+    """Return n, 1 of a model without it (no shape, or 0)."""
+    return shape[0] if len(shape) and shape[0] else EXPONENTS[0]
 
 
 @kernel

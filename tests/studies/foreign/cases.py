@@ -315,8 +315,9 @@ def _drag(rng: np.random.Generator, i: int) -> Wrong:
 
 def _worn(rng: np.random.Generator, i: int) -> Wrong:
     own = {"internal": _size(rng, 5e-13, 2e-12), "worn": _size(rng, 2, 8)}
-    return Wrong("worn bore", f"joint {i + 1}", f"x {own['worn']:.2g} in its middle",
-                 joint=(i, own), also=("leakage_along_stroke",), kin=("internal_leakage",))  # fmt: skip
+    text = f"x {own['worn']:.2g} in its middle"
+    return Wrong("worn bore", f"joint {i + 1}", text, joint=(i, own),
+                 also=("leakage_along_stroke",), kin=("internal_leakage",))  # fmt: skip
 
 
 def _tapered(rng: np.random.Generator, i: int) -> Wrong:
