@@ -104,10 +104,10 @@ class FrictionCurve(Friction):
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
         """Return the shape with a growth along the stroke."""
-        missing = self._speed_place() + 1 - len(shape)
-        return (
-            (*shape, *(0.0,) * missing, GROWS / self._half(rig)) if missing >= 0 else tuple(shape)
-        )
+        place = self._speed_place() + 1
+        if len(shape) > place:
+            return tuple(shape)
+        return (*shape, *(0.0,) * (place - len(shape)), GROWS / self._half(rig))
 
     def _growth(self, shape: Sequence[float]) -> float:
         """Return the growth [1/m] of a shape, 0 where it has none."""
@@ -115,10 +115,10 @@ class FrictionCurve(Friction):
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State between what shares of its value at mid-stroke the friction changes."""
-        growth = self._growth(shape)
-        if growth == 0.0 or not signals:
+        growth, i = self._growth(shape), self.joint
+        places = [f(x.s[:, i]) for x in signals if x.excited[i] for f in (np.min, np.max)]
+        if growth == 0.0 or not places:
             return ""
-        places = [f(x.s[:, self.joint]) for x in signals for f in (np.min, np.max)]
         ends = sorted(1.0 + growth * (p - self._middle(rig)) for p in (min(places), max(places)))
         return (
             f"along the stroke of the records the friction is {ends[0]:.2f} to {ends[1]:.2f} times "

@@ -211,7 +211,7 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         more = _with_searched_shapes(data, _with_term(fit.terms, used, opened), steps)
         if fit.energy - more.energy <= asked:
             continue
-        # With the details another form may fit better: a distance that stood for them is gone.
+        # A form that fitted better without the details need not do so with them.
         if not _determines_shapes(data, more, more.terms[k]):
             more = _in_best_form(data, more, k, steps)
         if _determines_shapes(data, more, more.terms[k]):
@@ -228,11 +228,7 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
     """
     assert isinstance(used.term, Effect)
     shapes = shapes_of(data.rig, used)
-    at_end = any(
-        s.detail and not s.saturates and v > s.high - 1e-3 * (s.high - s.low)
-        for s, v in zip(shapes, used.shape, strict=True)
-    )
-    if at_end or used.term.outside(data.rig, used.shape):
+    if any(map(_at_end, shapes, used.shape)) or used.term.outside(data.rig, used.shape):
         return False
     names, columns = tangent(data, fit)
     misfit = math.sqrt(max(1.0, fit.energy / len(fit.residual)))
@@ -245,6 +241,13 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
         if misfit > SEARCH.shape_error * abs(value) * float(np.linalg.norm(left)):
             return False
     return True
+
+
+def _at_end(shape: Shape, value: float) -> bool:
+    """Return whether a detail lies at its high bound, or at a low one below 0."""
+    margin = 1e-3 * (shape.high - shape.low)
+    low = shape.low + margin if shape.low < 0.0 else -math.inf
+    return shape.detail and not shape.saturates and not low <= value <= shape.high - margin
 
 
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
