@@ -293,6 +293,11 @@ class Effect(Term):
         return ""
 
 
+def exponent(shape: Sequence[float]) -> float:
+    """Return the exponent, the one number of a shape; 1 of a shape without it (none, or 0)."""
+    return float(shape[0]) if len(shape) and shape[0] else 1.0
+
+
 def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.0) -> str:
     """Return that a coefficient is not within (low, high), in words ('' if it is)."""
     if low < value < high:

@@ -8,7 +8,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import VOLUME, Array, Effect, Shape, beyond
+from analysis.effects.base import VOLUME, Array, Effect, Shape, beyond, exponent
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     COMP_CAP,
@@ -90,7 +90,7 @@ class EntrainedAir(Effect):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return - V dp/dt times the softness of each chamber's gas per alpha."""
         out: Columns = {}
-        n = _exponent(shape)
+        n = exponent(shape)
         for i in range(signals.joints):
             for side, V, p, rate in (
                 ("flow_cap", signals.V_cap, signals.p_cap, signals.pd_cap),
@@ -108,7 +108,7 @@ class EntrainedAir(Effect):
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return alpha and n."""
-        return np.array([values["alpha_air"], _exponent(shape)])
+        return np.array([values["alpha_air"], exponent(shape)])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return each chamber's pressure [Pa]."""
@@ -196,11 +196,6 @@ class DeadVolume(Effect):
         """Return the chamber's pressure rate [Pa/s]."""
         rate = signals.pd_cap if self.side == "cap" else signals.pd_rod
         return {equation(f"flow_{self.side}", self.joint): rate[:, self.joint]}
-
-
-def _exponent(shape: Sequence[float]) -> float:
-    """Return n, 1 of a model without it (no shape, or 0)."""
-    return shape[0] if len(shape) and shape[0] else EXPONENTS[0]
 
 
 @kernel

@@ -128,6 +128,14 @@ def spread_knots(values: Array, shares: Sequence[float], low: float | None = Non
     return np.asarray(knots)
 
 
+def knot_points(
+    values: Array, shares: Sequence[float], low: float | None = None
+) -> tuple[tuple[float, ...], ...]:
+    """Return `spread_knots` as the one starting point of a search, none where nothing spreads."""
+    knots = spread_knots(values, shares, low)
+    return (tuple(map(float, knots)),) if len(knots) else ()
+
+
 def knot_shapes(names: Sequence[str], unit: str, low: float, high: float) -> tuple[Shape, ...]:
     """Return the knots as shapes that the data place beforehand, evenly spread without data."""
     even = np.linspace(low, high, len(names))

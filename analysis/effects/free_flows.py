@@ -16,11 +16,11 @@ from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
 from analysis.effects.curve import (
     LAST,
     curve_at,
+    knot_points,
     knot_shapes,
     packed,
     shown,
     spline,
-    spread_knots,
 )
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
@@ -90,8 +90,7 @@ class MeteringCurve(Effect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the spool's travel."""
         travel = evidence.of_joint(self.joint, lambda x: np.abs(x.u[:, self.joint]))
-        knots = spread_knots(travel, (0.0, 0.2, 0.45, 0.75, LAST), low=0.0)
-        return (tuple(map(float, knots)),) if len(knots) else ()
+        return knot_points(travel, (0.0, 0.2, 0.45, 0.75, LAST), low=0.0)
 
     def _names(self, edge: str) -> tuple[str, ...]:
         return tuple(f"C_{edge}_{self.joint + 1}_at_{k}" for k in range(2, OPENINGS))
@@ -204,8 +203,7 @@ class BulkModulusCurve(Effect):
         joints = range(len(rig.joints))
         parts = [evidence.of_joint(i, lambda x, i=i: x.p_cap[:, i]) for i in joints]  # type: ignore[misc]
         parts += [evidence.of_joint(i, lambda x, i=i: x.p_rod[:, i]) for i in joints]  # type: ignore[misc]
-        knots = spread_knots(np.concatenate(parts), (1.0 - LAST, 0.25, 0.65, LAST))
-        return (tuple(map(float, knots)),) if len(knots) else ()
+        return knot_points(np.concatenate(parts), (1.0 - LAST, 0.25, 0.65, LAST))
 
     def _names(self) -> tuple[str, ...]:
         return tuple(f"softness_{k}" for k in range(1, PRESSURES))

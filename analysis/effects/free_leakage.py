@@ -15,13 +15,14 @@ from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
 from analysis.effects.curve import (
     LAST,
     curve_at,
+    knot_points,
     knot_shapes,
     packed,
     refuse_large,
     shown,
     spline,
-    spread_knots,
 )
+from analysis.effects.leakage import UNIT, with_chambers
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -45,26 +46,36 @@ BACKWARDS: Final = 0.05  # of its largest flow that a leak may reverse: its unce
 
 
 @dataclass(frozen=True)
-class LeakageCurve(Effect):
-    """Q = f(|dp|) sign(dp): a leak over the pressure across it, f a curve with f(0) = 0.
-
-    Between the chambers, or out of one of them to the tank.
-    """
-
-    name: ClassVar[str] = "leakage_curve"
+class _FreeLeakage(Effect):
     family: ClassVar[str] = "fluid"
     mechanism: ClassVar[str] = "leakage_curve"
     element: ClassVar[str] = "piston"
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    def _refused(self, rig: Rig, flow: Array) -> str:
+        """Reject a flow (m,) [m^3/s] that pumps, or is more than half the pump's."""
+        if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
+            return "the leak would pump"
+        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak")
+
+
+@dataclass(frozen=True)
+class LeakageCurve(_FreeLeakage):
+    """Q = f(|dp|) sign(dp): a leak over the pressure across it, f a curve with f(0) = 0.
+
+    Between the chambers, or out of one of them to the tank.
+    """
+
+    name: ClassVar[str] = "leakage_curve"
     variable: ClassVar[str] = "the pressure across the leak"
     confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
     separated_by: ClassVar[str] = (
         "a load that drives the pressures far apart while the piston hardly moves"
     )
-    per_joint: ClassVar[bool] = True
-    where: str = "joint 1"
 
     @property
     def kernel(self) -> Kernel:
@@ -74,9 +85,7 @@ class LeakageCurve(Effect):
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return each joint, between its chambers, then each of its chambers."""
-        return tuple(
-            f"{joint}{side}" for joint in super().all_places(rig) for side in ("", " cap", " rod")
-        )
+        return with_chambers(super().all_places(rig))
 
     @property
     def _mark(self) -> str:
@@ -100,8 +109,7 @@ class LeakageCurve(Effect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the pressure across the leak."""
         drop = evidence.of_joint(self.joint, lambda x: np.abs(self.across(x)))
-        knots = spread_knots(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
-        return (tuple(map(float, knots)),) if len(knots) else ()
+        return knot_points(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
 
     def _names(self) -> tuple[str, ...]:
         return tuple(f"Q_leak_{self._mark}_{k}" for k in range(2, DROPS + 1))
@@ -139,10 +147,7 @@ class LeakageCurve(Effect):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a leak that pumps, and one of more than half the pump's flow."""
         knots = self.shape_of(rig, shape)
-        flow = spline(knots, shown(knots)) @ self._values(values)
-        if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
-            return "the leak would pump"
-        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak")
+        return self._refused(rig, spline(knots, shown(knots)) @ self._values(values))
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the pressure across the leak [Pa]."""
@@ -151,7 +156,7 @@ class LeakageCurve(Effect):
 
 
 @dataclass(frozen=True)
-class LeakageAlongStroke(Effect):
+class LeakageAlongStroke(_FreeLeakage):
     """Q = f(s) dp: a laminar leak past the piston over its position, f a curve (`curve`).
 
     A bore that is worn where the piston moves most leaks more there. Beyond the outer knots f keeps
@@ -159,17 +164,9 @@ class LeakageAlongStroke(Effect):
     """
 
     name: ClassVar[str] = "leakage_along_stroke"
-    family: ClassVar[str] = "fluid"
-    mechanism: ClassVar[str] = "leakage_curve"
-    element: ClassVar[str] = "piston"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    hydraulic: ClassVar[bool] = True
     variable: ClassVar[str] = "the pressure difference across the piston, by its position"
     confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "internal_leakage")
     separated_by: ClassVar[str] = "the same motion about several places of the stroke"
-    per_joint: ClassVar[bool] = True
-    where: str = "joint 1"
 
     @property
     def kernel(self) -> Kernel:
@@ -187,15 +184,14 @@ class LeakageAlongStroke(Effect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the piston's position."""
         place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
-        knots = spread_knots(place, np.linspace(1.0 - LAST, LAST, PLACES).tolist())
-        return (tuple(map(float, knots)),) if len(knots) else ()
+        return knot_points(place, np.linspace(1.0 - LAST, LAST, PLACES).tolist())
 
     def _names(self) -> tuple[str, ...]:
         return tuple(f"c_internal_{self.joint + 1}_at_{k}" for k in range(1, PLACES + 1))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the flow over the pressure difference at the knots [m^3/(s Pa)]."""
-        return tuple(Coefficient(name, "m^3/(s*Pa)", "fluid") for name in self._names())
+        return tuple(Coefficient(name, UNIT, "fluid") for name in self._names())
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the curve's basis times the pressure difference, out of cap and into rod side."""
@@ -207,24 +203,24 @@ class LeakageAlongStroke(Effect):
         into_cap = {name: -flow for name, flow in into_rod.items()}
         return {equation("flow_cap", i): into_cap, equation("flow_rod", i): into_rod}
 
+    def _values(self, values: Mapping[str, float]) -> Array:
+        return np.array([values[name] for name in self._names()])
+
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, curve."""
-        at_knots = np.array([values[name] for name in self._names()])
-        return np.array([self.joint, *packed(self.shape_of(rig, shape), at_knots)])
+        return np.array([self.joint, *packed(self.shape_of(rig, shape), self._values(values))])
 
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
         """Return the flow over the pressure difference [m^3/(s Pa)] over the position [m]."""
         at = shown(shape)
         weights = dict(zip(self._names(), spline(shape, at).T, strict=True))
-        return (Branch("leakage over position", at, weights, "m", "m^3/(s*Pa)"),)
+        return (Branch("leakage over position", at, weights, "m", UNIT),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a leak that pumps, and one of more than half the pump's flow."""
         knots = self.shape_of(rig, shape)
-        size = spline(knots, shown(knots)) @ np.array([values[name] for name in self._names()])
-        if np.min(size) < -BACKWARDS * float(np.max(np.abs(size))):
-            return "the leak would pump"
-        return refuse_large(size * rig.supply.pressure, 0.5 * rig.supply.flow, "the leak")
+        size = spline(knots, shown(knots)) @ self._values(values)
+        return self._refused(rig, size * rig.supply.pressure)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's position [m]."""

@@ -18,7 +18,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.effects.base import Array, Effect, Shape, beyond, exponent
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -89,9 +89,9 @@ class _Leakage(Effect):
         )
 
 
-def exponent(shape: Sequence[float]) -> float:
-    """Return the exponent of a leak's shape, 1 of a shape without it (none, or 0)."""
-    return float(shape[0]) if len(shape) and shape[0] else 1.0
+def with_chambers(joints: Sequence[str]) -> tuple[str, ...]:
+    """Return each of the places `joint I`, then each of its chambers."""
+    return tuple(f"{joint}{side}" for joint in joints for side in ("", " cap", " rod"))
 
 
 @njit(cache=True)
@@ -173,9 +173,7 @@ class ExternalLeakage(_Leakage):
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return each hydraulic joint, then each of its chambers."""
-        return tuple(
-            f"{joint}{side}" for joint in super().all_places(rig) for side in ("", " cap", " rod")
-        )
+        return with_chambers(super().all_places(rig))
 
     @property
     def _chambers(self) -> tuple[str, ...]:

@@ -110,8 +110,8 @@ def _effect(effect: JudgedEffect, rig: Rig) -> str:
 
 def _curve_range(curve: Curve) -> str:
     """Return between which values a curve lies, and over which range of its variable."""
-    low, high = (f"{plain(v, 3)}" for v in (np.min(curve.y), np.max(curve.y)))
-    first, last = (f"{plain(v, 3)}" for v in (curve.x[0], curve.x[-1]))
+    ends = (np.min(curve.y), np.max(curve.y), curve.x[0], curve.x[-1])
+    low, high, first, last = (plain(v, 3) for v in ends)
     y, x = typeset(curve.unit_y), typeset(curve.unit_x)
     return f"{curve.label}: {low} to {high} {y} between {first} and {last} {x}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -67,11 +68,15 @@ def hidden(what: BenchRequest, rig: Rig) -> Scenario:
         return draw(rig, what.seed)
     if what.scenario in shipped_scenarios():
         return load_shipped(what.scenario)
-    path = Path(what.scenario)
+    return _scenario_file("--scenario", what.scenario, (RANDOM, *shipped_scenarios()))
+
+
+def _scenario_file(option: str, name: str, known: Iterable[str]) -> Scenario:
+    """Return the scenario of the file `name`; raises InputError for a name that is not `known`."""
+    path = Path(name)
     if not path.suffix and not path.exists():
-        known = " ".join(sorted((RANDOM, *shipped_scenarios())))
-        raise InputError(f"--scenario {path}: expected a file, or one of: {known}")
-    return parse_scenario(read_text(path, "a scenario"), what.scenario)
+        raise InputError(f"{option} {name}: expected a file, or one of: {' '.join(sorted(known))}")
+    return parse_scenario(read_text(path, "a scenario"), name)
 
 
 def wire_faults(name: str | None) -> tuple[WireFault, ...]:
@@ -81,12 +86,7 @@ def wire_faults(name: str | None) -> tuple[WireFault, ...]:
     known = {kind.fault_name(): kind for kind in CLASSES if issubclass(kind, WireFault)}
     if name in known:
         return (known[name].model_validate({"name": name, "probability": USUAL_SHARE}),)
-    path = Path(name)
-    if not path.suffix and not path.exists():
-        raise InputError(
-            f"--wire-faults {name}: expected a file, or one of: {' '.join(sorted(known))}"
-        )
-    scenario = parse_scenario(read_text(path, "a scenario"), name)
+    scenario = _scenario_file("--wire-faults", name, known)
     if scenario != Scenario(description=scenario.description, faults=scenario.wire_faults):
         raise InputError(
             f"--wire-faults {name}: expected faults of the wire only ({' '.join(sorted(known))}); "
