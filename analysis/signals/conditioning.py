@@ -70,6 +70,11 @@ class Signals:
         """N."""
         return int(self.s.shape[1])
 
+    @property
+    def excited_joints(self) -> list[int]:
+        """The joints, 0-based, whose rows may be used."""
+        return np.flatnonzero(self.excited).tolist()
+
 
 def without_rests(signals: Signals, joints: Sequence[int]) -> Signals:
     """Return signals that weight the torque balances of `joints` by 0 while they are at rest.
@@ -122,6 +127,8 @@ def lost_samples(rig: Rig, record: Record) -> Mask:
     for name in rig.channels:
         if name in record.channels:
             missing = np.isnan(record.channels[name])
+            if not missing.any():
+                continue
             kind, joint = ch.kind_of(name)
             if joint is None:
                 lost |= missing[:, None]
@@ -151,37 +158,40 @@ def condition(
     channels = aligned_channels(rig, record)
     n = record.samples
 
-    def stacked(kind: str) -> Array:
+    def filtered(kind: str, highest: int) -> Sequence[Array]:
+        """Return the joints' channels of one kind and their derivatives, (n, N) each."""
         fill = np.zeros(n)
-        return np.column_stack([channels.get(ch.channel(kind, i), fill) for i in joints])
+        rows = np.array([channels.get(ch.channel(kind, i), fill) for i in joints])
+        return smoother.derivatives(rows.T, highest)
 
     def bench(name: str, constant: float) -> Array:
         return smoother.apply(channels[name]) if name in channels else np.full(n, constant)
 
-    raw_s, raw_p = stacked(rig.position_kind), (stacked(ch.CAP), stacked(ch.ROD))
     supply, oil = (0.0, 0.0) if rig.electric else (rig.supply.pressure, rig.oil.temperature)
     moving = moving_joints(rig, [record]) if moving is None else moving
     held = held_positions(rig, [record]) if held is None else held
-    s, sd, sdd = _motion(raw_s, moving, held, smoother)
-    q, qd, qdd, G = _angles(rig, s, sd, sdd)
+    s, sd, sdd = filtered(rig.position_kind, 2)
+    # A joint that does not move stands at `held`.
+    s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = held[~moving], 0.0, 0.0
+    (p_cap, pd_cap), (p_rod, pd_rod) = filtered(ch.CAP, 1), filtered(ch.ROD, 1)
+    q, qd, qdd, G = _angles(rig, s, sd, sdd, moving)
     volumes = [rig.chamber_volumes(i - 1, s[:, i - 1]) for i in joints]
     return Signals(
         rate=record.sample_rate,
         t=record.time,
-        u=smoother.apply(stacked(rig.drive_kind)),
-        s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=rig.base_angle + np.cumsum(q, axis=1), G=G,
-        p_cap=smoother.apply(raw_p[0]),
-        p_rod=smoother.apply(raw_p[1]),
-        pd_cap=smoother.apply(raw_p[0], 1),
-        pd_rod=smoother.apply(raw_p[1], 1),
-        V_cap=np.column_stack([v[0] for v in volumes]),
-        V_rod=np.column_stack([v[1] for v in volumes]),
+        u=filtered(rig.drive_kind, 0)[0],
+        s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=rig.base_angle + np.cumsum(q.T, axis=0).T, G=G,
+        p_cap=p_cap, p_rod=p_rod, pd_cap=pd_cap, pd_rod=pd_rod,
+        V_cap=np.array([v[0] for v in volumes]).T,
+        V_rod=np.array([v[1] for v in volumes]).T,
         p_s=bench(ch.SUPPLY, supply),
         p_tank=np.zeros(n),
         temperature=bench(ch.TEMPERATURE, oil),
         excited=excited,
         valid=_valid(rig, record, smoother.reach),
-        lost=_lost(rig, record, smoother.reach + align_reach(rig, record.sample_rate)),
+        lost=_spread(
+            lost_samples(rig, record), smoother.reach + align_reach(rig, record.sample_rate)
+        ),
         moving=moving,
         loaded=record.loaded,
     )  # fmt: skip
@@ -196,12 +206,12 @@ def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:
     s = signals.s
     slope = np.column_stack([j.geometry(s[:, i])[2] for i, j in enumerate(rig.joints)])
     sdd = signals.G * signals.qdd + slope * signals.qd**2
-    q, qd, qdd, G = _angles(other, s, signals.sd, sdd)
+    q, qd, qdd, G = _angles(other, s, signals.sd, sdd, signals.moving)
     volumes = [other.chamber_volumes(i, s[:, i]) for i in range(signals.joints)]
     return replace(
-        signals, q=q, qd=qd, qdd=qdd, G=G, theta=other.base_angle + np.cumsum(q, axis=1),
-        V_cap=np.column_stack([v[0] for v in volumes]),
-        V_rod=np.column_stack([v[1] for v in volumes]),
+        signals, q=q, qd=qd, qdd=qdd, G=G, theta=other.base_angle + np.cumsum(q.T, axis=0).T,
+        V_cap=np.array([v[0] for v in volumes]).T,
+        V_rod=np.array([v[1] for v in volumes]).T,
     )  # fmt: skip
 
 
@@ -214,7 +224,10 @@ def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
             low, high = sensor.range
             step = (high - low) / ((1 << sensor.bits) - 1)
             x = np.asarray(record.channels[name])
-            mask = (x <= low + 0.5 * step) | (x >= high - 0.5 * step)
+            low, high = low + 0.5 * step, high - 0.5 * step
+            if x.min() > low and x.max() < high:  # nearly always; not with a lost sample
+                continue
+            mask = (x <= low) | (x >= high)
             if mask.any():
                 clipped[name] = mask
     return clipped
@@ -238,43 +251,37 @@ def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
                 )
 
 
-def _motion(
-    raw: Array, moving: Mask, held: Array, smoother: Smoother
-) -> tuple[Array, Array, Array]:
-    """Return filtered s, ds/dt, d2s/dt2 (n, N); a joint that does not move stands at `held`."""
-    s, sd, sdd = (smoother.apply(raw, k) for k in range(3))
-    s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = held[~moving], 0.0, 0.0
-    return s, sd, sdd
-
-
-def _angles(rig: Rig, s: Array, sd: Array, sdd: Array) -> tuple[Array, Array, Array, Array]:
+def _angles(
+    rig: Rig, s: Array, sd: Array, sdd: Array, moving: Mask | None
+) -> tuple[Array, Array, Array, Array]:
     """Return q, dq/dt, d2q/dt2 and G (n, N): q' = s'/G, q'' = (s'' - (dG/dq) q'^2)/G."""
     q, G, slope = np.empty_like(s), np.empty_like(s), np.empty_like(s)
     for i, joint in enumerate(rig.joints):
-        q[:, i], G[:, i], slope[:, i] = joint.geometry(s[:, i])
+        still = moving is not None and not moving[i]
+        q[:, i], G[:, i], slope[:, i] = joint.geometry(s[:1, i] if still else s[:, i])
     qd = sd / G
     return q, qd, (sdd - slope * qd**2) / G, G
 
 
 def _valid(rig: Rig, record: Record, reach: int) -> Mask:
     n = record.samples
-    bad = np.zeros((n, len(rig.joints)), dtype=np.float64)
+    bad = np.zeros((n, len(rig.joints)), dtype=bool)
     for name, mask in clipped_samples(rig, record).items():
         kind, joint = ch.kind_of(name)
         if joint is None:
             if kind == ch.SUPPLY:
-                bad[mask] = 1.0
+                bad[mask] = True
         elif joint not in record.locked or kind == rig.position_kind:
-            bad[mask, joint - 1] = 1.0
-    spread = np.apply_along_axis(np.convolve, 0, bad, np.ones(2 * reach + 1), "same") > 0.5
-    spread[:reach] = spread[n - reach :] = True
-    return np.asarray(~spread)
+            bad[mask, joint - 1] = True
+    bad = _spread(bad, reach)
+    bad[:reach] = bad[n - reach :] = True
+    return np.asarray(~bad)
 
 
-def _lost(rig: Rig, record: Record, reach: int) -> Mask:
-    lost = lost_samples(rig, record)
-    if lost.any():
-        wide = np.ones(2 * reach + 1)
-        whole = np.apply_along_axis(np.convolve, 0, lost.astype(np.float64), wide)
-        lost = whole[reach : reach + record.samples] > 0.5
-    return lost
+def _spread(mask: Mask, reach: int) -> Mask:
+    """Return where (n, N) a mask is true anywhere within `reach` samples."""
+    if not mask.any():
+        return mask
+    wide = np.ones(2 * reach + 1)
+    whole = np.apply_along_axis(np.convolve, 0, mask.astype(np.float64), wide)
+    return np.asarray(whole[reach : reach + len(mask)] > 0.5)

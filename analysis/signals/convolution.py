@@ -17,21 +17,36 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-BLOCK: Final = 8  # a block is at least so many times as long as the taps
+BLOCK: Final = 4  # a block is at least so many times as long as the taps
+GROUP: Final = 8  # decimated samples that are summed together
 
 
 def convolved(x: Array, taps: Array) -> Array:
     """Return the convolution of x (n, ...) with taps (m,) inside x, shape (n - m + 1, ...)."""
-    m, n = len(taps), len(x)
+    (rows,) = convolved_rows(x.reshape(len(x), -1).T, taps[None])
+    return rows.T.reshape(-1, *x.shape[1:])
+
+
+def convolved_rows(x: Array, taps: Array) -> list[Array]:
+    """Return, for each of the taps (k, m), its convolution inside the rows of x (c, n)."""
+    (rows, n), m = x.shape, taps.shape[1]
     size = 1 << (BLOCK * m - 1).bit_length()
     fresh = size - m + 1
     count = -(-(n - m + 1) // fresh)
-    flat = np.zeros((int(np.prod(x.shape[1:])), count * fresh + m - 1))
-    flat[:, :n] = x.reshape(n, -1).T
-    blocks = sliding_window_view(flat, size, axis=1)[:, ::fresh]
-    spectrum = np.fft.rfft(blocks) * np.fft.rfft(taps, size)
-    out = np.fft.irfft(spectrum, size)[:, :, m - 1 :].reshape(len(flat), -1)[:, : n - m + 1]
-    return np.ascontiguousarray(out.T).reshape(n - m + 1, *x.shape[1:])
+    response = np.fft.rfft(taps, size)
+    wide = np.zeros(count * fresh + m - 1)
+    blocks = sliding_window_view(wide, size)[::fresh]
+    out = [np.empty((rows, count, fresh)) for _ in taps]
+    spectrum, product = np.empty((2, count, size // 2 + 1), dtype=np.complex128)
+    part = np.empty((count, size))
+    # Row by row in the same space: new pages of memory would take as long as the transforms.
+    for row in range(rows):
+        wide[:n] = x[row]
+        np.fft.rfft(blocks, out=spectrum)
+        for one, transfer in zip(out, response, strict=True):
+            np.fft.irfft(np.multiply(spectrum, transfer, out=product), size, out=part)
+            one[row] = part[:, m - 1 :]
+    return [one.reshape(rows, -1)[:, : n - m + 1] for one in out]
 
 
 def same_convolved(x: Array, taps: Array) -> Array:
@@ -51,15 +66,20 @@ def decimated(x: Array, taps: Array, step: int) -> Array:
     if len(x) < len(taps) + first:
         return np.zeros((0, *x.shape[1:]))
     count = (len(x) - first - len(taps)) // step + 1
-    # Taps and samples cut into rows of `step`: one matrix product has all partial sums.
-    rows = -(-len(taps) // step)
-    turned = np.zeros(rows * step)
-    turned[: len(taps)] = taps[::-1]
-    flat = np.zeros((int(np.prod(x.shape[1:])), (count + rows - 1) * step))
-    within = min(len(x) - first, flat.shape[1])
-    flat[:, :within] = x.reshape(len(x), -1)[first : first + within].T
-    partial = flat.reshape(len(flat), -1, step) @ turned.reshape(rows, step).T
-    out = partial[:, :count, 0].copy()
-    for row in range(1, rows):
-        out += partial[:, row : row + count, row]
-    return np.ascontiguousarray(out.T).reshape(count, *x.shape[1:])
+    # Samples in chunks of GROUP steps: one matrix product has every chunk's part in the GROUP
+    # outputs that begin in it (lag 0) and in those of each chunk before (lag 1, 2, ...).
+    chunk, room = GROUP * step, (GROUP - 1) * step
+    lags = -(-(len(taps) + room) // chunk)
+    turned = np.zeros((lags + 1) * chunk)
+    turned[room : room + len(taps)] = taps[::-1]
+    begins = room + chunk * np.arange(lags)[:, None] - step * np.arange(GROUP)
+    weights = sliding_window_view(turned, chunk)[begins.ravel()].T
+    chunks = -(-count // GROUP)
+    wide = np.zeros((int(np.prod(x.shape[1:])), (chunks + lags - 1) * chunk))
+    within = min(len(x) - first, wide.shape[1])
+    wide[:, :within] = x.reshape(len(x), -1)[first : first + within].T
+    partial = (wide.reshape(-1, chunk) @ weights).reshape(len(wide), -1, lags, GROUP)
+    out: Array = partial[:, :chunks, 0].copy()
+    for lag in range(1, lags):
+        out += partial[:, lag : lag + chunks, lag]
+    return out.reshape(len(wide), -1)[:, :count].T.reshape(count, *x.shape[1:])

@@ -19,13 +19,14 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals.convolution import convolved, decimated
+from analysis.signals.convolution import convolved, convolved_rows, decimated
 from analysis.signals.settings import SIGNALS
 from rig.model.parse import InputError
 
@@ -55,6 +56,9 @@ class Smoother(Protocol):
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the filtered (d/dt)^order of x along axis 0, same shape, SI per s^order."""
 
+    def derivatives(self, x: Array, highest: int) -> Sequence[Array]:
+        """Return the filtered x (n, c) and its derivatives up to `highest`, each as by `apply`."""
+
 
 @dataclass(frozen=True)
 class FirSmoother:
@@ -70,7 +74,16 @@ class FirSmoother:
 
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the filtered (d/dt)^order of x (n, ...); raises InputError if x is too short."""
-        return convolved(_extended(x, self.reach, self.name), self.taps[order])
+        level = x[:1]  # filtered without it, so that rounding does not move a constant
+        out = convolved(_extended(x - level, self.reach, self.name), self.taps[order])
+        return out + level if order == 0 else out
+
+    def derivatives(self, x: Array, highest: int) -> Sequence[Array]:
+        """Return the filtered x (n, c) and its derivatives up to `highest`, each as by `apply`."""
+        level = x[:1]
+        wide = _extended(x - level, self.reach, self.name)
+        value, *rates = (rows.T for rows in convolved_rows(wide.T, self.taps[: highest + 1]))
+        return [value + level, *rates]
 
     def decimate(self, x: Array, step: int) -> Array:
         """Return every `step`-th filtered sample whose support lies inside x, shape (m, ...)."""
@@ -184,8 +197,9 @@ def align(x: Array, shift: float) -> Array:
     if abs(shift) < 1e-9:
         return x
     taps = _interpolation(shift)
+    level = x[:1]
     # Convolution turns the taps round.
-    return convolved(_extended(x, len(taps) // 2, "alignment"), taps[::-1])
+    return level + convolved(_extended(x - level, len(taps) // 2, "alignment"), taps[::-1])
 
 
 @functools.lru_cache(maxsize=256)

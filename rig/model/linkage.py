@@ -24,6 +24,17 @@ def angle_from_piston(
     return np.asarray(beta - offset - 2.0 * np.pi * turns, dtype=np.float64)
 
 
+def geometry_from_piston(
+    piston: ArrayLike, a: float, c: float, mid_length: float, offset: float
+) -> tuple[Array, Array, Array]:
+    """Return the angle q [rad], G = ds/dq [m] and dG/dq [m/rad] of piston displacement s [m]."""
+    q = angle_from_piston(piston, a, c, mid_length, offset)
+    length = mid_length + np.asarray(piston, dtype=np.float64)
+    slope = a * c * np.sin(q + offset) / length
+    cosine = (a * a + c * c - length * length) / (2.0 * a * c)
+    return q, slope, np.asarray((a * c * cosine - slope * slope) / length)
+
+
 def piston_from_angle(q: ArrayLike, a: float, c: float, mid_length: float, offset: float) -> Array:
     """Return the piston displacement s [m] of joint angle q [rad]."""
     beta = np.asarray(q, dtype=np.float64) + offset

@@ -57,6 +57,12 @@ class Linkage(Part):
             piston, self.base_pin, self.arm_pin, self.mid_length, self.offset
         )
 
+    def geometry(self, piston: Array | float) -> tuple[Array, Array, Array]:
+        """Return q [rad], G = ds/dq [m] and dG/dq [m/rad] of piston displacement s [m]."""
+        return linkage.geometry_from_piston(
+            piston, self.base_pin, self.arm_pin, self.mid_length, self.offset
+        )
+
     def piston(self, q: Array | float) -> Array:
         """Return the piston displacement s [m] of joint angle q [rad]."""
         return linkage.piston_from_angle(
@@ -181,8 +187,7 @@ class Joint(Part):
         A sensor may read slightly beyond the stroke's end: s is limited to 0.55 strokes.
         """
         half = 0.55 * self.cylinder.stroke
-        q = self.linkage.angle(np.clip(position, -half, half))
-        return q, self.linkage.jacobian(q), self.linkage.jacobian_rate(q)
+        return self.linkage.geometry(np.clip(position, -half, half))
 
 
 class Calibration(Part):

@@ -50,6 +50,10 @@ class FourierSmoother:
             smooth += slope * self.rate
         return np.asarray(smooth)
 
+    def derivatives(self, x: Array, highest: int) -> list[Array]:
+        """Return the low-passed x (n, c) and its derivatives up to the order `highest`."""
+        return [self.apply(x, order) for order in range(highest + 1)]
+
 
 def savitzky_golay(rate: float, samples: int = 31, degree: int = 4) -> FirSmoother:
     """Return a local polynomial fit of `degree` over an odd number of samples."""
