@@ -91,7 +91,7 @@ class EntrainedAir(Effect):
         """Return - V dp/dt times the softness of each chamber's gas per alpha."""
         out: Columns = {}
         n = exponent(shape)
-        for i in range(signals.joints):
+        for i in signals.excited_joints:
             for side, V, p, rate in (
                 ("flow_cap", signals.V_cap, signals.p_cap, signals.pd_cap),
                 ("flow_rod", signals.V_rod, signals.p_rod, signals.pd_rod),

@@ -215,7 +215,7 @@ class BulkModulusCurve(Effect):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return - V dp/dt times the curve's basis of each chamber."""
         knots, out = self.shape_of(rig, shape), {}
-        for i in range(signals.joints):
+        for i in signals.excited_joints:
             for side, V, p, rate in (
                 ("flow_cap", signals.V_cap, signals.p_cap, signals.pd_cap),
                 ("flow_rod", signals.V_rod, signals.p_rod, signals.pd_rod),

@@ -13,8 +13,20 @@ import numpy as np
 
 from analysis.identify import checks as ck
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
-from analysis.regression.rows import Filtering, Rows, default_filtering, prepared, record_rows
-from analysis.terms.base import Used, family_of
+from analysis.regression.rows import (
+    Filtering,
+    Rows,
+    columns_at,
+    default_filtering,
+    filtered_sines,
+    parameters_of,
+    places_of,
+    prepared,
+    record_rows,
+    term_part,
+    without_sines,
+)
+from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 
@@ -73,23 +85,23 @@ def with_columns(
     """
     if not extra:
         return list(built)
-    families = {c.family for used in extra for c in used.term.coefficients(rig)}
+    names = {family: parameters_of(rig, extra, family) for family in FAMILIES}
     out = []
     for record in built:
+        filtering, rows = record.conditioned.filtering, dict(record.rows)
         signals = prepared(rig, terms, record.conditioned.signals)
-        more = record_rows(rig, extra, signals, record.conditioned.filtering, families)
-        rows = {
-            name: _joined(r, more[name]) if name in more else r for name, r in record.rows.items()
-        }
+        for family in filter(names.get, FAMILIES):
+            parts = [term_part(rig, used, signals, filtering, family, signals) for used in extra]
+            for r in record.family(family):
+                at = places_of(r, signals, filtering)
+                more = columns_at(names[family], parts, r.equation, at)
+                sines = filtered_sines(signals, filtering, r.equation)
+                more = without_sines(more, sines[at] if sines.size else sines)
+                rows[r.equation] = replace(
+                    r, names=(*r.names, *names[family]), matrix=np.hstack((r.matrix, more))
+                )
         out.append(replace(record, rows=rows))
     return out
-
-
-def _joined(rows: Rows, more: Rows) -> Rows:
-    """Append columns to rows whose instants are among those of `more`."""
-    at = np.searchsorted(more.time, rows.time - 1e-9)
-    matrix = np.column_stack((rows.matrix, more.matrix[at]))
-    return replace(rows, names=(*rows.names, *more.names), matrix=matrix)
 
 
 def repeats_of(records: Iterable[tuple[int, Record | RecordHead]]) -> dict[tuple[int, str], int]:

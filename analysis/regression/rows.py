@@ -117,23 +117,31 @@ FILTERINGS: dict[str, Callable[[Record], Filtering]] = {
 
 
 def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
-    """Return the right-hand side (n,) of every equation: G F, A_cap ds/dt, - A_rod ds/dt.
+    """Return the right-hand side (n,) of every equation."""
+    kinds = [kind for family in rig.families for kind in FAMILIES[family]]
+    return {
+        equation(kind, i): right_side(rig, signals, kind, i)
+        for kind in kinds
+        for i in range(signals.joints)
+    }
+
+
+def right_side(rig: Rig, signals: Signals, kind: str, i: int) -> Array:
+    """Return joint i's (0-based) right-hand side (n,): G F, A_cap ds/dt or - A_rod ds/dt.
 
     An electric joint has its drive's torque or force alone: gain times drive.
 
     The torque is G F, by virtual work; Sakai and Maeshima's regressor prints the inverse of G.
     """
-    gains = rig.drive_gains
-    sides = {equation("torque", i): gain * signals.u[:, i] for i, gain in enumerate(gains)}
     if "fluid" not in rig.families:
-        return sides
-    for i, joint in enumerate(rig.joints):
-        cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
-        force = cap * signals.p_cap[:, i] - rod * signals.p_rod[:, i]
-        sides[equation("torque", i)] = signals.G[:, i] * force
-        sides[equation("flow_cap", i)] = cap * signals.sd[:, i]
-        sides[equation("flow_rod", i)] = -rod * signals.sd[:, i]
-    return sides
+        return np.asarray(rig.drive_gains[i] * signals.u[:, i])
+    cylinder = rig.joints[i].cylinder
+    cap, rod = cylinder.cap_area, cylinder.rod_area
+    if kind == "flow_cap":
+        return np.asarray(cap * signals.sd[:, i])
+    if kind == "flow_rod":
+        return np.asarray(-rod * signals.sd[:, i])
+    return np.asarray(signals.G[:, i] * (cap * signals.p_cap[:, i] - rod * signals.p_rod[:, i]))
 
 
 def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ...]:
@@ -203,8 +211,7 @@ class RightPart:
 
 
 def _equations(signals: Signals, family: str) -> list[str]:
-    joints = map(int, np.flatnonzero(signals.excited))
-    return [equation(kind, i) for i in joints for kind in FAMILIES[family]]
+    return [equation(kind, i) for i in signals.excited_joints for kind in FAMILIES[family]]
 
 
 def term_part(
@@ -236,18 +243,20 @@ def right_parts(
     rig: Rig, signals: Signals, filtering: Filtering, family: str
 ) -> dict[str, RightPart]:
     """Return the right sides of one family's equations of the excited joints."""
-    sides, out = right_sides(rig, signals), {}
+    out: dict[str, RightPart] = {}
+    if family not in rig.families:
+        return out
     for name in _equations(signals, family):
-        if name not in sides:
-            continue
-        i = int(name.rsplit("_", 1)[1]) - 1
+        kind, number = name.rsplit("_", 1)
+        i = int(number) - 1
         # Inertia couples the joints: a clipped piston of any joint affects every torque row.
         joints = slice(None) if family == "mechanical" else slice(i, i + 1)
-        side = low_passed(weighted({"": sides[name]}, signals, name), filtering)[""]
+        whole = {"": right_side(rig, signals, kind, i)}
+        side = low_passed(weighted(whole, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
         if family == "fluid":  # below zero the oil cavitates, and the flow balance does not hold
-            sensors &= (signals.p_cap if "cap" in name else signals.p_rod)[:, i] >= 0.0
+            sensors &= (signals.p_cap if kind == "flow_cap" else signals.p_rod)[:, i] >= 0.0
         sines = filtered_sines(signals, filtering, name)
         out[name] = RightPart(side, time, sensors, _lost(signals, joints), sines)
     return out
@@ -293,10 +302,7 @@ def assembled(
         inside = (right.time >= within[0]) & (right.time < within[1])
         dropped = _dropped(bad, right.lost, filtering, len(right.side))
         kept = inside & ~dropped
-        matrix = np.zeros((int(kept.sum()), len(names)))
-        for part in parts:
-            for parameter, column in part.columns.get(name, {}).items():
-                matrix[:, names.index(parameter)] += column[kept]
+        matrix = columns_at(names, parts, name, np.flatnonzero(kept))
         masked = int((inside & dropped).sum())
         sines = right.sines[kept] if right.sines.size else right.sines
         matrix, side = without_sines(matrix, sines), without_sines(right.side[kept], sines)
@@ -304,9 +310,20 @@ def assembled(
     return out
 
 
+def columns_at(
+    names: Sequence[str], parts: Sequence[TermPart], equation: str, at: Indices
+) -> Array:
+    """Return the columns (m, k) `names` of one equation, summed over terms, at the rows `at`."""
+    matrix = np.zeros((len(at), len(names)))
+    for part in parts:
+        for parameter, column in part.columns.get(equation, {}).items():
+            matrix[:, names.index(parameter)] += column[at]
+    return matrix
+
+
 def low_passed(columns: Mapping[str, Array], filtering: Filtering) -> dict[str, Array]:
     """Filter and decimate columns (n,) by name, before rows are dropped."""
-    stack = _inside(np.column_stack(list(columns.values())), filtering)
+    stack = _inside(np.array(list(columns.values())).T, filtering)
     if filtering.rows is None:
         stack = stack[:: filtering.step]
     else:
@@ -320,6 +337,14 @@ def instants(time: Array, filtering: Filtering, count: int) -> Array:
     if filtering.rows is not None:
         first = -(-2 * filtering.rows.reach // step) * step - filtering.rows.reach
     return _inside(time, filtering)[first + step * np.arange(count)]
+
+
+def places_of(rows: Rows, signals: Signals, filtering: Filtering) -> Indices:
+    """Return the numbers of rows (m,) among all filtered rows of their record."""
+    if not len(rows.time):
+        return np.zeros(0, dtype=np.int64)
+    since = rows.time - instants(signals.t, filtering, 1)
+    return np.asarray(np.rint(since * signals.rate / filtering.step), dtype=np.int64)
 
 
 def _inside(x: NDArray[Any], filtering: Filtering) -> NDArray[Any]:

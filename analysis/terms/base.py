@@ -155,7 +155,10 @@ class Term:
         return signals
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the columns, each (n,), by equation and parameter; absent ones are zero."""
+        """Return the columns, each (n,), by equation and parameter; absent ones are zero.
+
+        Only the equations of the excited joints (`Signals.excited_joints`) need to be among them.
+        """
         raise NotImplementedError
 
     def valid(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Mapping[str, Mask]:

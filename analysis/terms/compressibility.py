@@ -45,7 +45,7 @@ class Compressibility(Term):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return - V dp/dt of each chamber, V being that of the moving piston."""
         out: Columns = {}
-        for i in range(signals.joints):
+        for i in signals.excited_joints:
             out[equation("flow_cap", i)] = {"b": -signals.V_cap[:, i] * signals.pd_cap[:, i]}
             out[equation("flow_rod", i)] = {"b": -signals.V_rod[:, i] * signals.pd_rod[:, i]}
         return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -55,20 +56,24 @@ class Inertia(Term):
         N = signals.joints
         # Sums over joints as a loop: along an axis of two or three, numpy's sums take longer.
         rate, acceleration = _running(signals.qd.T), _running(signals.qdd.T)
+        lowest = min(signals.excited_joints, default=N)  # its torque carries links from here on
         feels: dict[tuple[int, int], Array] = {(k, k): acceleration[k] for k in range(N)}
-        for k in range(N):
-            for j in range(k + 1, N):
-                turn = signals.theta[:, k] - signals.theta[:, j]
-                c, s = np.cos(turn), np.sin(turn)
+        for k, j in itertools.combinations(range(N), 2):
+            if j < lowest:
+                continue
+            turn = signals.theta[:, k] - signals.theta[:, j]
+            c, s = np.cos(turn), np.sin(turn)
+            feels[j, k] = c * acceleration[k] - s * rate[k] ** 2
+            if k >= lowest:
                 feels[k, j] = c * acceleration[j] + s * rate[j] ** 2
-                feels[j, k] = c * acceleration[k] - s * rate[k] ** 2
-        out: Columns = {equation("torque", i): {} for i in range(N)}
+        out: Columns = {equation("torque", i): {} for i in signals.excited_joints}
         for weights, coefficient in zip(inertia_map(N), self.coefficients(rig), strict=True):
-            on_link = [np.zeros(len(signals.qd)) for _ in range(N)]
-            for k, j in map(tuple, np.argwhere(weights)):
-                on_link[k] += weights[k, j] * feels[k, j]
-            for i, on_joint in enumerate(reversed(_running(on_link[::-1]))):
-                out[equation("torque", i)][coefficient.parameter] = on_joint
+            pairs = list(map(tuple, np.argwhere(weights)))
+            for i in signals.excited_joints:
+                carried = [weights[k, j] * feels[k, j] for k, j in pairs if k >= i]
+                if carried:
+                    total = functools.reduce(np.add, carried)
+                    out[equation("torque", i)][coefficient.parameter] = total
         return out
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:

@@ -58,7 +58,7 @@ class Orifice(Term):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the four roots times the opening, in the chamber that each edge serves."""
         out: Columns = {}
-        for i in range(signals.joints):
+        for i in signals.excited_joints:
             pp, pm, mp, mm = gain_names(i + 1)
             u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
             cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
@@ -75,13 +75,12 @@ class Orifice(Term):
 
     def valid(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Mapping[str, Mask]:
         """Return where each chamber's pressure lies in [p_t, p_s]."""
-        p_s, p_t = signals.p_s[:, None], signals.p_tank[:, None]
-        cap = (signals.p_cap >= p_t) & (signals.p_cap <= p_s)
-        rod = (signals.p_rod >= p_t) & (signals.p_rod <= p_s)
+        p_s, p_t = signals.p_s, signals.p_tank
         out: dict[str, Mask] = {}
-        for i in range(signals.joints):
-            out[equation("flow_cap", i)] = cap[:, i]
-            out[equation("flow_rod", i)] = rod[:, i]
+        for i in signals.excited_joints:
+            for kind, pressures in (("flow_cap", signals.p_cap), ("flow_rod", signals.p_rod)):
+                p = pressures[:, i]
+                out[equation(kind, i)] = (p >= p_t) & (p <= p_s)
         return out
 
 

@@ -68,7 +68,7 @@ class BulkTemperature(Term):
         reference = rig.oil.temperature if self.reference is None else self.reference
         kelvin = signals.temperature - reference
         out: Columns = {}
-        for i in range(signals.joints):
+        for i in signals.excited_joints:
             out[equation("flow_cap", i)] = {KAPPA: -signals.V_cap[:, i] * signals.pd_cap[:, i]}
             out[equation("flow_rod", i)] = {KAPPA: -signals.V_rod[:, i] * signals.pd_rod[:, i]}
         return {e: {KAPPA: column[KAPPA] * kelvin} for e, column in out.items()}
@@ -89,7 +89,7 @@ class LaminarTransition(Term):
         """Return the column of each chamber."""
         C = dict(self.gains)
         out: Columns = {}
-        for i in range(signals.joints):
+        for i in signals.excited_joints:
             pp, pm, mp, mm = (C.get(name, 0.0) for name in gain_names(i + 1))
             u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
             cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
@@ -114,9 +114,9 @@ class SpoolPath(Term):
         return (Coefficient(f"{BETWEEN}{self.joint + 1}", "", "fluid"),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the column of each chamber; none where a joint stands still."""
+        """Return the column of each chamber; none where the joint is not excited."""
         C, i = dict(self.gains), self.joint
-        if i >= signals.joints:
+        if i not in signals.excited_joints:
             return {}
         pp, pm, mp, mm = (C.get(name, 0.0) for name in gain_names(i + 1))
         u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
@@ -130,9 +130,8 @@ class SpoolPath(Term):
 
 
 def _lost(drop: Array) -> Array:
-    return np.asarray(
-        -0.25 * np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop) ** -1.5
-    )
+    held = np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop)
+    return np.asarray(-0.25 / (held * np.sqrt(held)))
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,15 @@ from analysis.identify import checks as ck
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.rows import (
     Filtering,
-    Indices,
     Rows,
     TermPart,
     assembled,
     default_filtering,
     filtered_sines,
     in_common,
-    instants,
     low_passed,
     parameters_of,
+    places_of,
     record_rows,
     right_parts,
     term_part,
@@ -134,7 +133,7 @@ def _at_rows(
     conditioned: ConditionedRecord, columns: Mapping[str, Array], rows: Rows
 ) -> dict[str, Array]:
     """Return filtered columns at the instants (m,) of rows, without the sines that these lack."""
-    at = _row_places(conditioned, len(next(iter(columns.values()))), rows)
+    at = places_of(rows, conditioned.signals, conditioned.filtering)
     sines = sines_at(conditioned, rows)
     return {name: without_sines(column[at], sines) for name, column in columns.items()}
 
@@ -142,13 +141,8 @@ def _at_rows(
 def sines_at(conditioned: ConditionedRecord, rows: Rows) -> Array:
     """Return the sines and cosines (m, 2 l) that a record's rows are without, at their instants."""
     sines = filtered_sines(conditioned.signals, conditioned.filtering, rows.equation)
-    return sines[_row_places(conditioned, len(sines), rows)] if sines.size else sines
-
-
-def _row_places(conditioned: ConditionedRecord, count: int, rows: Rows) -> Indices:
-    """Return the numbers of rows (m,) among all `count` filtered rows of their record."""
-    time = instants(conditioned.signals.t, conditioned.filtering, count)
-    return np.searchsorted(time, rows.time - 1e-9)
+    at = places_of(rows, conditioned.signals, conditioned.filtering)
+    return sines[at] if sines.size else sines
 
 
 def shared_rows(
