@@ -72,10 +72,12 @@ def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFi
         c.parameter for u in model.terms if isinstance(u.term, Effect)
         for c in u.term.coefficients(rig)
     }  # fmt: skip
-    at = [k for k, name in enumerate(rows.names) if name not in {KAPPA, *of_effects}]
+    # A coefficient that no row contains would be moved by rounding alone.
+    shown = np.sum(rows.matrix**2, axis=0) + np.diag(model.information) > 0.0
+    at = [k for k, n in enumerate(rows.names) if shown[k] and n not in {KAPPA, *of_effects}]
     X, known = rows.matrix[:, at], model.information[np.ix_(at, at)]
     seen = X.T @ X
-    scale = np.sqrt(np.maximum(np.diag(seen) + np.diag(known), 1e-300))
+    scale = np.sqrt(np.diag(seen) + np.diag(known))
     least = TRACE.eigenvalue_ratio * np.eye(len(at))
     ratio, directions = eigh(seen / np.outer(scale, scale), known / np.outer(scale, scale) + least)
     free = directions[:, ratio > TRACE.information_ratio] / scale[:, None]
