@@ -193,23 +193,39 @@ def _prepare(
         beside = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
         beside = [n for n in beside if n in columns and n not in mine]
         prepared = _family(built, family, columns, mine, beside)
-        for name in tuple(beside):
-            fit, fit_names = least_squares(prepared.blocks), prepared.names
-            # Rebuilt each time: leaving out a nuisance shifts the columns.
-            beliefs = {b.name: b for b in nu.beliefs(prepared.names, fit.beta)}
-            if name not in beliefs:
-                continue
-            belief = beliefs[name]
-            error = spread([pieces(fit)], fit.inverse)
-            wrong = nu.implausible(belief, fit.beta, error.covariance)
-            moved = None
-            if wrong:
-                beside.remove(belief.name)
-                prepared = _family(built, family, columns, mine, beside)
-                moved = largest_move(mine, fit.beta, least_squares(prepared.blocks).beta, error)
-            checks.append(nuisance_statement(belief, fit_names, fit.beta, error, moved))
+        if beside:
+            prepared, stated = _plausible(prepared)
+            checks += stated
         out.append(prepared)
     return out, checks
+
+
+def _plausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:
+    """Return a family without the nuisances that its data contradict, with a check for each."""
+    checks = []
+    fit = least_squares(p.blocks)
+    error = spread([pieces(fit)], fit.inverse)
+    for name in p.names[p.parameters :]:
+        # Found anew each time: leaving out a nuisance shifts the columns.
+        belief = next((b for b in nu.beliefs(p.names, fit.beta) if b.name == name), None)
+        if belief is None:
+            continue
+        if not nu.implausible(belief, fit.beta, error.covariance):
+            checks.append(nuisance_statement(belief, p.names, fit.beta, error, None))
+            continue
+        less = _without(p, name)
+        left = least_squares(less.blocks)
+        moved = largest_move(p.names[: p.parameters], fit.beta, left.beta, error)
+        checks.append(nuisance_statement(belief, p.names, fit.beta, error, moved))
+        p, fit, error = less, left, spread([pieces(left)], left.inverse)
+    return p, checks
+
+
+def _without(p: FamilyBlocks, name: str) -> FamilyBlocks:
+    """Return a family's blocks without the column `name`."""
+    at = p.names.index(name)
+    blocks = tuple(replace(b, X=np.delete(b.X, at, axis=1)) for b in p.blocks)
+    return replace(p, names=(*p.names[:at], *p.names[at + 1 :]), blocks=blocks)
 
 
 def _family(

@@ -190,12 +190,10 @@ def _folded(
     rig: Rig, terms: Sequence[Used], chunks: Iterable[Mapping[str, Rows]], duration: float
 ) -> tuple[dict[str, tuple[Part, ...]], int]:
     """Return a triangle per family and part of a record of `duration` [s], and masked rows."""
+    columns = {family: len(parameters_of(rig, terms, family)) for family in FAMILIES}
     sums = {
-        family: [
-            Accumulator(len(parameters_of(rig, terms, family)))
-            for _ in range(IDENTIFY.record_segments)
-        ]
-        for family in FAMILIES
+        family: [Accumulator(count) for _ in range(IDENTIFY.record_segments)]
+        for family, count in columns.items()
     }
     masked = 0
     for rows_by_equation in chunks:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import Rows, record_rows
+from analysis.regression.rows import Rows, in_common, record_rows
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -65,5 +65,5 @@ def record_moments(
 
 def _difference(rows: Rows, other: Rows) -> Array:
     """Return the change of [X y] in the rows that both have."""
-    _, a, b = np.intersect1d(rows.time, other.time, return_indices=True)
+    a, b = in_common(rows, other)
     return np.column_stack((other.matrix[b] - rows.matrix[a], other.rhs[b] - rows.rhs[a]))

@@ -26,6 +26,7 @@ from analysis.regression.least_squares import factored
 from analysis.regression.settings import REGRESSION
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -163,34 +164,45 @@ def _clustered(beta: Array, bread: Array, clusters: Sequence[RowCluster]) -> tup
     k = len(beta)
     labels: dict[tuple[Hashable, Hashable], int] = {}
     member = [labels.setdefault((c.stratum, c.key), len(labels)) for c in clusters]
-    sums = np.zeros((len(labels), k))
     triangles = np.array([c.triangle for c in clusters]).reshape(-1, k + 1, k + 1)
-    np.add.at(sums, np.array(member, dtype=np.int64), scores(beta, triangles))
+    sums = sums_of(scores(beta, triangles), np.array(member, dtype=np.int64))
     number = {s: n for n, s in enumerate(dict.fromkeys(stratum for stratum, _ in labels))}
     strata = np.array([number[stratum] for stratum, _ in labels], dtype=np.int64)
-    scatter = stratified(strata, sums @ bread)
+    scatter = stratified(sums @ bread, strata)
     return (np.full((k, k), np.nan), np.full(k, np.nan)) if scatter is None else scatter
 
 
-def stratified(stratum: NDArray[np.int64], influence: Array) -> tuple[Array, Array] | None:
+def stratified(influence: Array, *labels: Indices) -> tuple[Array, Array] | None:
     """Return sum over strata of n/(n-1) sum (u - mean)(u - mean)' (k, k) of influences u (c, k).
 
-    `stratum` (c,) or (c, l) labels them. Also Satterthwaite's degrees of freedom (k,); None where
-    a stratum has one member only.
+    A stratum has equal `labels`, each (c,). Also Satterthwaite's degrees of freedom (k,); None
+    where a stratum has one member only.
     """
-    k = influence.shape[1]
-    total, squares = np.zeros((k, k)), np.zeros(k)
-    labels = np.unique(stratum, axis=0, return_inverse=True)[1].ravel()
-    for label in range(labels.max(initial=-1) + 1):
-        u = influence[labels == label]
-        n = len(u)
-        if n < 2:
-            return None
-        u = u - u.mean(axis=0)
-        part = u.T @ u * (n / (n - 1))
-        total += part
-        squares += np.diag(part) ** 2 / (n - 1)
+    _, number = numbered(*labels)
+    n = np.bincount(number)[:, None]
+    if (n < 2).any():
+        return None
+    u = (influence - (sums_of(influence, number) / n)[number]) * np.sqrt(n / (n - 1))[number]
+    squares = np.sum(sums_of(u**2, number) ** 2 / (n - 1), axis=0)
+    total = u.T @ u
     return total, satterthwaite(np.diag(total), squares)
+
+
+def numbered(*labels: Indices) -> tuple[Indices, Indices]:
+    """Number the combinations of labels (c,): the first place (g,) of each, the number (c,)."""
+    code = np.zeros(len(labels[0]), dtype=np.int64)
+    for label in labels:
+        values, place = np.unique(label, return_inverse=True)
+        code = code * len(values) + place
+    _, first, number = np.unique(code, return_index=True, return_inverse=True)
+    return first, number
+
+
+def sums_of(values: Array, number: Indices) -> Array:
+    """Return the sums (g, ...) of values (c, ...) of equal number (c,), which is 0 .. g - 1."""
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], np.arange(number.max(initial=-1) + 1))
+    return np.asarray(np.add.reduceat(values[order], first, axis=0))
 
 
 def satterthwaite(variance: Array, squares: Array) -> Array:

@@ -62,16 +62,16 @@ def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
 
 def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
     """Return the scatter between repeats of a step (k, k); None where a step has only one."""
-    stratum, score, _ = pieces.grouped(pieces.repeat)
-    sandwich = stratified(stratum, score @ inverse.T)
+    stratum, score = pieces.grouped(pieces.repeat, pieces.score)
+    sandwich = stratified(score @ inverse.T, stratum)
     return None if sandwich is None else CovarianceParts(*sandwich, np.zeros(len(inverse)))
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
     """Return V_groups - V_noise (k, k), positive; zero for parameters without significance."""
-    _, score, _ = pieces.grouped(pieces.part)
+    _, score = pieces.grouped(pieces.part, pieces.score)
     u = score @ inverse.T
-    noise = stratified(np.column_stack((pieces.stratum, pieces.part)), pieces.score @ inverse.T)
+    noise = stratified(pieces.score @ inverse.T, pieces.stratum, pieces.part)
     k = len(inverse)
     if noise is None:
         return np.zeros((k, k))
@@ -90,7 +90,9 @@ def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
 
     A direction that the rows do not determine, zero in `inverse` (k, k), gets no variance.
     """
-    stratum, score, information = pieces.grouped(pieces.part)
+    assert pieces.information is not None, "a step with one repeat has it"
+    stratum, score = pieces.grouped(pieces.part, pieces.score)
+    _, information = pieces.grouped(pieces.part, pieces.information)
     A = scaled_inverse(inverse)
     left_out = np.array(
         [_without(A, inverse, part, g) for part, g in zip(information, score, strict=True)]

@@ -6,6 +6,7 @@ A = sum Z'wX the influence of a set of rows c on beta is A^-1 sum_c Z'w e.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import scaled_inverse
+from analysis.regression.solve import numbered, sums_of
 from analysis.signals.filters import bridged
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -125,50 +127,44 @@ class Pieces:
     """Scores g = Z'w e and information A of every (stratum, repeat, part) that has rows.
 
     Arrays of the length of the pieces: `stratum`, `repeat`, `part` (c,), `score` (c, k),
-    `information` (c, k, k).
+    `information` (c, k, k), None where every step has repeats: only a single one needs it.
     """
 
     stratum: Indices
     repeat: Indices
     part: Indices
     score: Array
-    information: Array
+    information: Array | None
 
-    def grouped(self, key: Indices) -> tuple[Indices, Array, Array]:
-        """Sum pieces of equal stratum and `key`: (stratum (g,), scores, information)."""
-        table = np.column_stack((self.stratum, key))
-        unique, place = np.unique(table, axis=0, return_inverse=True)
-        score = np.zeros((len(unique), self.score.shape[1]))
-        information = np.zeros((len(unique), *self.information.shape[1:]))
-        np.add.at(score, place.ravel(), self.score)
-        np.add.at(information, place.ravel(), self.information)
-        return unique[:, 0], score, information
+    def grouped(self, key: Indices, values: Array) -> tuple[Indices, Array]:
+        """Sum values (c, ...) of pieces of equal stratum and `key`: (stratum (g,), sums)."""
+        first, number = numbered(self.stratum, key)
+        return self.stratum[first], sums_of(values, number)
 
 
 def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
     """Return scores and information of a fit by stratum, repeat and `segment` or `level`."""
     strata = {s: i for i, s in enumerate(sorted({b.stratum for b in fit.blocks}))}
-    sums: dict[tuple[int, int, int], tuple[Array, Array]] = {}
+    repeats = {(b.stratum, b.repeat) for b in fit.blocks}
+    single = min(Counter(stratum for stratum, _ in repeats).values()) < 2
+    keys, score, information = [], [], []
     for b, z, weight, e in zip(fit.blocks, fit.Z, fit.w, fit.residuals(), strict=True):
-        weighted = z * weight[:, None]
         labels = b.segment if by == "segment" else b.level
-        # Rows sorted by part: one product for each contiguous stretch.
-        order = np.argsort(labels, kind="stable")
-        parts, first = np.unique(labels[order], return_index=True)
-        weighted, error, X = weighted[order], e[order], b.X[order]
-        ends = [*first[1:].tolist(), len(order)]
-        for part, begin, end in zip(parts.tolist(), first.tolist(), ends, strict=True):
-            here = weighted[begin:end].T
-            score, information = here @ error[begin:end], here @ X[begin:end]
-            key = (strata[b.stratum], b.repeat, part)
-            if key in sums:
-                score, information = score + sums[key][0], information + sums[key][1]
-            sums[key] = (score, information)
-    keys = np.array(list(sums), dtype=np.int64)
+        parts = np.unique(labels)
+        inside = (labels == parts[:, None]).astype(np.float64)
+        score.append(inside @ (z * (weight * e)[:, None]))
+        if single:
+            information += [(z * (weight * here)[:, None]).T @ b.X for here in inside]
+        keys += [(strata[b.stratum], b.repeat, place) for place in parts.tolist()]
+    stratum, repeat, part = np.array(keys, dtype=np.int64).T
+    first, number = numbered(stratum, repeat, part)
     return Pieces(
-        keys[:, 0], keys[:, 1], keys[:, 2],
-        np.array([g for g, _ in sums.values()]), np.array([a for _, a in sums.values()]),
-    )  # fmt: skip
+        stratum[first],
+        repeat[first],
+        part[first],
+        sums_of(np.concatenate(score), number),
+        sums_of(np.array(information), number) if single else None,
+    )
 
 
 def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
@@ -176,8 +172,9 @@ def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
     shared = shared_ticks(blocks)
     out = []
     for b in blocks:
-        here = np.isin(_ticks(b), shared[*b.stratum, b.equation])
-        out.append(b if here.all() else rows_of(b, here))
+        ticks = shared[*b.stratum, b.equation]
+        same = len(ticks) == len(b.time)  # nearly always
+        out.append(b if same else rows_of(b, np.isin(_ticks(b), ticks)))
     return out
 
 
@@ -185,8 +182,10 @@ def shared_ticks(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], Ar
     """Return, by (run, step, equation), the times [s] of rows that every repeat has."""
     shared: dict[tuple[int, str, str], Array] = {}
     for b in blocks:
-        key = (*b.stratum, b.equation)
-        shared[key] = np.intersect1d(shared[key], _ticks(b)) if key in shared else _ticks(b)
+        key, ticks = (*b.stratum, b.equation), _ticks(b)
+        before = shared.setdefault(key, ticks)
+        if not np.array_equal(before, ticks):
+            shared[key] = np.intersect1d(before, ticks)
     return shared
 
 

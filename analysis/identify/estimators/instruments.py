@@ -78,7 +78,7 @@ def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
     difference = ls.beta - iv.beta
     plain, instrumented = pieces(ls), pieces(iv)
     influence = plain.score @ ls.inverse.T - instrumented.score @ iv.inverse.T
-    scatter = stratified(np.column_stack((plain.stratum, plain.part)), influence)
+    scatter = stratified(influence, plain.stratum, plain.part)
     assert scatter is not None, "instruments exist only where steps have repeats"
     covariance, dof = scatter
     error = np.sqrt(np.diag(covariance))
