@@ -141,7 +141,8 @@ def step(
         rates(trial, end[2], warmth, joints, bench, inertia, w, k[3])
         for n in range(size):
             y[n] += d / 6.0 * (k[0, n] + 2.0 * (k[1, n] + k[2, n]) + k[3, n])
-        spool[:] = end
+        for i in range(len(joints)):
+            spool[0, i], spool[1, i], spool[2, i] = end[0, i], end[1, i], end[2, i]
         remaining = remaining - d if at < 1.0 else 0.0
 
 
@@ -267,6 +268,11 @@ def hold_waves(tick: int, time: float, period: float, joints: Any, laws: Any) ->
             joints[i].wave_now = joints[i].wave_torque * turned
 
 
+def work_size(n: int) -> int:
+    """Return the length of the array in which `run` keeps its intermediate values of N joints."""
+    return 5 * (5 * n + 3) + 6 * n + (n + 4) * n + 2 * n
+
+
 @jit
 def run(
     tick: int,
@@ -285,16 +291,22 @@ def run(
     noise: Any,
     measured: Any,
     codes: Any,
+    work: Any,
 ) -> None:
     """Run len(measured) ticks: measure, evaluate the laws, hold the outputs for one period.
 
     In place: state y, spool, rings values and slopes (ring, channels). Out: AD codes (ticks,
     channels) as `rig.model.wire.codes.encode_input` defines them, DA codes (ticks, joints). `noise`
-    is standard normal, (ticks, channels).
+    is standard normal, (ticks, channels); work has `work_size` elements.
     """
     n, bench = len(joints), bench_table[0]
-    w, k, ends = np.zeros((n + 4, n)), np.zeros((5, len(y))), np.zeros((2, 3, n))
-    target, position = np.zeros(n), np.zeros(n)
+    # One array for all: each further one costs time to hand over, for every block of ticks.
+    a = 5 * len(y)
+    b = a + 6 * n
+    c = b + (n + 4) * n
+    k, ends = work[:a].reshape(5, len(y)), work[a:b].reshape(2, 3, n)
+    w = work[b:c].reshape(n + 4, n)
+    target, position = work[c : c + n], work[c + n :]
     for row in range(len(measured)):
         heat = temperature(tick * period, bench)
         warmth = 1.0 + bench.bulk_temperature * (heat - bench.temperature)

@@ -66,6 +66,7 @@ class Plant:
         self._state, self._spool = rest(self._tables)
         self._joints, self._width = len(rig.joints), len(rig.channels)
         self._draws, self._used = np.empty((0, self._width)), 0
+        self._work = np.zeros(kernel_loop.work_size(self._joints))
         self._laws: tuple[Law, ...] = ()
         ring = ring_length(self._tables.channels, self._period)
         self._values, self._slopes = np.zeros((ring, self._width)), np.zeros((ring, self._width))
@@ -107,6 +108,7 @@ class Plant:
             self._noise_of(ticks),
             measured,
             outputs,
+            self._work,
         )
         self.tick += ticks
         return measured, outputs
