@@ -69,11 +69,20 @@ class Rows:
     masked: int
 
 
-def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
-    """Return the indices, in either set of rows, of the instants that both have."""
+def matrix_of(rows: Rows, names: tuple[str, ...]) -> Array:
+    """Return the columns (m, k) of parameters, 0 for those that the rows lack."""
+    if rows.names[: len(names)] == names:
+        return rows.matrix[:, : len(names)]
+    out = np.zeros((len(rows.rhs), len(names)))
+    known = [k for k, name in enumerate(names) if name in rows.names]
+    out[:, known] = rows.matrix[:, [rows.names.index(names[k]) for k in known]]
+    return out
+
+
+def in_common(one: Rows, other: Rows) -> tuple[Indices | slice, Indices | slice]:
+    """Return where, in either set of rows, the instants are that both have."""
     if np.array_equal(one.time, other.time):  # nearly always
-        at = np.arange(len(one.time))
-        return at, at
+        return slice(None), slice(None)
     _, here, there = np.intersect1d(one.time, other.time, return_indices=True)
     return here, there
 

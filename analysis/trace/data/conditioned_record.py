@@ -27,6 +27,7 @@ from analysis.regression.rows import (
     filtered_sines,
     in_common,
     low_passed,
+    matrix_of,
     parameters_of,
     places_of,
     record_rows,
@@ -254,10 +255,7 @@ def candidate_columns(
         before = rows[name]
         here, there = in_common(before, after)
         # Column by column, so that an unchanged column gives a difference of exactly 0.
-        moved = -before.matrix[here]
-        for k, n in enumerate(before.names):
-            if n in after.names:  # a column of zeros is left out of rows
-                moved[:, k] += after.matrix[there, after.names.index(n)]
+        moved = matrix_of(after, before.names)[there] - before.matrix[here]
         side = after.rhs[there] - before.rhs[here]
         columns = {"": np.zeros(len(before.rhs))}
         columns[""][here] = moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Evidence
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
-from analysis.regression.rows import Rows
+from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.cache import RowCache
@@ -206,7 +206,7 @@ def regression_data(
             cut = _rows_at(mean, time)
             kept_rows[-1][equation] = cut
             sigma = max(noise[conditioned.group, equation], 1e-30)
-            base.append(_matrix_of(cut, names) * np.sqrt(len(own)) / sigma)
+            base.append(matrix_of(cut, names) * np.sqrt(len(own)) / sigma)
             table = np.full((most, len(time)), np.nan)
             for k, record in enumerate(own):
                 table[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
@@ -231,13 +231,6 @@ def regression_data(
 def _rows_at(rows: Rows, time: Array) -> Rows:
     kept = np.isin(rows.time, time)
     return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
-
-
-def _matrix_of(rows: Rows, names: Sequence[str]) -> Array:
-    """Return the rows' matrix (m, k) with a column for each of `names`, 0 for those it lacks."""
-    out = np.zeros((len(rows.rhs), len(names)))
-    out[:, [names.index(n) for n in rows.names]] = rows.matrix
-    return out
 
 
 @dataclass(frozen=True)

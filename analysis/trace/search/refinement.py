@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shapes_of
-from analysis.regression.rows import in_common, parameters_of
+from analysis.regression.rows import in_common, matrix_of, parameters_of
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.conditioned_record import acting_on, shared_rows
 from analysis.trace.data.regression_data import RegressionData
@@ -125,13 +125,13 @@ def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> 
             float(np.linalg.norm(rows.rhs[there])), 1e-300
         )
         weight = np.sqrt(segment.repeats) / segment.noise * size
-        at = start + here
-        columns = np.array([names.index(n) for n in rows.names], dtype=np.int64)
-        X[np.ix_(at, columns)] = rows.matrix[there] * weight
-        y[at] = rows.rhs[there] * weight
-        kept.setdefault(segment.equation, []).append(at)
-        every.setdefault(segment.equation, []).append(start + np.arange(len(before.rhs)))
-        start += len(before.rhs)
+        own = np.arange(start, start + len(before.rhs))
+        inside = slice(start, start + len(own))
+        X[inside][here] = matrix_of(rows, names)[there] * weight
+        y[inside][here] = rows.rhs[there] * weight
+        kept.setdefault(segment.equation, []).append(own[here])
+        every.setdefault(segment.equation, []).append(own)
+        start += len(own)
     return DesignMatrix(names, X, y, _cavitating(kept, every))
 
 
