@@ -9,6 +9,7 @@ those are summed.
 
 from __future__ import annotations
 
+import functools
 from typing import Final
 
 import numpy as np
@@ -68,12 +69,8 @@ def decimated(x: Array, taps: Array, step: int) -> Array:
     count = (len(x) - first - len(taps)) // step + 1
     # Samples in chunks of GROUP steps: one matrix product has every chunk's part in the GROUP
     # outputs that begin in it (lag 0) and in those of each chunk before (lag 1, 2, ...).
-    chunk, room = GROUP * step, (GROUP - 1) * step
-    lags = -(-(len(taps) + room) // chunk)
-    turned = np.zeros((lags + 1) * chunk)
-    turned[room : room + len(taps)] = taps[::-1]
-    begins = room + chunk * np.arange(lags)[:, None] - step * np.arange(GROUP)
-    weights = sliding_window_view(turned, chunk)[begins.ravel()].T
+    chunk, weights = GROUP * step, _weights(np.ascontiguousarray(taps).tobytes(), step)
+    lags = weights.shape[1] // GROUP
     chunks = -(-count // GROUP)
     wide = np.zeros((int(np.prod(x.shape[1:])), (chunks + lags - 1) * chunk))
     within = min(len(x) - first, wide.shape[1])
@@ -83,3 +80,16 @@ def decimated(x: Array, taps: Array, step: int) -> Array:
     for lag in range(1, lags):
         out += partial[:, lag : lag + chunks, lag]
     return out.reshape(len(wide), -1)[:, :count].T.reshape(count, *x.shape[1:])
+
+
+@functools.lru_cache(maxsize=64)
+def _weights(taps: bytes, step: int) -> Array:
+    """Return the weights (GROUP step, lags GROUP) of the samples of a chunk in its outputs."""
+    turned = np.frombuffer(taps)[::-1]
+    chunk, room = GROUP * step, (GROUP - 1) * step
+    lags = -(-(len(turned) + room) // chunk)
+    wide = np.zeros((lags + 1) * chunk)
+    wide[room : room + len(turned)] = turned
+    begins = room + chunk * np.arange(lags)[:, None] - step * np.arange(GROUP)
+    weights: Array = sliding_window_view(wide, chunk)[begins.ravel()].T
+    return weights

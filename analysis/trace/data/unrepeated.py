@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.signal import lombscargle
 
 from analysis.trace.data.noise_floor import PERIODS, REPEATS, Floor
 from analysis.trace.data.regression_data import RegressionData, Segment
@@ -87,17 +86,24 @@ def dominant_frequency(parts: Sequence[tuple[Array, Array]]) -> tuple[float, flo
     whole = sum(float(np.sum(series**2)) for _, series in parts)
 
     def share(frequency: Array) -> Array:
-        return np.asarray(
-            sum(
-                lombscargle(time, r - r.mean(), 2 * np.pi * frequency, normalize=True) * (r @ r)
-                for time, series in parts
-                for r in series
-            )
-            / whole
-        )
+        return np.asarray(sum(_sine_energy(t, series, frequency) for t, series in parts) / whole)
 
     frequency = np.arange(2.0 / length, highest, 0.25 / length)
     coarse = float(frequency[np.argmax(share(frequency))])
     bounds = (coarse - 0.25 / length, coarse + 0.25 / length)
     best = minimize_scalar(lambda f: -share(np.array([f])).item(), bounds=bounds, method="bounded")
     return float(best.x), -float(best.fun)
+
+
+def _sine_energy(time: Array, series: Array, frequency: Array) -> Array:
+    """Return the energy (f,) that a sine at each frequency [Hz] fits in series (n, m), summed.
+
+    Least squares with free amplitude and phase for each series (Lomb 1976).
+    """
+    series = series - series.mean(axis=1, keepdims=True)
+    angle = 2 * np.pi * time[:, None] * frequency
+    c, s = np.cos(angle), np.sin(angle)
+    cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
+    a, b = series @ c, series @ s
+    fitted = (ss * a * a - 2 * cs * a * b + cc * b * b).sum(axis=0)
+    return np.asarray(fitted / (cc * ss - cs * cs))

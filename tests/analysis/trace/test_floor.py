@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lombscargle
 
 from analysis.effects.friction import CoulombFriction
 from analysis.simulation.synthetic import multisine, synthetic_run
@@ -15,7 +16,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import NEIGHBOURS, REPEATS, STATED, Floor, floors, stated_noise
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.data.unrepeated import unrepeated_notes
+from analysis.trace.data.unrepeated import dominant_frequency, unrepeated_notes
 from analysis.trace.settings import DATA
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -130,3 +131,17 @@ def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(
         kept[segment.where] = segment.equation != "torque_2"
     others = [note for note in after if not note.startswith("torque_2")]
     assert unrepeated_notes(moved.at(kept)) == others
+
+
+def test_the_frequency_of_a_scatter_is_where_another_library_finds_its_energy() -> None:
+    """Three repeats with samples left out: compared with scipy's Lomb-Scargle periodogram."""
+    rng = np.random.default_rng(3)
+    time = np.sort(rng.choice(np.arange(500), 430, replace=False)) / 50
+    turns = 2 * np.pi * (6.31 * time + rng.uniform(size=(3, 1)))
+    series = np.sin(turns) + rng.normal(size=(3, len(time)))
+    series -= series.mean(axis=1, keepdims=True)
+    found, share = dominant_frequency([(time, series)])
+    near = np.arange(6.2, 6.4, 1e-4)
+    power = sum(lombscargle(time, r, 2 * np.pi * near, normalize=True) * (r @ r) for r in series)
+    assert found == pytest.approx(near[np.argmax(power)], abs=1e-3)
+    assert share == pytest.approx(np.max(power) / np.sum(series**2), rel=1e-6)
