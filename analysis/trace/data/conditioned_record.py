@@ -98,14 +98,14 @@ def families_of(rig: Rig, term: Term) -> frozenset[str]:
 
 def acting_on(rig: Rig, terms: Iterable[Used], family: str, cache: RowCache) -> tuple[Used, ...]:
     """Return the terms that have columns in a family's rows or change their signals."""
-    known = cache.families
-    out = []
-    for u in terms:
-        if u.term not in known:
-            known[u.term] = families_of(rig, u.term)
-        if family in known[u.term]:
-            out.append(u)
-    return tuple(out)
+    return tuple(u for u in terms if family in _families(rig, u.term, cache))
+
+
+def _families(rig: Rig, term: Term, cache: RowCache) -> frozenset[str]:
+    found = cache.families.get(term)
+    if found is None:
+        found = cache.families[term] = families_of(rig, term)
+    return found
 
 
 def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
@@ -154,10 +154,14 @@ def shared_rows(
     Many models share the terms that act on a family of rows. The columns of an effect that changes
     no signal are filtered separately and appended to the rows of the other terms.
     """
-    here = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
+    here = [
+        (u, _families(rig, u.term, cache))
+        for u in terms
+        if not is_hidden_by_lock(u.term, conditioned)
+    ]
     out: dict[str, Rows] = {}
     for family in conditioned.families:
-        acting = acting_on(rig, here, family, cache)
+        acting = [u for u, families in here if family in families]
         added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
@@ -244,7 +248,7 @@ def candidate_columns(
     """
     if not changes_signals(used.term):
         return _added_columns(rig, conditioned, lambda: seen, rows, used, cache)
-    acting = families_of(rig, used.term)
+    acting = _families(rig, used.term, cache)
     families = tuple(f for f in conditioned.families if f in acting)
     changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), cache)
     own = [c.parameter for c in used.term.coefficients(rig)]
