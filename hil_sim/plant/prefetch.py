@@ -51,7 +51,12 @@ class Prefetch:
 
     def prefetch(self, ticks: int, laws: Sequence[Any]) -> None:
         """Compute the next `ticks` samples under `laws`, unless done already or impossible."""
-        if self._block is not None or (mark := self._plant.mark()) is None:
+        if self._block is not None:
+            if self._holds(laws):
+                return
+            self._block = None
+            self._plant.rewind(self._mark)
+        if (mark := self._plant.mark()) is None:
             return
         try:
             ahead = self._plant.advance(ticks, laws)
@@ -64,8 +69,11 @@ class Prefetch:
         """Run `ticks` samples as the plant does."""
         ahead, self._block = self._block, None
         if ahead is not None:
-            same = len(laws) == len(self._laws) and all(map(operator.is_, laws, self._laws))
-            if same and len(ahead[0]) == ticks:
+            if len(ahead[0]) == ticks and self._holds(laws):
                 return ahead
             self._plant.rewind(self._mark)
         return self._plant.advance(ticks, laws)
+
+    def _holds(self, laws: Sequence[Any]) -> bool:
+        """Return whether the block ahead was computed under these laws."""
+        return len(laws) == len(self._laws) and all(map(operator.is_, laws, self._laws))

@@ -19,7 +19,7 @@ from tests.hil_sim.plant_trace import CLOSED, bench, sine
 
 RIG = bench()
 LAWS = ([CLOSED, CLOSED], [CLOSED, sine(RIG, 1.0)], [sine(RIG, 2.0), Law(bias=0.3, limit=1.0)])
-Asked = list[tuple[bool, int, int, int]]
+Asked = list[tuple[int, int, int, int]]
 
 
 FILTERED = Scenario.model_validate(
@@ -37,7 +37,7 @@ FILTERED = Scenario.model_validate(
 @settings(max_examples=25)
 @given(
     st.lists(
-        st.tuples(st.booleans(), st.integers(0, 2), st.integers(1, 300), st.integers(0, 2)),
+        st.tuples(st.integers(0, 3), st.integers(0, 2), st.integers(1, 300), st.integers(0, 2)),
         min_size=1,
         max_size=8,
     )
@@ -47,8 +47,8 @@ def test_samples_are_the_same_whether_the_block_ahead_was_right_or_wrong(
 ) -> None:
     ahead, plain = Prefetch(Plant(RIG, scenario, 4)), Plant(RIG, scenario, 4)
     for early, guess, ticks, laws in asked:
-        if early:
-            ahead.prefetch(10 if ticks % 2 else ticks, LAWS[guess])
+        for n in range(early):
+            ahead.prefetch(10 if ticks % 2 else ticks, LAWS[(guess + n) % 3])
         assert ahead.tick == plain.tick
         for found, expected in zip(
             ahead.advance(ticks, LAWS[laws]), plain.advance(ticks, LAWS[laws]), strict=True
@@ -77,6 +77,16 @@ def test_a_block_computed_ahead_is_not_computed_again() -> None:
     ahead.prefetch(10, LAWS[1])
     ahead.advance(10, LAWS[2])
     assert plant.ran == 220
+
+
+def test_new_laws_discard_a_block_computed_ahead_before_the_host_reads_it() -> None:
+    plant = Counting(RIG, Scenario(), 4)
+    ahead = Prefetch(plant)
+    ahead.prefetch(10, LAWS[1])
+    ahead.prefetch(10, LAWS[2])
+    assert (plant.ran, plant.tick, ahead.tick) == (20, 10, 0)
+    ahead.advance(10, LAWS[2])
+    assert (plant.ran, ahead.tick) == (20, 10)
 
 
 def test_a_device_reads_as_if_nothing_were_computed_ahead() -> None:
