@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Final
 
 import numpy as np
@@ -78,8 +79,8 @@ class Guard:
         self._frozen = tuple(Frozen(rig, j) for j in range(len(rig.joints)))
         self._window = max(2, round(self.settings.frozen_after * rig.sample_rate))
         self._rate_window = max((rate.window for rate in self._rates), default=0)
-        self._near = tuple(rig.alarms.warning_share * rate.bounds for rate in self._rates)
-        self._steady = np.minimum.reduce([np.full(len(rig.recorded), math.inf), *self._near])
+        near = [rate.near for rate in self._rates]
+        self._steady = np.minimum.reduce([np.full(len(rig.recorded), math.inf), *near])
         self._keep = max(self._rate_window, self._window)
         self._recent = Recent(len(rig.recorded), self._keep)
         self._saturation = Saturation(rig, self.settings)
@@ -180,9 +181,8 @@ class Guard:
             trips += self._band_trips(block)
         elif not was_calm:
             self._forget_outside()
-        swing = most - least
-        if not (self._calm and np.count_nonzero(swing <= self._steady) == len(swing)):
-            trips += self._rate_trips(new, last, swing)
+        if not (self._calm and np.count_nonzero(most - least <= self._steady) == len(most)):
+            trips += self._rate_trips(new, last, least, most)
         trips += self._saturation.find(block)
         if self._may_freeze is not None:
             trips += self._frozen_sensors(last)
@@ -195,18 +195,20 @@ class Guard:
             self._end_warnings(block, last)
         return min(trips, key=lambda violation: violation.tick) if trips else None
 
-    def _rate_trips(self, new: int, last: int, swing: Array) -> list[Violation]:
+    def _rate_trips(self, new: int, last: int, least: Array, most: Array) -> list[Violation]:
         """Return the trips by rate in the latest `new` samples, which end at tick `last`.
 
-        `swing` (recorded,) is the range of the samples, which bounds every difference.
+        `least` and `most` (recorded,) are of these samples and bound every difference.
         """
         rows, trips = self._recent.last(self._unbroken), []
-        with np.errstate(invalid="ignore"):  # inf - inf; the check of bands reports the sample
-            for rate, steady in zip(self._rates, self._near, strict=True):
-                if self._calm and np.count_nonzero(swing <= steady) == len(swing):
+        first = last + 1 - len(rows)
+        # inf - inf, which no calm block has; the check of bands reports the sample
+        with nullcontext() if self._calm else np.errstate(invalid="ignore"):
+            swing = most - least
+            for rate in self._rates:
+                if self._calm and np.count_nonzero(swing <= rate.near) == len(swing):
                     continue
-                first = last + 1 - len(rows)
-                trip, near = rate.find(self.rig, rows, first, new, self.rig.alarms.warning_share)
+                trip, near = rate.find(self.rig, rows, first, new)
                 if trip is not None:
                     trips.append(trip)
                 self._standing.see(near, last)

@@ -99,7 +99,17 @@ class Plausibility:
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for s in sensors])
         self._noise = np.maximum([s.noise for s in sensors], codes)
+        self._spool_floor = [
+            max(settings.spool_floor * joint.valve.spool_stroke, 5.0 * float(self._noise[column]))
+            for joint, column in zip(rig.joints, self._spool, strict=True)
+        ]
+        # The noise of a channel's third difference, its median allowed, and that less rounding.
+        self._noise_scale = _NORMAL_MEDIAN * _THIRD_DIFFERENCE
+        self._noise_allowed = settings.noise * self._noise
+        self._noise_bound = (self._noise_allowed * self._noise_scale * (1.0 - 1e-9))[:, None]
         self._slow = SlowRows(rate, len(rig.joints), settings.trend_span)
+        slow_noise = self._noise[[self._cap[0], self._rod[0]]] / math.sqrt(self._slow.each)
+        self._slow_noise = slow_noise.tolist()
         self._states = np.column_stack([self._piston, self._cap, self._rod, self._command])
         self.forget()
 
@@ -177,8 +187,7 @@ class Plausibility:
         commanded = _mean(np.abs(expected - _mean(expected)[:, None])).tolist()
         for j, joint in enumerate(self._rig.joints):
             stroke = joint.valve.spool_stroke
-            least = max(settings.spool_floor * stroke, 5.0 * float(self._noise[self._spool[j]]))
-            bound = max(settings.spool_share * commanded[j], least)
+            bound = max(settings.spool_share * commanded[j], self._spool_floor[j])
             if moving[j] > bound:
                 yield say(NOT_FOLLOWING, self._spool[j], moving[j], (-math.inf, bound))
             elif abs(constants[j]) > settings.spool_constant * stroke:
@@ -250,10 +259,10 @@ class Plausibility:
         rows = slow.last(settings.swing_span)
         if rows is None:
             return
-        shut = (rows[:, :, pressure_sensors.COMMAND] == 0.0).all(axis=0)
-        closed = [j for j in held if shut[j] and self._within_stroke(window, j)]
-        noise = self._noise[[self._cap[0], self._rod[0]]] / math.sqrt(slow.each)
-        for swap in pressure_sensors.swapped(rig, settings, closed, rows, noise):
+        commands = rows[:, :, pressure_sensors.COMMAND]
+        shut = [j for j in held if not np.count_nonzero(commands[:, j])]
+        closed = [j for j in shut if self._within_stroke(window, j)]
+        for swap in pressure_sensors.swapped(rig, settings, closed, rows, self._slow_noise):
             yield shown(SWAPPED, swap)
 
     def _within_stroke(self, window: _Window, j: int) -> bool:
@@ -271,17 +280,15 @@ class Plausibility:
         steps = data[: len(self._noise)].ravel()
         for _ in range(3):
             steps = steps[1:] - steps[:-1]
-        size = np.zeros((len(self._noise), data.shape[1]))
+        size = np.empty((len(self._noise), data.shape[1]))
         np.abs(steps, out=size.ravel()[:-3])
         size[:, -3:] = 0.0
-        allowed, scale = self._settings.noise * self._noise, _NORMAL_MEDIAN * _THIRD_DIFFERENCE
         # A median above a bound needs half of its samples there. Mostly all channels together have
         # fewer, so that no sorting is needed. NaN counts as above.
-        bound = allowed * scale * (1.0 - 1e-9)
-        above = size.size - np.count_nonzero(size <= bound[:, None])
+        above = size.size - np.count_nonzero(size <= self._noise_bound)
         if 2 * above < size.shape[1] - 3:
             return
-        seen = np.median(size[:, :-3], axis=1) / scale
+        seen, allowed = np.median(size[:, :-3], axis=1) / self._noise_scale, self._noise_allowed
         for column in np.flatnonzero(seen > allowed).tolist():
             bound = float(allowed[column])
             yield say(NOISY, column, float(seen[column]), (-math.inf, bound))

@@ -52,7 +52,7 @@ def swapped(
     settings: GuardSettings,
     closed: Sequence[int],
     rows: Array,
-    noise: Array,
+    noise: Sequence[float],
 ) -> Iterator[PressureFinding]:
     """Find sensors of closed cylinders that are exchanged with sensors of another joint.
 
@@ -61,26 +61,26 @@ def swapped(
     cylinder and one of another joint does.
     """
     x = _detrended(rows[:, :, CAP : ROD + 1])
-    swings = np.sqrt(np.mean(x * x, axis=0))
+    swings = np.sqrt(np.add.reduce(x * x, axis=0) / len(x)).tolist()
     others_far, others_near = settings.swing_factor, settings.swing_match
     for j in closed:
-        expected = swing_ratio(rig, j, float(rows[:, j, PISTON].mean()))
+        expected = swing_ratio(rig, j, float(np.add.reduce(rows[:, j, PISTON]) / len(rows)))
         for side, ratio in ((0, expected), (1, 1.0 / expected)):
-            partner = swings[j, 1 - side]
-            if min(swings[j, side] / noise[side], partner / noise[1 - side]) < settings.swing_noise:
+            own, partner = swings[j][side], swings[j][1 - side]
+            if min(own / noise[side], partner / noise[1 - side]) < settings.swing_noise:
                 continue
             fitting = ratio * partner
-            if fitting / others_far <= swings[j, side] <= fitting * others_far:
+            if fitting / others_far <= own <= fitting * others_far:
                 continue
             for i in range(len(swings)):
                 for k in range(2):
-                    near = fitting / others_near <= swings[i, k] <= fitting * others_near
+                    near = fitting / others_near <= swings[i][k] <= fitting * others_near
                     if i == j or not near:
                         continue
-                    together = np.mean(x[:, i, k] * x[:, j, 1 - side]) / (swings[i, k] * partner)
+                    together = np.mean(x[:, i, k] * x[:, j, 1 - side]) / (swings[i][k] * partner)
                     if together < -settings.swing_phase:
                         bounds = fitting / others_far, fitting * others_far
-                        yield PressureFinding(j, side == 0, float(swings[j, side]), bounds)
+                        yield PressureFinding(j, side == 0, own, bounds)
 
 
 def drifting(
@@ -96,7 +96,7 @@ def drifting(
     cap, rod = rows[2:-2, joint, CAP], rows[2:-2, joint, ROD]
     force = cap - part.rod_area / part.cap_area * rod
     bound = settings.trend * rig.supply.pressure
-    time = np.linspace(-0.5, 0.5, len(force))
+    time = np.arange(len(force)) / (len(force) - 1) - 0.5
     least = settings.trend_alone * (time @ time)
     # The Cauchy-Schwarz bound of the trend; mostly it is small and no fit is needed.
     spread = force - np.add.reduce(force) / len(force)
@@ -146,7 +146,7 @@ class SlowRows:
         self._begun = samples[whole:]
         parts = samples[:whole].reshape(-1, self.each, *samples.shape[1:])
         rows = np.add.reduce(parts, axis=1) / self.each
-        rows[:, :, COMMAND] = np.abs(parts[:, :, :, COMMAND]).max(axis=1, initial=0.0)
+        np.maximum.reduce(np.abs(parts[:, :, :, COMMAND]), axis=1, out=rows[:, :, COMMAND])
         self._rows = np.concatenate([self._rows, rows])[-self._most :]
 
     def last(self, span: float) -> Array | None:

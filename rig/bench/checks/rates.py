@@ -28,27 +28,29 @@ def rate_window(noise: float, limit: float, sample_rate: float) -> int:
 
 @dataclass(frozen=True)
 class Rate:
-    """A bound on |x[k] - x[k-window]|, (recorded,), infinite without a limit; a share warns."""
+    """A bound on |x[k] - x[k-window]|, (recorded,), infinite without a limit; `near` it warns."""
 
     limit: str
     window: int
     bounds: Array
+    near: Array
 
     def find(
-        self, rig: Rig, joined: Array, first: int, new: int, share: float
+        self, rig: Rig, joined: Array, first: int, new: int
     ) -> tuple[Violation | None, list[Violation]]:
-        """Return the first violation of the limit, and one per channel above `share` of it.
+        """Return the first violation of the limit, and one per channel that is near it.
 
         `joined` (n, recorded) begins at tick `first`; only its last `new` samples are checked. It
         may contain infinite samples: the caller suppresses numpy's warning of their difference.
         """
         values = joined[-(new + self.window) :]
-        start = first + len(joined) - len(values) + self.window
         steps = values[self.window :] - values[: -self.window]
         size = np.abs(steps)
-        near = size > share * self.bounds
+        near = size > self.near
         if not np.count_nonzero(near):
             return None, []
+        start = first + len(joined) - len(values) + self.window
+        share = rig.alarms.warning_share
         over = size > self.bounds
         trip = None
         if over.any():
@@ -88,5 +90,5 @@ def rates(rig: Rig) -> tuple[Rate, ...]:
         bounds = np.full(len(rig.recorded), math.inf)
         for column, limit in entries:
             bounds[column] = limit * (window / rig.sample_rate)
-        made.append(Rate(what, window, bounds))
+        made.append(Rate(what, window, bounds, rig.alarms.warning_share * bounds))
     return tuple(made)
