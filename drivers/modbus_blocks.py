@@ -21,7 +21,6 @@ logger = logging.getLogger(__name__)
 Flags = NDArray[np.bool_]
 Codes = NDArray[np.uint16]
 
-_ONE = np.uint16(1)
 _ARMED: Final = int(Status.ARMED)
 _TRIPPED: Final = int(Status.TRIPPED)  # an operation on a flag takes as long as one on an array
 
@@ -50,6 +49,7 @@ class BlockDecoder:
         # -most becomes one of the largest, so that a single comparison finds every impossible code.
         self._shift = self._rows([np.zeros(len(top)), most], np.uint16)
         self._span = self._rows([top, 2 * most], np.uint16)
+        self._one = np.ones(self._shape, np.uint16)
         self._almost_top = self._rows([top - 1, 2 * most], np.uint16)
         self._scale = self._rows([step, volt], np.float64)
         self._offset = self._rows([low, -(most * volt)], np.float64)
@@ -94,7 +94,7 @@ class BlockDecoder:
         sequence, tick = self._follow(header)
         codes = np.frombuffer(samples, ">u2").reshape(self._shape).astype(np.uint16)
         codes += self._shift
-        ends = codes - _ONE >= self._almost_top  # 0 wraps to the top
+        ends = codes - self._one >= self._almost_top  # 0 wraps to the top
         if np.count_nonzero(ends):  # values beyond an end count as at the end
             impossible = codes > self._span
             if np.count_nonzero(impossible):

@@ -85,6 +85,7 @@ class ModbusTcpDriver:
         self._wait = min(wire.timeout / 2, wire.watchdog / 4)
         self._tries = math.ceil(wire.timeout / self._wait - 1e-9)
         self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
+        self._period = self._layout.samples / rig.sample_rate  # [s] of a block
         self._decoder = BlockDecoder(rig)
         # The request for a block, to which the acknowledgement is appended.
         self._block_request = write_and_read_request(
@@ -222,7 +223,7 @@ class ModbusTcpDriver:
 
     def read_block(self) -> SampleBlock:
         """Return the next block, waiting for it; also feeds the device's watchdog."""
-        period = self._layout.samples / self._rig.sample_rate
+        period = self._period
         now = time.monotonic()
         if self._due is not None and now < self._due:
             self._sleep(self._due - now)

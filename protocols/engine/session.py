@@ -104,7 +104,8 @@ class Session:
         self.laws: list[OutputLaw] = [OFF] * self.joints
         self.now = 0  # the tick after the last sample read
         self._columns = {name: column for column, name in enumerate(rig.recorded)}
-        self._ring = np.full((keep, len(rig.recorded)), np.nan)  # NaN where lost
+        # NaN where lost; a channel's samples are adjacent, because they are read by channel.
+        self._ring = np.full((len(rig.recorded), keep), np.nan).T
 
     def apply(self, changes: Mapping[int, OutputLaw], restart: bool = False) -> int:
         """Apply new laws for some joints; return the tick from which they hold.
@@ -153,10 +154,10 @@ class Session:
 
     def channel(self, name: str, first: int, last: int) -> Array:
         """Return a channel by its name over ticks [first, last), NaN where lost."""
-        column = self._columns[name]
-        begin, end = max(first, self.now - len(self._ring)), min(last, self.now)
-        if (begin, end) == (first, last):
+        column, oldest = self._columns[name], self.now - len(self._ring)
+        if oldest <= first and last <= self.now:
             return self._ring[self._places(first, last), column].copy()  # the ring is overwritten
+        begin, end = max(first, oldest), min(last, self.now)
         values = np.full(last - first, np.nan)
         if begin < end:
             values[begin - first : end - first] = self._ring[self._places(begin, end), column]

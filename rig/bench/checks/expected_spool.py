@@ -26,9 +26,11 @@ class ExpectedSpool:
     """
 
     def __init__(self, rig: Rig) -> None:
-        self._valves = [joint.valve for joint in rig.joints]
+        valves = [joint.valve for joint in rig.joints]
+        self._gain = np.array([[valve.spool_gain] for valve in valves])
+        self._stroke = np.array([[valve.spool_stroke] for valve in valves])
         self._maps = []
-        for valve in self._valves:
+        for valve in valves:
             w = 2.0 * math.pi * valve.natural_frequency
             damping = 2.0 * valve.damping_ratio * w
             system = np.array([[0.0, 1.0, 0.0], [-w * w, -damping, w * w], [0.0, 0.0, 0.0]])
@@ -44,10 +46,7 @@ class ExpectedSpool:
 
         The spool at a sample follows from the commands up to the sample before.
         """
-        wanted = [
-            np.minimum(np.maximum(valve.spool_gain * row, -valve.spool_stroke), valve.spool_stroke)
-            for valve, row in zip(self._valves, commands, strict=True)
-        ]
+        wanted = np.minimum(np.maximum(self._gain * commands, -self._stroke), self._stroke)
         # At rest under the first command.
         self._states = self._states or [np.array([row[0], 0.0]) for row in wanted]
         out = np.empty_like(commands)

@@ -141,7 +141,7 @@ class SlowRows:
 
     def add(self, states: Array) -> None:
         """Add the next samples, (n, joints, 4): piston [m], cap and rod [Pa], command [V]."""
-        samples = np.concatenate([self._begun, states])
+        samples = np.concatenate([self._begun, states]) if len(self._begun) else states
         whole = len(samples) // self.each * self.each
         self._begun = samples[whole:]
         parts = samples[:whole].reshape(-1, self.each, *samples.shape[1:])
