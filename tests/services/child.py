@@ -103,6 +103,7 @@ def prepare(mode: str, number: int) -> dict[str, Any]:
         if mode == "disk full":
             usage = shutil.disk_usage(RUN.parent)._replace(free=0)
             shutil.disk_usage = lambda _: usage  # type: ignore[assignment]
+        sys.dont_write_bytecode = True  # the limit would cut it off, and Python would keep it
         resource.setrlimit(resource.RLIMIT_FSIZE, (number, number))
     elif mode == "ctrl-c twice":
         real = FakeDriver.zero_outputs
