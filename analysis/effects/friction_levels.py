@@ -17,6 +17,7 @@ from analysis.effects.contact import (
     FASTEST,
     contact_levels,
     contact_under_load,
+    slide,
 )
 from analysis.effects.friction import Friction, force_limit, force_unit
 from analysis.signals.conditioning import Signals
@@ -36,7 +37,8 @@ from rig.model.rig import Rig
 
 DIFFERENCE: Final = 0.1  # of the mean level: with a smaller difference it is not asymmetric
 LEAST_SHARE: Final = 0.1  # of the other level: those of a seal do not differ by more
-DIFFERENCE_LOAD: Final = -1.0  # weight of the rod pressure where the difference presses the seal
+SUM: Final = 1.0  # weight of the rod pressure in the load where each seal has one pressure
+DIFFERENCE_LOAD: Final = -1.0  # the same where the difference presses the piston's seal
 
 
 @dataclass(frozen=True)
@@ -138,17 +140,18 @@ class PressureDependentFriction(Friction):
 
     k [m^2] is the friction coefficient times the seals' area under pressure. The load is
     p = |p_cap + a p_rod|: the sum where each seal has one chamber's pressure on it (a = 1), the
-    difference where the piston's seal has both (a = -1). w [Pa] builds up to it at a contact
+    difference where the piston's seal has both (a = -1). Either w [Pa] builds up to it at a contact
     stiffness that does not depend on it, only on speed (`contact`):
     dw/ds = (1 + k_s |s'|) (p_S / d) (sign(s') - w / p), d the presliding distance at supply
-    pressure, k_s the stiffening.
+    pressure, k_s the stiffening; or within a distance d that does not: w = p z, dz/ds =
+    (sign(s') - z) / d.
     """
 
     hydraulic: ClassVar[bool] = True
     name: ClassVar[str] = "pressure_dependent_friction"
     least: ClassVar[tuple[float, ...]] = (5e-6,)  # [m^2]
     stiffens: ClassVar[bool] = True
-    after: ClassVar[int] = 1
+    after: ClassVar[int] = 2
     variable: ClassVar[str] = "the chamber pressures, with the velocity's sign"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
     separated_by: ClassVar[str] = (
@@ -165,14 +168,21 @@ class PressureDependentFriction(Friction):
         return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the contact's numbers and the rod pressure's weight in the load."""
-        return (*super().shape_names(), f"rod_weight_{self.joint + 1}")
+        """Name the contact's numbers, the rod pressure's weight, and what the load leaves alone."""
+        joint = self.joint + 1
+        return (*super().shape_names(), f"rod_weight_{joint}", f"constant_distance_{joint}")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the contact's shapes and the weight: -1 for the difference; without it the sum."""
-        name, only = self.shape_names()[-1], DIFFERENCE_LOAD
-        weight = Shape(name, "1", only, only, (only,), detail=True, fixed=True)
-        return (*super().shapes(rig), weight)
+        """Return the contact's shapes, the rod pressure's weight, and the constant distance.
+
+        A shape without the last two is of the sum and of the constant stiffness.
+        """
+        weight, constant = self.shape_names()[-2:]
+        known = (
+            Shape(weight, "1", DIFFERENCE_LOAD, SUM, (DIFFERENCE_LOAD,), detail=True, fixed=True),
+            Shape(constant, "1", 1.0, 1.0, (1.0,), detail=True, fixed=True),
+        )
+        return (*super().shapes(rig), *known)
 
     def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
         """Return a contact with memory under the difference of the pressures."""
@@ -180,26 +190,29 @@ class PressureDependentFriction(Friction):
         return ((distance, 0.0, 0.0, DIFFERENCE_LOAD),)
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return the shape with a stiffening where its load is the sum."""
-        return tuple(shape) if self._weight(shape) < 0.0 else super().in_detail(rig, shape)
+        """Return the shape with a stiffening where its load is the sum, at constant stiffness."""
+        return tuple(shape) if len(shape) > 3 else super().in_detail(rig, shape)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the contact without memory, and the load by the difference of the pressures."""
-        forms = super().other_forms(rig, shape)
-        if self._weight(shape) < 0.0:
-            return forms
-        contact = self.contact_of(shape)
-        memory = (contact[0], 0.0, 0.0) if self.remembers(shape) else (0.0, 0.0, contact[2])
-        return (*forms, (*memory, DIFFERENCE_LOAD))
+        """Return the contact without memory or at a constant distance, and the other load."""
+        distance, _, speed = self.contact_of(shape)
+        memory = (distance, 0.0, 0.0) if self.remembers(shape) else (0.0, 0.0, speed)
+        weight, constant = self._weight(shape), tuple(shape[4:])
+        forms: tuple[tuple[float, ...], ...] = ()
+        if self.remembers(shape) and not constant:
+            forms = (*super().other_forms(rig, shape), (*memory, weight, 1.0))
+        if weight == SUM:
+            forms = (*forms, (*memory, DIFFERENCE_LOAD, *constant))
+        return forms
 
     def _weight(self, shape: Sequence[float]) -> float:
         """Return the weight of the rod pressure in the load."""
-        return DIFFERENCE_LOAD if tuple(shape[3:]) == (DIFFERENCE_LOAD,) else 1.0
+        return shape[3] if len(shape) > 3 else SUM
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         i = self.joint
-        if self.remembers(shape):
+        if self.remembers(shape) and not shape[4:]:
             path = self.deflection(rig, signals, {}, shape)
             level = path * rig.supply.pressure / shape[0]
         else:
@@ -215,7 +228,9 @@ class PressureDependentFriction(Friction):
     def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
-        """Return w d / p_S (n,) [m]."""
+        """Return w d / p_S (n,) [m], at a constant distance z d."""
+        if shape[4:]:
+            return super().deflection(rig, signals, values, shape)
         stiffness = rig.supply.pressure / shape[0]
         path = self.path(signals, shape)
         return np.asarray(
@@ -223,9 +238,13 @@ class PressureDependentFriction(Friction):
         )
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), k, distance, stiffening, transition speed, p_S, rod's weight."""
+        """Return joint (0-based), k, distance, stiffening, transition speed, p_S, rod's weight.
+
+        At a constant distance 0 for p_S.
+        """
         k, weight = values[f"k_friction_{self.joint + 1}"], self._weight(shape)
-        return np.array([self.joint, k, *self.contact_of(shape), rig.supply.pressure, weight])
+        pressure = 0.0 if shape[4:] else rig.supply.pressure
+        return np.array([self.joint, k, *self.contact_of(shape), pressure, weight])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject friction that drives, and more than half of the cylinder's force."""
@@ -252,12 +271,13 @@ def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped
 
 @kernel
 def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The hidden state is w times d over p_S [m].
+    # The hidden state is w times d over p_S [m], at a constant distance z d.
     if phase == CONTRIBUTE:
         i = int(par[0])
         v, load = x[SD, i], abs(x[P_CAP, i] + par[6] * x[P_ROD, i])
-        if par[2] <= 0.0:
-            out[TORQUE, i] -= par[1] * load * x[G, i] * math.erf(v / par[4])
+        if par[2] <= 0.0 or par[5] <= 0.0:
+            state, dz[0] = slide(v, z[0], par[2], par[3], par[4])
+            out[TORQUE, i] -= par[1] * load * x[G, i] * state
             return
         stiffness = par[5] / par[2]
         pace = 1.0 + par[3] * abs(v)

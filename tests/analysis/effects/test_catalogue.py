@@ -162,8 +162,8 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
     if e.name == "asymmetric_friction":  # both levels are equal here
         ahead, back = contact_levels(s, *shape)
         return np.asarray(0.5 * (ahead - back) * shape[0])
-    if e.name == "pressure_dependent_friction":
-        rod_weight = -1.0 if len(shape) > 3 else 1.0
+    if e.name == "pressure_dependent_friction" and len(shape) < 5:
+        rod_weight = sum(shape[3:4]) or 1.0
         load = np.abs(signals.p_cap[:, e.joint] + rod_weight * signals.p_rod[:, e.joint])
         stiffness = rig.supply.pressure / shape[0]
         path = worked(s, signals.sd[:, e.joint], sum(shape[1:2]))
@@ -173,7 +173,7 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
     if e.family == "friction":
         distance, *stiffening = shape[4:5] if e.name == "friction_curve" else shape
-        path = worked(s, signals.sd[:, e.joint], sum(stiffening))
+        path = worked(s, signals.sd[:, e.joint], sum(stiffening[:1]))
         return np.asarray(distance * contact_state(path, distance))
     if e.name in ("spool_lag", "spool_hysteresis"):
         return e.prepare(rig, signals, shape).u[:, e.joint]
