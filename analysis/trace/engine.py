@@ -28,15 +28,12 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
-from analysis.trace.finding import (
-    Finding,
-    TraceRows,
-    TraceRuns,
+from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows
+from analysis.trace.in_motion import (
     find,
     fitted_in_motion,
     joints_with_friction,
     rest_phase_notes,
-    trace_rows,
 )
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves

@@ -1,8 +1,8 @@
-"""What is found on given rows: search, gates, free forms, friction judged in motion only."""
+"""What is found on given rows: search, gates, free forms."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,9 @@ import numpy as np
 from analysis.effects.base import Effect
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Filtering
-from analysis.terms.base import Used, equation
+from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import (
     conditioned_records,
-    moving_filtering,
     trace_filtering,
 )
 from analysis.trace.data.regression_data import RegressionData, regression_data
@@ -22,7 +21,7 @@ from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
-from analysis.trace.judge.unlocked import Line, judged_line
+from analysis.trace.judge.unlocked import Line
 from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.notes import WHY_MASKED
 from analysis.trace.remaining import Remainder, remainders
@@ -190,12 +189,12 @@ def search_and_judge(
     if quiet and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
     winner = hypotheses.run(done)
-    found = _judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
+    found = judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
     named = any(map(gates.passes_gates, found.effects))
-    notes = _remainder_notes(found.verdict, found.remainders, quiet, named)
+    notes = remainder_notes(found.verdict, found.remainders, quiet, named)
     if quiet and found.verdict == UNEXPLAINED:
         notes = [*_held_out_only_notes(rows.train, found.remainders), *notes]
-    return _finding(rows, found, notes)
+    return finding_of(rows, found, notes)
 
 
 def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) -> list[str]:
@@ -210,7 +209,8 @@ def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) 
     return out if unrepeated == above else [*out, ONLY_HELD_OUT_MISSED]
 
 
-def _finding(rows: TraceRows, found: Judgement, notes: Iterable[str]) -> Finding:
+def finding_of(rows: TraceRows, found: Judgement, notes: Iterable[str]) -> Finding:
+    """Return the finding of a judgement on `rows`, with `notes` on what remains."""
     return Finding(
         rows, found.hypotheses, found.winner, found.verdict, found.effects, found.remainders,
         tuple(notes),
@@ -226,138 +226,11 @@ def without_unnamed_effects(finding: Finding) -> Finding:
         return finding
     winner = hypotheses.refined(kept) if kept else hypotheses.empty
     left = remainders(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
-    notes = _remainder_notes(finding.verdict, left, quiet=False, named=bool(kept))
+    notes = remainder_notes(finding.verdict, left, quiet=False, named=bool(kept))
     return replace(finding, winner=winner, remainders=tuple(left), notes=tuple(notes))
 
 
-def find(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, rows: TraceRows,
-    candidates: Sequence[Effect], free: Sequence[Effect], seed: int, done: Callable[[float], None],
-) -> Finding:  # fmt: skip
-    """Return what the model lacks: `search_and_judge`, in motion only where that is needed.
-
-    Torques at `records.lines` are judged beside the effects found. Where one is refused, nothing is
-    taken out of the rows, and all is searched again.
-    """
-    found = search_and_judge(rows, candidates, free, seed, done)
-    found = without_unnamed_effects(
-        searched_in_motion(rig, terms, records, candidates, free, seed, found)
-    )
-    if not records.lines:
-        return found
-    judged = _judged_lines(rig, records, found)
-    refused = gates.refused_effects(judged)
-    if refused:
-        whole = replace(records, lines=())
-        rows = trace_rows(rig, terms, whole)
-        found = find(rig, terms, whole, rows, candidates, free, seed, done)
-        return replace(found, effects=(*found.effects, *refused))
-    verdict = EXPLAINED if found.verdict == CLEAN else found.verdict
-    return replace(found, effects=(*found.effects, *judged), verdict=verdict)
-
-
-def _judged_lines(rig: Rig, records: TraceRuns, found: Finding) -> tuple[JudgedEffect, ...]:
-    """Return the torques at `records.lines` with their gates, beside the effects found."""
-    unseen, fit = found.rows.unseen, found.winner.fit
-    train, holdout = (
-        conditioned_records(rig, runs, families=records.families)
-        for runs in (records.train, records.holdout)
-    )
-    judged = []
-    for line in records.lines:
-        own = [s for s in unseen.choosing.segments if s.equation == equation("torque", line[0])]
-        noise = float(np.sqrt(np.mean([s.noise**2 for s in own]))) if own else np.inf
-        judged.append(judged_line(rig, line, fit, train, holdout, unseen.divided, noise))
-    return tuple(judged)
-
-
-def searched_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
-    free: Sequence[Effect], seed: int, finding: Finding,
-) -> Finding:  # fmt: skip
-    """Search friction again in rows weighted by speed, where only torque balances keep too much.
-
-    While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
-    these rows, and they hide the law in motion. Candidates are friction in the torque balances that
-    keep too much, named forms before `free` curves, beside the other effects of `finding`. The
-    result is used if friction acts in each joint whose rows are weighted, and the set removes most
-    of the energy of all rows, rests included; else `finding` is returned.
-    """
-    loud = {r.equation for r in finding.remainders if r.veto}
-    friction = [e for e in (*candidates, *free) if e.family == "friction"]
-    joints = {e.joint for e in friction if equation("torque", e.joint) in loud}
-    if finding.verdict != UNEXPLAINED or {equation("torque", i) for i in joints} != loud:
-        return finding
-    others = [u.term for u in finding.winner.effects if isinstance(u.term, Effect)]
-    others = [e for e in others if e.family != "friction"]
-
-    def searched(joints: Collection[int]) -> Finding:
-        rows = trace_rows(rig, terms, records, moving_filtering(joints))
-        tried = [*others, *(e for e in friction if e.joint in joints)]
-        return _search_few(rows, tried, seed, rest_phase_notes(joints, "leave out"))
-
-    found = searched(joints)
-    acting = joints_with_friction(found.winner, loud)
-    if acting and acting != joints:  # an effect of several balances had spread friction to others
-        found = searched(acting)
-    explains = found.verdict in (EXPLAINED, CONFOUNDED)
-    if not explains or not acting or joints_with_friction(found.winner, loud) != acting:
-        return finding
-    on_all_rows = finding.hypotheses.refined(found.winner.effects)
-    if on_all_rows.total / finding.hypotheses.empty.total > 1.0 - TRACE.least_removed:
-        return finding
-    failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
-    return replace(found, effects=(*found.effects, *failed))
-
-
-def _search_few(
-    rows: TraceRows, candidates: Sequence[Effect], seed: int, notes: Sequence[str]
-) -> Finding:
-    """Search and judge a few candidates, free forms last; `notes` are put before those of it."""
-    hypotheses = HypothesisSet(rows.train, [e for e in candidates if not e.free])
-    free = [e for e in candidates if e.free]
-    rng = np.random.default_rng(seed)
-    found = _judge_winner(hypotheses, hypotheses.run(), free, rows.unseen.choosing, rng)
-    more = _remainder_notes(found.verdict, found.remainders, quiet=False, named=True)
-    return _finding(rows, found, (*notes, *more))
-
-
-def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:
-    """Return the joints (0-based) in whose torque balance, one of `equations`, friction acts."""
-    return {
-        used.term.joint
-        for used in winner.effects
-        if isinstance(used.term, Effect)
-        and used.term.family == "friction"
-        and equation("torque", used.term.joint) in equations
-    }
-
-
-def fitted_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
-) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
-    """Return rows that are weighted by the speed of `joints` (0-based), and the set fitted to them.
-
-    The middle element is the collection of sets that the fitted set belongs to.
-    """
-    rows = trace_rows(rig, terms, records, moving_filtering(joints))
-    hypotheses = HypothesisSet(rows.train, [])
-    return rows, hypotheses, hypotheses.refined(winner.effects)
-
-
-def rest_phase_notes(joints: Iterable[int], errors: str) -> list[str]:
-    """Return a note for each joint (0-based) whose samples at rest were not judged.
-
-    `errors` says whether the stated errors "include" or "leave out" these samples.
-    """
-    return [
-        f"{equation('torque', joint)}: judged without the samples at which the joint rests, where "
-        f"dry friction is whatever holds it; the errors {errors} them"
-        for joint in sorted(joints)
-    ]
-
-
-def _judge_winner(
+def judge_winner(
     hypotheses: HypothesisSet, winner: Hypothesis, free: Sequence[Effect],
     holdout_data: RegressionData, rng: np.random.Generator,
 ) -> Judgement:  # fmt: skip
@@ -411,9 +284,7 @@ def _refused_as_unphysical(
     return tuple(replace(f, rivals=()) for f in judged if not gates.passes_gates(f))
 
 
-def _remainder_notes(
-    verdict: str, left: Sequence[Remainder], quiet: bool, named: bool
-) -> list[str]:
+def remainder_notes(verdict: str, left: Sequence[Remainder], quiet: bool, named: bool) -> list[str]:
     """State what remains in each equation, where the verdict itself does not say it.
 
     `quiet`: the training records held nothing above the noise; `named`: an effect is named.

@@ -200,7 +200,7 @@ def held_out_above_band(
     now = energy_above_noise(holdout_data, left)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
-        for e, r in _error_over_floor(holdout_data, left).items()
+        for e, r in error_over_floor(holdout_data, left).items()
         if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
 
@@ -211,7 +211,7 @@ def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> f
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
 
 
-def _error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
+def error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
     """Return the held-out error of single records over the noise floor, by equation."""
     floor: dict[str, float] = {}
     energy: dict[str, float] = {}
@@ -288,7 +288,7 @@ def _disturbed_in_held_out(
     start, alone, now = (energy_above_noise(holdout_data, r) for r in (before, without, after))
     return [
         e
-        for e, ratio in _error_over_floor(holdout_data, after).items()
+        for e, ratio in error_over_floor(holdout_data, after).items()
         if ratio > TRACE.noted_ratio
         and now[e] > max(TRACE.harm_ratio * max(0.0, start[e]), alone[e])
     ]

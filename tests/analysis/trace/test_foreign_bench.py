@@ -84,6 +84,27 @@ def test_a_joint_that_sticks_has_dry_friction_of_one_level_and_no_breakaway(rig:
     assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.03)
 
 
+def test_a_joint_that_sticks_now_and_then_is_fitted_in_motion(rig: Rig) -> None:
+    """All rows explain it too, with 1.6 noise floors and viscous friction 1.3 % off."""
+    result = traced(rig, Hidden(30.0, 30.0, 1e-3, KARNOPP))
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["coulomb_friction"]
+    assert result.worst(result.after) < 1.2
+    assert result.effects[0].parameters["Fc2"].value == pytest.approx(30.0, rel=0.003)
+    assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.003)
+    assert any("without the samples at which the joint rests" in note for note in result.notes)
+
+
+def test_levels_by_direction_of_a_joint_that_sticks_are_found_in_motion(rig: Rig) -> None:
+    """In all rows one level of 53 N seems to explain them."""
+    result = traced(rig, Hidden(60.0, 40.0, 5e-4, KARNOPP))
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["asymmetric_friction"]
+    found = result.effects[0].parameters
+    assert found["F_ext_2"].value == pytest.approx(60.0, rel=0.005)
+    assert found["F_ret_2"].value == pytest.approx(40.0, rel=0.005)
+
+
 @pytest.mark.slow
 def test_a_breakaway_of_ten_times_the_sliding_level_is_named_in_motion(rig: Rig) -> None:
     """The joint sticks most of the time; motion shows the level and that friction falls to it."""

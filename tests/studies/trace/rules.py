@@ -19,7 +19,7 @@ from analysis.effects.friction import Friction
 from analysis.effects.measurement import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
-from analysis.trace import engine, finding, remaining
+from analysis.trace import engine, finding, in_motion, remaining
 from analysis.trace.data import noise_floor, regression_data
 from analysis.trace.judge import gates, inference
 from analysis.trace.search import linear_fit
@@ -152,7 +152,7 @@ RULES: Final = (
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
-         ((finding, "searched_in_motion", lambda *given: given[-1]),
+         ((in_motion, "searched_in_motion", lambda *given: given[-1]),
           (engine, "joints_with_friction", lambda *_: set()))),
     Rule("free forms", "no mechanism without a named form",
          ((finding, "_try_free_forms", lambda *_: None),)),
