@@ -82,20 +82,17 @@ def moved(rig: Rig, signals: Signals, what: Input, by: float) -> Signals:
         changed = getattr(signals, what.field).copy()
         changed[:, i] += by
         return replace(signals, **{what.field: changed})
-    link = rig.joints[i].linkage
     s, sd = signals.s.copy(), signals.sd.copy()
     # The second derivative of the piston is not kept; it follows from the joint's.
-    slope = link.jacobian_rate(signals.q[:, i])
+    slope = rig.joints[i].linkage.jacobian_rate(signals.q[:, i])
     sdd = signals.G[:, i] * signals.qdd[:, i] + slope * signals.qd[:, i] ** 2
     s[:, i] += by if what.field == "s" else 0.0
     sd[:, i] += by if what.field == "sd" else 0.0
     sdd = sdd + (by if what.field == "sdd" else 0.0)
     q, qd, qdd, G = (a.copy() for a in (signals.q, signals.qd, signals.qdd, signals.G))
-    half = 0.55 * rig.joints[i].cylinder.stroke
-    q[:, i] = link.angle(np.clip(s[:, i], -half, half))
-    G[:, i] = link.jacobian(q[:, i])
+    q[:, i], G[:, i], new_slope = rig.joints[i].geometry(s[:, i])
     qd[:, i] = sd[:, i] / G[:, i]
-    qdd[:, i] = (sdd - link.jacobian_rate(q[:, i]) * qd[:, i] ** 2) / G[:, i]
+    qdd[:, i] = (sdd - new_slope * qd[:, i] ** 2) / G[:, i]
     V_cap, V_rod = signals.V_cap.copy(), signals.V_rod.copy()
     V_cap[:, i], V_rod[:, i] = rig.chamber_volumes(i, s[:, i])
     return replace(

@@ -124,7 +124,7 @@ class Sensor(Effect):
         s = self.undone(signals.s[:, i], 0, rate, value)
         half = 0.55 * rig.joints[i].cylinder.stroke
         s = np.clip(s, -half, half)
-        q, G, slope = rig.joints[i].geometry(s)
+        q, G, slope = linkage.geometry(s)
         sd = self.undone(signals.sd[:, i], 1, rate, value)
         new["s"][:, i], new["sd"][:, i], new["q"][:, i], new["G"][:, i] = s, sd, q, G
         new["qd"][:, i] = sd / G

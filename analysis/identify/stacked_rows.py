@@ -18,11 +18,11 @@ from analysis.regression.rows import (
     Rows,
     columns_at,
     default_filtering,
-    filtered_sines,
     parameters_of,
     places_of,
     prepared,
     record_rows,
+    sines_at,
     term_part,
     without_sines,
 )
@@ -95,8 +95,7 @@ def with_columns(
             for r in record.family(family):
                 at = places_of(r, signals, filtering)
                 more = columns_at(names[family], parts, r.equation, at)
-                sines = filtered_sines(signals, filtering, r.equation)
-                more = without_sines(more, sines[at] if sines.size else sines)
+                more = without_sines(more, sines_at(r, signals, filtering))
                 rows[r.equation] = replace(
                     r, names=(*r.names, *names[family]), matrix=np.hstack((r.matrix, more))
                 )

@@ -281,6 +281,12 @@ def filtered_sines(signals: Signals, filtering: Filtering, name: str) -> Array:
     return np.column_stack(list(low_passed(weighted(waves, signals, name), filtering).values()))
 
 
+def sines_at(rows: Rows, signals: Signals, filtering: Filtering) -> Array:
+    """Return the sines and cosines (m, 2 l) that rows are without, at their instants."""
+    sines = filtered_sines(signals, filtering, rows.equation)
+    return sines[places_of(rows, signals, filtering)] if sines.size else sines
+
+
 def without_sines(columns: Array, sines: Array) -> Array:
     """Return columns (m, k) or (m,) without what the sines (m, l) can make of each."""
     if not sines.size:

@@ -174,16 +174,13 @@ def condition(
     # A joint that does not move stands at `held`.
     s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = held[~moving], 0.0, 0.0
     (p_cap, pd_cap), (p_rod, pd_rod) = filtered(ch.CAP, 1), filtered(ch.ROD, 1)
-    q, qd, qdd, G = _angles(rig, s, sd, sdd, moving)
-    volumes = [rig.chamber_volumes(i - 1, s[:, i - 1]) for i in joints]
+    q, qd, qdd, G, theta, V_cap, V_rod = _geometry(rig, s, sd, sdd, moving)
     return Signals(
         rate=record.sample_rate,
         t=record.time,
         u=filtered(rig.drive_kind, 0)[0],
-        s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=rig.base_angle + np.cumsum(q.T, axis=0).T, G=G,
-        p_cap=p_cap, p_rod=p_rod, pd_cap=pd_cap, pd_rod=pd_rod,
-        V_cap=np.array([v[0] for v in volumes]).T,
-        V_rod=np.array([v[1] for v in volumes]).T,
+        s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=theta, G=G,
+        p_cap=p_cap, p_rod=p_rod, pd_cap=pd_cap, pd_rod=pd_rod, V_cap=V_cap, V_rod=V_rod,
         p_s=bench(ch.SUPPLY, supply),
         p_tank=np.zeros(n),
         temperature=bench(ch.TEMPERATURE, oil),
@@ -206,12 +203,9 @@ def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:
     s = signals.s
     slope = np.column_stack([j.geometry(s[:, i])[2] for i, j in enumerate(rig.joints)])
     sdd = signals.G * signals.qdd + slope * signals.qd**2
-    q, qd, qdd, G = _angles(other, s, signals.sd, sdd, signals.moving)
-    volumes = [other.chamber_volumes(i, s[:, i]) for i in range(signals.joints)]
+    q, qd, qdd, G, theta, V_cap, V_rod = _geometry(other, s, signals.sd, sdd, signals.moving)
     return replace(
-        signals, q=q, qd=qd, qdd=qdd, G=G, theta=other.base_angle + np.cumsum(q.T, axis=0).T,
-        V_cap=np.array([v[0] for v in volumes]).T,
-        V_rod=np.array([v[1] for v in volumes]).T,
+        signals, q=q, qd=qd, qdd=qdd, G=G, theta=theta, V_cap=V_cap, V_rod=V_rod
     )  # fmt: skip
 
 
@@ -251,16 +245,22 @@ def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
                 )
 
 
-def _angles(
+def _geometry(
     rig: Rig, s: Array, sd: Array, sdd: Array, moving: Mask | None
-) -> tuple[Array, Array, Array, Array]:
-    """Return q, dq/dt, d2q/dt2 and G (n, N): q' = s'/G, q'' = (s'' - (dG/dq) q'^2)/G."""
+) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """Return q, dq/dt, d2q/dt2, G, absolute angles and chamber volumes (cap, rod), each (n, N).
+
+    q' = s'/G, q'' = (s'' - (dG/dq) q'^2)/G.
+    """
     q, G, slope = np.empty_like(s), np.empty_like(s), np.empty_like(s)
     for i, joint in enumerate(rig.joints):
         still = moving is not None and not moving[i]
         q[:, i], G[:, i], slope[:, i] = joint.geometry(s[:1, i] if still else s[:, i])
     qd = sd / G
-    return q, qd, (sdd - slope * qd**2) / G, G
+    theta = rig.base_angle + np.cumsum(q.T, axis=0).T
+    volumes = [rig.chamber_volumes(i, s[:, i]) for i in range(len(rig.joints))]
+    V_cap, V_rod = (np.array(side).T for side in zip(*volumes, strict=True))
+    return q, qd, (sdd - slope * qd**2) / G, G, theta, V_cap, V_rod
 
 
 def _valid(rig: Rig, record: Record, reach: int) -> Mask:

@@ -24,7 +24,6 @@ from analysis.regression.rows import (
     TermPart,
     assembled,
     default_filtering,
-    filtered_sines,
     in_common,
     low_passed,
     matrix_of,
@@ -32,6 +31,7 @@ from analysis.regression.rows import (
     places_of,
     record_rows,
     right_parts,
+    sines_at,
     term_part,
     without_sines,
 )
@@ -135,15 +135,8 @@ def _at_rows(
 ) -> dict[str, Array]:
     """Return filtered columns at the instants (m,) of rows, without the sines that these lack."""
     at = places_of(rows, conditioned.signals, conditioned.filtering)
-    sines = sines_at(conditioned, rows)
+    sines = sines_at(rows, conditioned.signals, conditioned.filtering)
     return {name: without_sines(column[at], sines) for name, column in columns.items()}
-
-
-def sines_at(conditioned: ConditionedRecord, rows: Rows) -> Array:
-    """Return the sines and cosines (m, 2 l) that a record's rows are without, at their instants."""
-    sines = filtered_sines(conditioned.signals, conditioned.filtering, rows.equation)
-    at = places_of(rows, conditioned.signals, conditioned.filtering)
-    return sines[at] if sines.size else sines
 
 
 def shared_rows(

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from analysis.effects.disturbance import FREQUENCY, PeriodicDisturbance
 from analysis.effects.mechanics import torque_limit
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import WAVES, without_sines
+from analysis.regression.rows import WAVES, sines_at, without_sines
 from analysis.simulation.model import Estimate
 from analysis.terms.base import equation
-from analysis.trace.data.conditioned_record import model_rows, row_residual, sines_at
+from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import REPEATS, Group
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.data.set_aside import in_judging_block
@@ -113,8 +113,8 @@ def _fitted(
     rows = model_rows(rig, fit.terms, conditioned).get(equation("torque", line[0]))
     if rows is None or len(rows.time) < TRACE.least_rows:
         return None
-    with_line = replace(conditioned, filtering=replace(conditioned.filtering, lines=(line,)))
-    left, sines = row_residual(rows, fit.beta), sines_at(with_line, rows)
+    with_line = replace(conditioned.filtering, lines=(line,))
+    left, sines = row_residual(rows, fit.beta), sines_at(rows, conditioned.signals, with_line)
     rest = without_sines(left, sines)
     waves = np.linalg.lstsq(sines, left, rcond=None)[0]
     noise = float(np.sqrt(rest @ rest / max(len(rest) - len(WAVES), 1)))

@@ -25,7 +25,7 @@ from analysis.design.twin_records import ideal
 from analysis.effects.base import Effect, shapes_of
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
-from analysis.regression.rows import Rows
+from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.cache import RowCache
@@ -180,9 +180,7 @@ class ComparisonRows:
         parts, labels = [train_data.base], [label]
         if seen is not None:
             for equation, rows in seen.rows.items():
-                part = np.zeros((len(rows.rhs), len(train_data.names)))
-                part[:, [train_data.names.index(n) for n in rows.names]] = rows.matrix
-                parts.append(part * seen.weight(equation))
+                parts.append(matrix_of(rows, train_data.names) * seen.weight(equation))
                 labels.append(np.full(len(rows.rhs), equation, dtype=object))
         self.base, self.equation = np.concatenate(parts), np.concatenate(labels)
 
