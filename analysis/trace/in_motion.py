@@ -76,61 +76,74 @@ def searched_in_motion(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
     free: Sequence[Effect], seed: int, finding: Finding,
 ) -> Finding:  # fmt: skip
-    """Search friction again in rows weighted by speed, where only torque balances keep too much.
+    """Search again in rows weighted by speed, where a joint's torque balance keeps too much.
 
     While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
-    these rows, and they hide the law in motion. Candidates are friction in the torque balances that
-    keep too much, named forms before `free` curves, beside the other effects of `finding`. The
-    result is used if friction acts in each joint whose rows are weighted, and the set removes most
-    of the energy of all rows, rests included; else `finding` is returned.
-
-    An explanation whose friction leaves a held-out error above `TRACE.noted_ratio` noise floors is
-    searched again too, and replaced where less than that remains in motion: the rests caused it.
+    these rows, and they hide the law in motion, and effects of other balances with it. After
+    `unexplained` all candidates are searched; after an explanation, friction of the joints beside
+    the other effects of `finding`. The result is used if friction acts in each joint whose rows are
+    weighted and it is better (`_is_better`), and the balances of other joints are looked at next.
     """
-    friction = [e for e in (*candidates, *free) if e.family == "friction"]
-    loud, joints = _loud_joints(finding, friction)
-    if not joints:
+    loud, joints = _loud_joints(finding, [e for e in candidates if e.family == "friction"])
+    weighted = set(finding.rows.in_motion)
+    if joints <= weighted:
         return finding
-    named = [u.term for u in finding.winner.effects if isinstance(u.term, Effect)]
 
     def searched(joints: Collection[int]) -> Finding:
-        rows = trace_rows(rig, terms, records, moving_filtering(joints))
-        others = [e for e in named if e.family != "friction" or e.joint not in joints]
-        tried = [*others, *(e for e in friction if e.joint in joints)]
-        return _search_few(rows, tried, seed, rest_phase_notes(joints, "leave out"))
+        rows = trace_rows(rig, terms, records, moving_filtering({*weighted, *joints}))
+        if finding.verdict == UNEXPLAINED:
+            found = search_and_judge(rows, candidates, free, seed, lambda _: None)
+        else:
+            found = _search_friction(rows, (*candidates, *free), seed, finding.winner)
+        return replace(found, notes=(*rest_phase_notes(rows.in_motion, "leave out"), *found.notes))
 
     found = searched(joints)
     acting = joints_with_friction(found.winner, loud)
     if acting and acting != joints:  # an effect of several balances had spread friction to others
         found = searched(acting)
-    explains = found.verdict in (EXPLAINED, CONFOUNDED)
-    if not explains or not acting or joints_with_friction(found.winner, loud) != acting:
-        return finding
-    if finding.verdict != UNEXPLAINED and not _meets_noise(found, acting):
-        return finding
-    on_all_rows = finding.hypotheses.refined(found.winner.effects)
-    if on_all_rows.total / finding.hypotheses.empty.total > 1.0 - TRACE.least_removed:
+    unmet = joints_with_friction(found.winner, loud) != acting
+    if not acting or unmet or not _is_better(found, finding, acting):
         return finding
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
-    return replace(found, effects=(*found.effects, *failed))
+    found = replace(found, effects=(*found.effects, *failed))
+    return searched_in_motion(rig, terms, records, candidates, free, seed, found)
 
 
 def _loud_joints(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:
-    """Return the equations that keep too much, and the joints (0-based) whose friction they show.
+    """Return the equations that keep too much, and the joints (0-based) whose rests may cause it.
 
-    No joints where an unexplained residual lies elsewhere too.
+    These have friction in the set, or, where the residual is `unexplained`, may have it.
     """
-    if finding.verdict == UNEXPLAINED:
-        loud = {r.equation for r in finding.remainders if r.veto}
-        joints = {e.joint for e in friction if equation("torque", e.joint) in loud}
-        return loud, joints if {equation("torque", i) for i in joints} == loud else set()
     names = {e.name for e in friction}
     tied = {r.name for f in finding.effects for r in f.rivals if r.tied}
-    if finding.verdict == CLEAN or not tied <= names:  # other rivals would not be searched again
+    explained = finding.verdict != UNEXPLAINED
+    if finding.verdict == CLEAN or (explained and not tied <= names):  # other rivals would be lost
         return set(), set()
     ratios = _held_out_ratios(finding.rows, finding.winner)
     loud = {e for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
-    return loud, joints_with_friction(finding.winner, loud)
+    joints = joints_with_friction(finding.winner, loud)
+    if not explained:
+        against = {r.equation for r in finding.remainders if r.veto}
+        joints |= {e.joint for e in friction if equation("torque", e.joint) in against}
+        loud |= against
+    return loud, joints
+
+
+def _is_better(found: Finding, finding: Finding, joints: Collection[int]) -> bool:
+    """Return whether a finding with rows of `joints` weighted by speed does better than `finding`.
+
+    It must remove most of the energy of all rows, rests included. It explains what was unexplained,
+    or it leaves at most `TRACE.noted_ratio` noise floors in the balances of `joints`, and explains
+    too or has fewer equations that speak against it.
+    """
+    total = finding.hypotheses.refined(found.winner.effects).total
+    if total / finding.hypotheses.empty.total > 1.0 - TRACE.least_removed:
+        return False
+    explains = found.verdict in (EXPLAINED, CONFOUNDED)
+    if explains and finding.verdict == UNEXPLAINED:
+        return True
+    fewer = sum(r.veto for r in found.remainders) < sum(r.veto for r in finding.remainders)
+    return (explains or fewer) and _meets_noise(found, joints)
 
 
 def _meets_noise(found: Finding, joints: Collection[int]) -> bool:
@@ -145,16 +158,24 @@ def _held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     return gates.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
 
 
-def _search_few(
-    rows: TraceRows, candidates: Sequence[Effect], seed: int, notes: Sequence[str]
+def _search_friction(
+    rows: TraceRows, candidates: Sequence[Effect], seed: int, winner: Hypothesis
 ) -> Finding:
-    """Search and judge a few candidates, free forms last; `notes` are put before those of it."""
-    hypotheses = HypothesisSet(rows.train, [e for e in candidates if not e.free])
-    free = [e for e in candidates if e.free]
+    """Search and judge friction of joints in motion beside the other effects of a set (`winner`).
+
+    Named forms are tried before free ones.
+    """
+    named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
+    tried = [
+        *(e for e in named if e.family != "friction" or e.joint not in rows.in_motion),
+        *(e for e in candidates if e.family == "friction" and e.joint in rows.in_motion),
+    ]
+    hypotheses = HypothesisSet(rows.train, [e for e in tried if not e.free])
+    free = [e for e in tried if e.free]
     rng = np.random.default_rng(seed)
     found = judge_winner(hypotheses, hypotheses.run(), free, rows.unseen.choosing, rng)
     more = remainder_notes(found.verdict, found.remainders, quiet=False, named=True)
-    return finding_of(rows, found, (*notes, *more))
+    return finding_of(rows, found, more)
 
 
 def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:
