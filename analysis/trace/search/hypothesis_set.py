@@ -122,6 +122,18 @@ class HypothesisSet:
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
+    def _refined_anew(self, effects: Sequence[Used]) -> Hypothesis:
+        """Return the exact fit of a set of effects, from these shapes too where it had others.
+
+        A search of shapes may end in a local minimum, which a further effect then seems to mend.
+        """
+        known = self.refined(effects)
+        if set(effects) != set(known.effects):
+            del self.fitted[known.keys]
+            if self.refined(effects).total > known.total:
+                self.fitted[known.keys] = known
+        return self.fitted[known.keys]
+
     def log_energy_ratio(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
         """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
 
@@ -185,7 +197,8 @@ class HypothesisSet:
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
         r = self.train_data.mean_residual
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        return self.exchanged(self._searched(candidates, r))
+        found = self.exchanged(self._searched(candidates, r))
+        return self.fitted.get(found.keys, found)  # a later start may have found better shapes
 
     def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
@@ -374,7 +387,7 @@ class HypothesisSet:
         """Return the set without effects that are not needed or remove too little."""
         while len(hypothesis.effects) > 1:
             smaller = [
-                self.refined(tuple(u for u in hypothesis.effects if u is not used))
+                self._refined_anew([u for u in hypothesis.effects if u is not used])
                 for used in hypothesis.effects
             ]
             smaller = [o for o in smaller if not self.physical_problem(o)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,8 +16,11 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.search import refinement
+from analysis.trace.search.hypothesis import energy_above_noise
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
+from tests.analysis.trace.gate_cases import searched
+from tests.analysis.trace.hidden import pair_of_runs
 
 Array = NDArray[np.float64]
 
@@ -119,3 +123,20 @@ def test_a_detail_at_its_bound_or_one_that_leaves_the_shape_open_is_no_form(rig:
     assert not shaped(100e-6, 3e3)
     # So short a distance that no sample lies within a reversal says nothing of how it shortens.
     assert not shaped(2e-6, 30.0)
+
+
+def test_shapes_are_searched_again_from_those_of_a_larger_set(rig: Rig) -> None:
+    """A search that began far away leaves more; an effect that mends this is not needed."""
+    s = searched(rig, *pair_of_runs(rig, Fc=60.0), "coulomb_friction", "torque_offset")
+    sets, alone = s.hypotheses, s.set_of("coulomb_friction")
+    both = s.set_of("coulomb_friction", "torque_offset")
+    (friction,) = alone.effects
+    far = Used(friction.term, tuple(10.0 * value for value in friction.shape))
+    fit = refinement.fit_coefficients(sets.train_data, (*sets.base, far))
+    energy = energy_above_noise(sets.train_data, fit.residual)
+    poor = sets.fitted[alone.keys] = replace(alone, effects=(far,), fit=fit, excess_energy=energy)
+    assert poor.total > 2.0 * alone.total
+    kept = sets.prune(both)
+    assert kept.keys == alone.keys
+    assert kept.total == pytest.approx(alone.total, rel=0.01)
+    assert sets.fitted[alone.keys] is kept
