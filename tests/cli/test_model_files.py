@@ -94,6 +94,17 @@ def test_record_by_record_the_same_terms_give_the_same_numbers(folder: Path, rub
         bramah("identify", rubbed, "--with", "valve_deadband@joint 2", "--stream")
 
 
+def test_a_shape_that_the_records_give_is_stated_with_its_interval(rubbed: Path) -> None:
+    """A dead band of edges that nothing on this bench has, in JSON and in text."""
+    line = ("identify", rubbed, "--with", "coulomb_friction@joint 2")
+    line = (*line, "--with", "valve_deadband@joint 2")
+    shape = json.loads(bramah(*line, "--json", "-"))["shapes"]["w_ahead_2"]
+    low, high = shape["ci95"]
+    assert low < shape["value"] < high
+    assert (shape["unit"], shape["std"] > 0.0) == ("V", True)
+    assert f"shape: w_ahead_2 = {shape['value']:.4g} ± " in bramah(*line)
+
+
 def test_what_the_model_was_driven_with_and_held_by_stays_measured(
     folder: Path, rubbed: Path
 ) -> None:

@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from analysis.effects.base import Effect, Shape, open_shapes, shapes_of
+from analysis.effects.base import Effect, open_shapes, shapes_of
 from analysis.identify import checks as ck
+from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import shape_grid
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.regression_data import evidence, regression_data
+from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
 from analysis.trace.data.temperature_nuisance import temperature_terms
-from analysis.trace.search.refinement import fit_coefficients, refine
+from analysis.trace.search.refinement import ExactFit, fit_coefficients, refine
 from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
 
 
+@dataclass(frozen=True)
+class ShapeFit:
+    """The terms of a model with shapes found in records, and the fit of them to `data`."""
+
+    terms: tuple[Used, ...]
+    data: RegressionData
+    fit: ExactFit
+
+
 def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms of a model with open shapes fitted to the runs' rows.
+    """Return the terms of a model with open shapes fitted to the runs' rows (see `fit_shapes`)."""
+    found = fit_shapes(runs, terms)
+    return tuple(terms) if found is None else found.terms
+
+
+def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
+    """Fit the open shapes of a model's terms to the runs' rows; return None where none is open.
 
     By variable projection: effects are added one after another, each from the points of its shape
     grid that leave least. Given shapes are kept. Raises InputError for unusable records.
@@ -26,13 +44,13 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
     rig = ck.common_rig(runs)
     wanted = [u for u in terms if open_shapes(rig, u)]
     if not wanted:
-        return tuple(terms)
+        return None
     known = [u for u in terms if u not in wanted]
     data = regression_data(
         rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
     )
-    refined: tuple[Used, ...] = ()
     seen = evidence(data, data.mean_residual)
+    refined: tuple[Used, ...] = ()
     for used in wanted:
         assert isinstance(used.term, Effect)
         looks = shape_grid(used.term, rig, seen)
@@ -45,13 +63,13 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
         best = min((refine(data, trial) for trial in near), key=lambda candidate: candidate.energy)
         refined = best.terms[len(data.terms) :]
     shaped = dict(zip(wanted, refined, strict=True))
-    return tuple(shaped.get(u, u) for u in terms)
+    return ShapeFit(tuple(shaped.get(u, u) for u in terms), data, best)
 
 
-def shapes_in(rig: Rig, terms: Sequence[Used]) -> Mapping[str, tuple[float, Shape]]:
-    """Return value and description of every shape that a model has, by its name."""
+def shapes_in(rig: Rig, terms: Sequence[Used]) -> dict[str, Estimate]:
+    """Return the value of every shape that a model has, by its name, with no error (NaN)."""
     return {
-        s.parameter: (value, s)
+        s.parameter: Estimate(value, s.unit, math.nan, (math.nan, math.nan))
         for u in terms
         for value, s in zip(u.shape, shapes_of(rig, u), strict=True)
     }

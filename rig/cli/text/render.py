@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.effects.base import Shape
 from analysis.identify.result import Identification
 from analysis.report.format import MINUS, column_percent
 from analysis.simulation.model import Estimate
@@ -76,10 +75,13 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     return "\n".join(lines)
 
 
-def shapes_text(shapes: Mapping[str, tuple[float, Shape]]) -> str:
-    """Return the effects' shape parameters, one per line; '' if there are none."""
-    lines = [f"shape: {name} = {value:.4g} {s.unit}" for name, (value, s) in shapes.items()]
-    return "".join(f"\n{line}" for line in lines)
+def shapes_text(shapes: Mapping[str, Estimate]) -> str:
+    """Return the effects' shapes, one per line, those found with 95 % half-widths; '' if none."""
+    lines = []
+    for name, shape in shapes.items():
+        half = f" ± {shape.half:.2g}" if math.isfinite(shape.half) else ""
+        lines.append(f"\nshape: {name} = {shape.value:.4g}{half} {shape.unit}")
+    return "".join(lines)
 
 
 def validation_text(results: Sequence[RecordValidation]) -> str:

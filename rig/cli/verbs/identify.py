@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +20,9 @@ from rig.cli.text.output import Countdown, printed_at_end, progress, write_json
 if TYPE_CHECKING:
     from analysis.identify.result import Identification
     from analysis.regression.rows import Filtering
+    from analysis.simulation.model import Estimate
     from analysis.terms.base import Used
+    from analysis.trace.search.shapes import ShapeFit
     from rig.model.records import Record, Run
 
 
@@ -73,28 +77,50 @@ def _streamed(
         )  # fmt: skip
 
 
-def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Sequence[Used] | None:
-    """Return the terms of the options, with unset shapes fitted; None for the rig file's terms."""
+def _terms(
+    runs: Sequence[Run], effects: Sequence[str], like: Path | None
+) -> tuple[Sequence[Used] | None, ShapeFit | None]:
+    """Return the terms of the options, None for the rig file's, and the fit of unset shapes."""
     from analysis.simulation.model import terms_like
     from analysis.terms import with_effects
     from analysis.terms.base import Used
 
     if like is not None:
-        return terms_like(like, {run.source: run.rig for run in runs})
+        return terms_like(like, {run.source: run.rig for run in runs}), None
     if not effects:
-        return None
-    from analysis.trace.search.shapes import with_shapes  # loads scipy.optimize, slowly
+        return None, None
+    from analysis.trace.search.shapes import fit_shapes  # loads scipy.optimize, slowly
 
-    return with_shapes(runs, [Used(term) for term in with_effects(runs[0].rig, effects)])
+    terms = [Used(term) for term in with_effects(runs[0].rig, effects)]
+    found = fit_shapes(runs, terms)
+    return (terms if found is None else found.terms), found
 
 
-def _shapes_in(result: Identification) -> dict[str, Any]:
-    """Return the shapes of the model's effects by name; most models have none."""
+def _shapes_in(result: Identification) -> dict[str, Estimate]:
+    """Return the shapes of the model's effects by name, without errors; most models have none."""
     if not any(used.shape for used in result.model.terms):
         return {}
     from analysis.trace.search.shapes import shapes_in  # loads scipy.optimize, slowly
 
-    return dict(shapes_in(result.model.rig, result.model.terms))
+    return shapes_in(result.model.rig, result.model.terms)
+
+
+def _shape_json(shape: Estimate) -> dict[str, Any]:
+    """Return a shape as JSON data, with its error where it was found in the records."""
+    from analysis.simulation.model import estimate_json
+
+    found = math.isfinite(shape.std)
+    return estimate_json(shape) if found else {"value": shape.value, "unit": shape.unit}
+
+
+def _with_shape_errors(
+    result: Identification, found: ShapeFit
+) -> tuple[Identification, dict[str, Estimate]]:
+    """Return the result with the errors of shapes that were fitted, and these shapes."""
+    from analysis.trace.judge.given_effects import with_shape_errors
+
+    model, shapes = with_shape_errors(found, result.model)
+    return replace(result, model=model), shapes
 
 
 def identify(
@@ -185,10 +211,10 @@ def identify(
         raise InputError("--like uses the terms of a model unchanged: expected no --with beside it")
     if stream or cluster is not None:
         _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
-        result = _streamed(runs, filters, effects or (), like, cluster)
+        result, found = _streamed(runs, filters, effects or (), like, cluster), None
     else:
         loaded = load_runs(runs)
-        terms = _terms(loaded, effects or (), like)
+        terms, found = _terms(loaded, effects or (), like)
         result = identify_runs(
             loaded,
             method,
@@ -201,9 +227,12 @@ def identify(
             progress=Countdown("identifying"),
         )
     shapes = _shapes_in(result)
+    if found is not None:
+        result, fitted = _with_shape_errors(result, found)
+        shapes |= fitted
     document, more = to_json(result), shapes_text(shapes) + method_text(result)
     if shapes:
-        document["shapes"] = {n: {"value": v, "unit": s.unit} for n, (v, s) in shapes.items()}
+        document["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
     if physical:
         from rig.cli.identification.physical import make_physical
 

@@ -8,7 +8,8 @@ from analysis.effects.base import open_shapes
 from analysis.identify.identify import identify
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.trace.search.shapes import shapes_in, with_shapes
+from analysis.trace.judge.given_effects import with_shape_errors
+from analysis.trace.search.shapes import fit_shapes, shapes_in, with_shapes
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
@@ -28,7 +29,7 @@ def test_a_dead_band_is_found_with_both_edges_and_the_gains_come_back(
     rig: Rig, overlapped: Run
 ) -> None:
     terms = with_shapes([overlapped], used(rig, "valve_deadband@joint 2"))
-    shapes = {name: value for name, (value, _) in shapes_in(rig, terms).items()}
+    shapes = {name: shape.value for name, shape in shapes_in(rig, terms).items()}
     assert shapes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
     assert shapes["w_astern_2"] == pytest.approx(5e-3, rel=0.05)
     found = identify([overlapped], terms=terms).estimates
@@ -42,7 +43,7 @@ def test_what_the_records_do_not_have_comes_out_as_next_to_nothing(rig: Rig) -> 
     """And not as edges that no spool ever reaches."""
     run = experiment(rig, repeats=2)
     terms = with_shapes([run], used(rig, "valve_deadband@joint 2"))
-    shapes = {name: value for name, (value, _) in shapes_in(rig, terms).items()}
+    shapes = {name: shape.value for name, shape in shapes_in(rig, terms).items()}
     assert max(shapes["w_ahead_2"], shapes["w_astern_2"]) < 1e-3
 
 
@@ -52,4 +53,29 @@ def test_a_shape_that_is_given_stays_and_dry_friction_needs_none(rig: Rig, overl
     given = (*terms[:-1], Used(terms[-1].term, (0.01, 0.01, 0.0)))
     assert with_shapes([overlapped], given) == given
     assert with_shapes([overlapped], terms[:-1]) == tuple(terms[:-1])
-    assert shapes_in(rig, given)["w_ahead_2"][0] == 0.01
+    assert shapes_in(rig, given)["w_ahead_2"].value == 0.01
+
+
+def test_edges_come_with_intervals_that_hold(rig: Rig, overlapped: Run) -> None:
+    found = fit_shapes([overlapped], used(rig, "valve_deadband@joint 2"))
+    assert found is not None
+    model = identify([overlapped], terms=found.terms).model
+    wider, shapes = with_shape_errors(found, model)
+    for name, size in (("w_ahead_2", 8e-3), ("w_astern_2", 5e-3)):
+        low, high = shapes[name].ci95
+        assert low < size < high
+        assert high - low < 0.2 * size
+    assert wider.values == model.values
+
+
+def test_intervals_include_the_errors_of_the_shapes_that_the_records_gave(rig: Rig) -> None:
+    """Friction slides at 20 N; its transition and presliding distance decide how much that is."""
+    run = experiment(rig, repeats=2, Fc=20.0, Fs=60.0)
+    found = fit_shapes([run], used(rig, "coulomb_friction@joint 2", "stribeck_friction@joint 2"))
+    assert found is not None
+    exact = identify([run], terms=found.terms).model
+    wider, _ = with_shape_errors(found, exact)
+    (low, high), (least, most) = (m.parameters["Fc2"].ci95 for m in (exact, wider))
+    assert not low < 20.0 < high
+    assert least < 20.0 < most
+    assert wider.parameters["M2"].half > 2.0 * exact.parameters["M2"].half

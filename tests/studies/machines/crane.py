@@ -161,7 +161,7 @@ def known_band(runs: Sequence[Run], holdout_data: Sequence[Run]) -> tuple[str, T
         (found,) = validate(identify(runs, terms=terms).model, holdout_data)
         error = f"{1e3 * found.rmse['piston_1']:.1f} mm"
         shapes = shapes_in(runs[0].rig, terms).items()
-        edges = ", ".join(f"{n} {value:.3g}" for n, (value, _) in shapes)
+        edges = ", ".join(f"{n} {shape.value:.3g}" for n, shape in shapes)
         rows.append([name, f"{found.fit['piston_1']:.1f} %", error, edges])
     told = trace(runs, holdout_data, families=("fluid",), terms=band)
     return table(["model", "piston FIT", "RMSE", "edges"], rows), told
