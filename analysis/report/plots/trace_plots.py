@@ -121,9 +121,9 @@ def against(
     after: bool,
 ) -> Markup:
     """Draw the residual over a variable, before next to after on one scale, with binned means."""
-    parts = [("before", np.concatenate([line.before for line in lines]))]
+    parts = [("before: " if after else "", np.concatenate([line.before for line in lines]))]
     if after:
-        parts.append(("after", np.concatenate([line.after for line in lines])))
+        parts.append(("after: ", np.concatenate([line.after for line in lines])))
     top = 1.1 * max(float(np.quantile(np.abs(parts[0][1]), 0.995)), 2.5 * noise)
     kept = np.linspace(0, len(x) - 1, min(REPORT.scatter_points, len(x))).astype(int)
     with style():
@@ -141,9 +141,9 @@ def against(
             if not k:
                 axes.set_ylabel(f"residual [{unit}]")
             rms = float(np.sqrt(np.mean(y**2)))
-            note(axes, 0.98, 0.98, f"{word}: {fm.significant(rms)} {unit} rms", INK)
+            note(axes, 0.98, 0.98, f"{word}{fm.significant(rms)} {unit} rms", INK)
         canvas.tight_layout()
-        return svg(canvas, key, f"Residual against {label}, before and after")
+        return svg(canvas, key, f"Residual against {label}{_compared(after)}")
 
 
 def curves(effect: JudgedEffect, key: str) -> Markup:
@@ -235,14 +235,14 @@ def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool
         axes = canvas.add_subplot()
         axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
         axes.plot(*gapped(t[shown], line.before[shown]), color=GREY, lw=1.1)
-        note(axes, 0.99, 0.97, "before", GREY)
         if after:
+            note(axes, 0.99, 0.97, "before", GREY)
             axes.plot(*gapped(t[shown], line.after[shown]), color=BLUE, lw=1.1)
             note(axes, 0.99, 0.84, "after", BLUE)
         axes.set_xlabel("time in the record [s]")
         axes.set_ylabel(f"residual [{unit}]")
         canvas.tight_layout()
-        return svg(canvas, key, "Held-out residual in time, before and after")
+        return svg(canvas, key, f"Held-out residual in time{_compared(after)}")
 
 
 def over_noise(result: Trace, key: str = "overnoise") -> Markup:
@@ -268,9 +268,16 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))
         axes.set_ylim(-0.6, len(names) - 0.4)
-        axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
+        colours = " (grey before, blue after)" if result.changed else ""
+        axes.set_xlabel(f"held-out error over the noise floor{colours}")
         canvas.tight_layout()
-        return svg(canvas, key, "Held-out error over the noise floor, before and after")
+        title = f"Held-out error over the noise floor{_compared(result.changed)}"
+        return svg(canvas, key, title)
+
+
+def _compared(changed: bool) -> str:
+    """Return the end of the title of a figure that shows two models; '' for one model."""
+    return ", before and after" if changed else ""
 
 
 def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
@@ -303,9 +310,10 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
             if not k:
                 axes.set_ylabel(f"repeatable rms per line [{unit}]")
                 axes.legend(loc="lower left", fontsize=7, ncols=3, handletextpad=0.2, frameon=False)
-            note(axes, 0.98, 0.98, word, INK)
+            if after:
+                note(axes, 0.98, 0.98, word, INK)
         canvas.tight_layout()
-        return svg(canvas, key, "Lines of the residual, before and after")
+        return svg(canvas, key, f"Lines of the residual{_compared(after)}")
 
 
 def binned(x: Array, y: Array) -> dict[str, Array]:

@@ -21,49 +21,9 @@ def trace_text(result: Trace) -> str:
         lines += _effect(effect)
     for effect in result.refused:
         lines += ["fitted best, but not named:", *_effect(effect)]
-    rig = result.model_before.rig
-    rows = [
-        [
-            name, _number(result.noise_floor.get(name, math.nan), 2), _number(before, 2),
-            _number(result.after.get(name, math.nan), 2), unit_of_equation(rig, name),
-            *(_share(errors.get(name), result.size.get(name)) for errors in (
-                result.before, result.after)),
-        ]
-        for name, before in result.before.items()
-    ]  # fmt: skip
-    lines += [
-        table(
-            [
-                "held-out error",
-                "noise floor",
-                "before",
-                "after",
-                "unit",
-                "relative before",
-                "after",
-            ],
-            rows,
-        ),
-        "",
-    ]
-    fits = [_free_run(result, name) for name in result.fit_before]
-    if fits:
-        lines += [
-            table(
-                [
-                    "held-out free run",
-                    "FIT before",
-                    "after",
-                    "RMSE before",
-                    "after",
-                    "in 0.25 s before",
-                    "after",
-                    "unit",
-                ],
-                fits,
-            ),
-            "",
-        ]
+    lines += [_errors(result), ""]
+    if result.fit_before:
+        lines += [_free_runs(result), ""]
     changed = _changed(result) if result.changed else []
     if changed:
         lines += [table(["parameter", "before", "after", "unit", "change"], changed), ""]
@@ -84,6 +44,32 @@ def trace_text(result: Trace) -> str:
     lines += [f"note: {note}" for note in result.notes]
     lines.append(f"traced in {result.seconds:.1f} s")
     return "\n".join(lines)
+
+
+def _errors(result: Trace) -> str:
+    """Return the held-out errors as a table, once where nothing was added to the model."""
+    models = (result.before, result.after)[: 2 if result.changed else 1]
+    rows = [
+        [
+            name, _number(result.noise_floor.get(name, math.nan), 2),
+            *(_number(errors.get(name, math.nan), 2) for errors in models),
+            unit_of_equation(result.model_before.rig, name),
+            *(_share(errors.get(name), result.size.get(name)) for errors in models),
+        ]
+        for name in result.before
+    ]  # fmt: skip
+    words = ["before", "after"] if result.changed else ["rms"]
+    relative = ["relative before", "after"] if result.changed else ["relative"]
+    return table(["held-out error", "noise floor", *words, "unit", *relative], rows)
+
+
+def _free_runs(result: Trace) -> str:
+    """Return the held-out free runs as a table, once where nothing was added to the model."""
+    figures: tuple[str, ...] = ("FIT", "RMSE", "in 0.25 s")
+    if result.changed:
+        figures = tuple(word for f in figures for word in (f"{f} before", "after"))
+    rows = [_free_run(result, name) for name in result.fit_before]
+    return table(["held-out free run", *figures, "unit"], rows)
 
 
 def _share(error: float | None, size: float | None) -> str:
@@ -127,7 +113,8 @@ def _percent(value: float, sign: str = "") -> str:
 
 def _free_run(result: Trace, channel: str) -> list[str]:
     fits, errors, unit = free_run_row(result, channel)
-    return [channel, *map(_percent, fits), *map(_number, errors), unit]
+    step = 1 if result.changed else 2  # pairs of before and after
+    return [channel, *map(_percent, fits[::step]), *map(_number, errors[::step]), unit]
 
 
 def _number(value: float, digits: int = 3) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,14 @@ import pytest
 
 from analysis.effects.base import Effect
 from analysis.identify.identify import identify
+from analysis.report.trace import render
 from analysis.simulation.model import load_model, save_model
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
+from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -58,6 +61,9 @@ def test_a_bench_with_nothing_wrong_is_clean_and_nothing_is_named(quiet: tuple[R
     assert result.after == result.before
     for equation, error in result.after.items():
         assert error < 1.2 * result.noise_floor[equation]
+    for shown in (trace_text(result), render([quiet[1]], result)):
+        assert "noise floor" in shown.lower()
+        assert not re.search(r"\bbefore\b", shown, re.IGNORECASE)  # nothing was added: one figure
 
 
 def test_a_leak_is_named_with_place_and_size_and_its_error_falls_to_the_noise(
