@@ -68,9 +68,9 @@ def trace(
     every = load_runs([*runs, *holdout, *(judge or ())])
     loaded, unseen = every[: len(runs)], every[len(runs) :]
     chosen_by, judged_by = unseen[: len(holdout)], unseen[len(holdout) :]
-    progress(f"tracing {sum(len(r.records) for r in loaded)} records")
     rigs = {run.source: run.rig for run in every}
     known = None if like is None else terms_like(like, rigs)
+    progress(f"tracing {sum(len(r.records) for r in loaded)} records")
     result = trace_runs(
         loaded, chosen_by, seed=seed, families=FAMILIES_OF[equations], terms=known,
         progress=Countdown("tracing"), judge=judged_by,
