@@ -113,7 +113,8 @@ class Evidence:
 class Effect(Term):
     """A candidate of the trace at one place (`where`); a subclass overrides methods as needed.
 
-    `variable` names in plain words what the effect's contribution depends on; `confounders` are
+    `variable` names in plain words what the effect's contribution depends on, `quantity` what its
+    residual is plotted against (see `plotted`, `abscissa`); `confounders` are
     effects whose columns are similar on poor excitation, `separated_by` an excitation on which they
     differ; `includes` names effects that it equals at a limit of its own numbers and replaces, and
     `beside` those that it may accompany as another part of their law, `excludes` those that cannot
@@ -139,6 +140,7 @@ class Effect(Term):
     least: ClassVar[tuple[float, ...]] = ()
     least_shape: ClassVar[tuple[float, ...]] = ()
     variable: ClassVar[str] = ""
+    quantity: ClassVar[str] = ""
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
     includes: ClassVar[tuple[str, ...]] = ()
@@ -230,6 +232,10 @@ class Effect(Term):
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State a size at the conditions of the records ('' where its parameter states it)."""
         return ""
+
+    def plotted(self) -> str:
+        """Name the quantity of `abscissa`; its unit is in `analysis.report.plots.trace_plots`."""
+        return self.quantity
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return, by equation, the variable (n,) to plot that equation's residual against."""

@@ -50,6 +50,7 @@ class EntrainedAir(Effect):
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
     variable: ClassVar[str] = "the pressure rate at low chamber pressure"
+    quantity: ClassVar[str] = "pressure"
     confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag", "channel_delay")
     separated_by: ClassVar[str] = (
         "fast pressure changes at low and at high chamber pressure: dead volume acts alike at both"
@@ -139,6 +140,7 @@ class DeadVolume(Effect):
     stage: ClassVar[int] = VOLUME
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     variable: ClassVar[str] = "the chamber's pressure rate"
+    quantity: ClassVar[str] = "pressure rate"
     confounders: ClassVar[tuple[str, ...]] = ("entrained_air", "spool_lag", "channel_delay")
     separated_by: ClassVar[str] = (
         "fast pressure changes near both ends of the stroke, of several chambers"

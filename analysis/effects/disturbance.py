@@ -44,6 +44,7 @@ class PeriodicDisturbance(Effect):
     least: ClassVar[tuple[float, ...]] = (1.0, 0.0)  # [N m]
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "time, at one frequency"
+    quantity: ClassVar[str] = "time"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring")
     separated_by: ClassVar[str] = (
         "another excitation, which changes effects of the joint's motion but not this one"

@@ -68,6 +68,7 @@ class MeteringCurve(Effect):
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
     variable: ClassVar[str] = "the spool"
+    quantity: ClassVar[str] = "spool"
     confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "supply_sag", "tank_pressure")
     separated_by: ClassVar[str] = "the same opening at several pressures across the edge"
     per_joint: ClassVar[bool] = True
@@ -177,6 +178,7 @@ class BulkModulusCurve(Effect):
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
     variable: ClassVar[str] = "the pressure rate, by the pressure"
+    quantity: ClassVar[str] = "pressure"
     confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag")
     separated_by: ClassVar[str] = "fast pressure changes at low and at high chamber pressure"
 

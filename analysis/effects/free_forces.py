@@ -217,6 +217,7 @@ class PositionForce(Effect):
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     variable: ClassVar[str] = "the piston's position"
+    quantity: ClassVar[str] = "position"
     confounders: ClassVar[tuple[str, ...]] = ("friction_curve",)
     separated_by: ClassVar[str] = "slow motion over the whole stroke at two poses of other joints"
     per_joint: ClassVar[bool] = True

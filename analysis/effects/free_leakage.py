@@ -72,6 +72,7 @@ class LeakageCurve(_FreeLeakage):
 
     name: ClassVar[str] = "leakage_curve"
     variable: ClassVar[str] = "the pressure across the leak"
+    quantity: ClassVar[str] = "pressure across the leak"
     confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
     separated_by: ClassVar[str] = (
         "a load that drives the pressures far apart while the piston hardly moves"
@@ -165,6 +166,7 @@ class LeakageAlongStroke(_FreeLeakage):
 
     name: ClassVar[str] = "leakage_along_stroke"
     variable: ClassVar[str] = "the pressure difference across the piston, by its position"
+    quantity: ClassVar[str] = "position"
     confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "internal_leakage")
     separated_by: ClassVar[str] = "the same motion about several places of the stroke"
 

@@ -41,6 +41,7 @@ class SupplyCurve(PortEffect):
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     variable: ClassVar[str] = "the flow drawn from the supply"
+    quantity: ClassVar[str] = "flow drawn"
     confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "tank_pressure")
     separated_by: ClassVar[str] = "two amplitudes, one and both joints at once"
 

@@ -68,6 +68,7 @@ class Friction(Effect):
     mechanism: ClassVar[str] = "friction_curve"
     element: ClassVar[str] = "piston"
     family: ClassVar[str] = "friction"
+    quantity: ClassVar[str] = "velocity"
     per_joint: ClassVar[bool] = True
     stiffens: ClassVar[bool] = False
     before: ClassVar[int] = 0

@@ -113,6 +113,7 @@ class InternalLeakage(_Leakage):
     name: ClassVar[str] = "internal_leakage"
     least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
     variable: ClassVar[str] = "the pressure difference across the piston"
+    quantity: ClassVar[str] = "pressure difference"
     confounders: ClassVar[tuple[str, ...]] = (
         "external_leakage",
         "underlap_leakage",
@@ -156,6 +157,7 @@ class ExternalLeakage(_Leakage):
     element: ClassVar[str] = "chamber"
     least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
     variable: ClassVar[str] = "the chamber's pressure"
+    quantity: ClassVar[str] = "pressure"
     confounders: ClassVar[tuple[str, ...]] = (
         "internal_leakage",
         "underlap_leakage",

@@ -156,6 +156,10 @@ class Sensor(Effect):
         """Reject a shape at its bounds."""
         return self.outside(rig, shape)
 
+    def plotted(self) -> str:
+        """Name the channel's quantity, of a piston its velocity."""
+        return {"spool": "spool", "piston": "velocity"}.get(self.shared or self.side, "pressure")
+
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the channel, in the rows in which it occurs first."""
         if self.shared:
@@ -168,14 +172,15 @@ class Sensor(Effect):
         i = self.joint
         flows = (equation("flow_cap", i), equation("flow_rod", i))
         if self.side == "spool":
-            return dict.fromkeys(flows, self._shown(signals.u))
+            return dict.fromkeys(flows, self._shown(signals.u, signals.rate))
         if self.side == "piston":
-            return {name: self._shown(signals.sd) for name in (*flows, equation("torque", i))}
+            speed = self._shown(signals.sd, signals.rate)
+            return dict.fromkeys((*flows, equation("torque", i)), speed)
         p = signals.p_cap if self.side == "cap" else signals.p_rod
         rows = (equation(f"flow_{self.side}", i), equation("torque", i))
-        return {name: self._shown(p) for name in rows}
+        return dict.fromkeys(rows, self._shown(p, signals.rate))
 
-    def _shown(self, x: Array) -> Array:
+    def _shown(self, x: Array, rate: float) -> Array:
         return x[:, self.joint]
 
 
@@ -195,8 +200,13 @@ class Late(Sensor):
         bent = between_samples(rig, self.shape_of(rig, shape)[0]) if spool else ""
         return super().problem(rig, values, shape) or bent
 
-    def _shown(self, x: Array) -> Array:
-        return np.gradient(x[:, self.joint])
+    def plotted(self) -> str:
+        """Name the rate of the channel's quantity."""
+        quantity = super().plotted()
+        return "acceleration" if quantity == "velocity" else f"{quantity} rate"
+
+    def _shown(self, x: Array, rate: float) -> Array:
+        return np.gradient(x[:, self.joint]) * rate
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class BaseInclination(Effect):
     family: ClassVar[str] = "mechanics"
     alters: ClassVar[tuple[str, ...]] = ("mechanical",)
     variable: ClassVar[str] = "the cosine of the absolute angles"
+    quantity: ClassVar[str] = "absolute angle"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring", "sensor_offset")
     separated_by: ClassVar[str] = (
         "slow motion of every joint over its whole stroke at several poses of the others"
@@ -117,6 +118,7 @@ class JointSpring(Effect):
     least: ClassVar[tuple[float, ...]] = (20.0,)  # [N m/rad]
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "the joint's angle"
+    quantity: ClassVar[str] = "joint position"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination")
     includes: ClassVar[tuple[str, ...]] = ("torque_offset",)  # at a rest angle far away
     separated_by: ClassVar[str] = (
@@ -200,6 +202,7 @@ class TorqueOffset(Effect):
     least: ClassVar[tuple[float, ...]] = (2.0,)  # [N m]
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "nothing: it is constant"
+    quantity: ClassVar[str] = "joint position"
     confounders: ClassVar[tuple[str, ...]] = (
         "asymmetric_friction",
         "base_inclination",

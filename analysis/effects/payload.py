@@ -45,6 +45,7 @@ class Payload(Effect):
     name: ClassVar[str] = "payload"
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "gravity and inertia alike"
+    quantity: ClassVar[str] = "absolute angle"
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = (
         "records with and without the payload, or a model identified without it as reference"

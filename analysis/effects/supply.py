@@ -183,6 +183,7 @@ class SupplySag(PortEffect):
     by_data: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
+    quantity: ClassVar[str] = "flow drawn"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
     separated_by: ClassVar[str] = (
         "two amplitudes, one and both joints at once: the drop depends on the whole bench's flow"
@@ -246,6 +247,7 @@ class TankPressure(PortEffect):
     name: ClassVar[str] = "tank_pressure"
     least_shape: ClassVar[tuple[float, ...]] = (0.1e6, 0.0)  # [Pa]
     variable: ClassVar[str] = "the pressure left across the edge to the tank"
+    quantity: ClassVar[str] = "pressure"
     confounders: ClassVar[tuple[str, ...]] = ("supply_sag", "sensor_offset", "external_leakage")
     separated_by: ClassVar[str] = (
         "motion at low chamber pressure, where the drop across the edge to the tank is small"
@@ -314,6 +316,7 @@ class ReturnLine(PortEffect):
     element: ClassVar[str] = "tank"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow returned to the tank"
+    quantity: ClassVar[str] = "flow returned"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag")
     separated_by: ClassVar[str] = (
         "two amplitudes: a tank's own pressure stays the same, the line's grows"

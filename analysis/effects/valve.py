@@ -37,6 +37,7 @@ class ValveEffect(Effect):
     element: ClassVar[str] = "valve"
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "valve"
+    quantity: ClassVar[str] = "spool"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     prepares: ClassVar[bool] = True
     per_joint: ClassVar[bool] = True
@@ -208,6 +209,7 @@ class SpoolLag(ValveEffect):
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     stage: ClassVar[int] = LAG
     variable: ClassVar[str] = "the spool's velocity"
+    quantity: ClassVar[str] = "spool rate"
     confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "valve_deadband", "entrained_air")
     separated_by: ClassVar[str] = (
         "high frequencies: a lag loses amplitude there, a delay only phase"

@@ -46,6 +46,7 @@ class AsymmetricViscousFriction(Effect):
     least: ClassVar[tuple[float, ...]] = (50.0, 0.0)  # [N s/m]
     family: ClassVar[str] = "friction"
     variable: ClassVar[str] = "the amount of the piston's velocity"
+    quantity: ClassVar[str] = "velocity"
     confounders: ClassVar[tuple[str, ...]] = (
         "torque_offset",
         "asymmetric_friction",

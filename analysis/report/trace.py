@@ -89,7 +89,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
     for k, effect in enumerate(effects):
         equation = trace_plots.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {place_in_words(effect.where)}"
-        add(effect, effect.variable, equation, heading, f"e{k}")
+        add(effect, effect.plotted(), equation, heading, f"e{k}")
     # A frequency is visible over time and in the lines only; noise depends on no variable.
     drawn = [
         d for d in result.depends_on
@@ -108,10 +108,8 @@ def _pair(
 ) -> dict[str, Any]:  # fmt: skip
     unit = unit_of_equation(rig, equation)
     noise, changed = result.noise_floor[equation], result.changed
-    x = trace_plots.abscissae(rig, here, effect, variable, equation, result.model_after)
-    label = variable
-    if effect is None:
-        label = f"{variable} [{trace_plots.unit_of_variable(rig, variable)}]"
+    label, scale = trace_plots.axis(rig, variable)
+    x = scale * trace_plots.abscissae(rig, here, effect, variable, equation, result.model_after)
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",

@@ -170,6 +170,12 @@ RESIDUALS: Final = {
     "m": _MM,
     "rad": DisplayUnit(1e3, "mrad"),
 }
+AXES: Final = {  # variables that a residual is plotted against
+    **READINGS,
+    **LIMITS,
+    "m/s": DisplayUnit(1e3, "mm/s"),
+    "rad/s": DisplayUnit(180.0 / math.pi, "°/s"),
+}
 
 
 def display_unit(si: str, table: Mapping[str, DisplayUnit]) -> DisplayUnit:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,7 @@ from rig.model import channels as ch
 from rig.model.channels import kind_of
 from rig.model.records import Run
 from rig.model.rig import Rig
+from rig.model.units import AXES, display_unit, typeset
 
 Array = NDArray[np.float64]
 
@@ -329,15 +331,28 @@ def binned(x: Array, y: Array) -> dict[str, Array]:
     }
 
 
-def unit_of_variable(rig: Rig, name: str) -> str:
-    """Return a variable's SI unit for an axis."""
-    stem = name.rsplit("_", 1)[0]
+def axis(rig: Rig, name: str) -> tuple[str, float]:
+    """Return the label with its practical unit of a variable's axis, and the factor from SI.
+
+    `name` is that of a channel, of a variable of clues, or of an effect's plotted quantity.
+    """
+    shown = display_unit(_unit_of_variable(rig, name), AXES)
+    return f"{name} [{typeset(shown.text)}]", shown.scale
+
+
+def _unit_of_variable(rig: Rig, name: str) -> str:
+    with suppress(ValueError):  # no channel
+        return rig.unit_of(name)
     way = rig.unit_of(ch.channel(rig.position_kind, 1))
-    units = {
-        "velocity": f"{way}/s", "acceleration": f"{way}/s²", "pressure_difference": "Pa",
-        "time": "s",
-    }  # fmt: skip
-    return units[stem] if stem in units else rig.unit_of(name)
+    spool, pressure = ch.UNITS[ch.SPOOL], ch.UNITS[ch.SUPPLY]
+    return {
+        "position": way, "velocity": f"{way}/s", "acceleration": f"{way}/s^2",
+        "joint position": way if rig.electric else "rad", "absolute angle": "rad",
+        "spool": spool, "spool rate": f"{spool}/s",
+        "pressure": pressure, "pressure difference": pressure,
+        "pressure across the leak": pressure, "pressure rate": f"{pressure}/s",
+        "flow drawn": "m^3/s", "flow returned": "m^3/s", "time": "s",
+    }[name.rstrip("_0123456789").replace("_", " ")]  # fmt: skip
 
 
 def equation_of(
@@ -352,6 +367,6 @@ def equation_of(
 
 
 __all__ = [
-    "ResidualSeries", "abscissae", "against", "equation_of", "held_out", "in_time", "instead",
-    "kind_of", "over_noise", "spectrum", "unit_of_variable",
+    "ResidualSeries", "abscissae", "against", "axis", "equation_of", "held_out", "in_time",
+    "instead", "kind_of", "over_noise", "spectrum",
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,21 @@ def test_every_place_that_the_catalogue_names_is_marked_in_the_drawing(name: str
         assert f"{k} {effect_name.replace('_', ' ')} at {place_in_words(place)}" in " ".join(
             drawn.split()
         )
+
+
+@pytest.mark.parametrize("name", ["shinshu-2dof", "electric-2dof", "emps"])
+def test_every_residual_is_plotted_over_a_quantity_with_a_practical_unit(name: str) -> None:
+    rig = shipped(name)
+    effects = (*catalogue(rig), *free_mechanisms(rig))
+    axes = {(e.name, e.where): trace_plots.axis(rig, e.plotted()) for e in effects}
+    way = rig.unit_of(f"{rig.position_kind}_1")
+    words, factor = {"rad": ("°/s", 180 / math.pi), "m": ("mm/s", 1e3)}[way]
+    label, scale = axes["coulomb_friction", "joint 1"]
+    assert (label, round(scale, 6)) == (f"velocity [{words}]", round(factor, 6))
+    if not rig.electric:
+        assert axes["internal_leakage", "joint 1"] == ("pressure difference [MPa]", 1e-6)
+        assert axes["sensor_lag", "joint 1 spool"] == ("spool rate [V/s]", 1.0)
+        assert trace_plots.axis(rig, "cap_pressure_1") == ("cap_pressure_1 [MPa]", 1e-6)
 
 
 @pytest.mark.parametrize(

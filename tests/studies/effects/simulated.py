@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from analysis.effects.base import Effect, Shape, ordered, shape_values
 from analysis.regression.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.report.plots import style
+from analysis.report.plots.trace_plots import axis
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms import baseline, make
 from analysis.terms.base import FAMILIES, Used, family_of
@@ -240,10 +241,11 @@ def _outcome(
         key=lambda name: before[name] / judged[name],
     )
     abscissa, old, new = _picture(train, effect, worst, plain, fit)
+    label, scale = axis(train.rig, effect.plotted())
     return Outcome(
         effect, {n: (v, found[n]) for n, v in sizes.items()}, worst,
-        before[worst] / judged[worst], after[worst] / judged[worst], abscissa, (old, new),
-        effect.variable,
+        before[worst] / judged[worst], after[worst] / judged[worst], scale * abscissa, (old, new),
+        label,
     )  # fmt: skip
 
 
