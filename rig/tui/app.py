@@ -112,6 +112,7 @@ class Monitor(ByHand, App[int]):
         self._span: float | None = None  # None: automatic
         self._held_frame: Frame | None = None  # frame of a held picture
         self._drawn_frame: object = None
+        self._listed: object = None  # state of the link when the folder was read
         self._slow = -float("inf")
         self._last_escape = -float("inf")
         self._stopped_by: events.Key | None = None  # the newest key that has already stopped
@@ -187,6 +188,7 @@ class Monitor(ByHand, App[int]):
     def draw(self, *, force: bool = False) -> None:
         """Draw changed parts, and time-dependent parts while anything is in progress."""
         frame, now = self.link.frame, self.clock()
+        self._list_again(frame)
         blink = int(now / BLINK) % 2 == 0 if self.alarms_of(frame).unacknowledged else True
         if blink != self.look.blink:
             self.look = replace(self.look, blink=blink)
@@ -301,6 +303,14 @@ class Monitor(ByHand, App[int]):
         marked = self.look.marked if back or opens else 0
         self.look = replace(self.look, page=page, marked=marked, offset=0)
         if page == "runs":
+            self._list_again(self.link.frame, force=True)
+
+    def _list_again(self, frame: Frame, *, force: bool = False) -> None:
+        """Read the folder of an open page of runs if a run has begun or ended since it was read."""
+        state = (frame.stage, frame.snapshot is None)
+        changed = self.look.page == "runs" and state != self._listed and not self.browsed.reading
+        if changed or force:
+            self._listed = state
             self.read_folder()
 
     def _choose(self, key: str) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from protocols.files.library import shipped_names
 from rig.queue.items import QueueJob
 from rig.queue.store import QueueStore
+from rig.runs.runstate import write_state
 from rig.runs.store import create_run
 from rig.tui import jobs
 from rig.tui.app import Monitor
@@ -20,7 +22,7 @@ from rig.tui.browse import BrowserState, read_disk
 from rig.tui.jobs import VerbJob
 from tests.services.children import RIG
 from tests.tui.glass import Clock, Glass, Machine, Recorded, endpoint
-from tests.tui.recorded import Bench, followed, run
+from tests.tui.recorded import Bench, followed, run, stopped
 
 HERE = endpoint()
 
@@ -114,6 +116,31 @@ async def test_runs_protocols_and_the_queue_are_listed_and_a_corrupt_run_is_a_se
         assert "Traceback" not in shown.text
         await shown.press("right")
         assert "validate" in shown.text
+
+
+async def test_a_run_that_ends_while_it_is_listed_is_not_shown_as_running(folder: Path) -> None:
+    here = folder / "fresh"
+    record = Recorded(replace(view, run=str(here)) for view in run(Bench(), 1.0))
+    machine = Machine({HERE: record})
+    office = Office(folder, machine)
+    async with office.app.run_test(size=(120, 40)) as pilot:
+        shown = Glass(office.app, pilot, office.clock)
+        await shown.watch()
+        await office.opened(shown, tab=1)
+        assert "fresh   ● running" in shown.text
+        last = office.app.link.frame.snapshot
+        assert last is not None
+        record.waiting.append(stopped(last))  # its folder is still being written
+        await shown.watch()
+        assert "● running" not in shown.text
+        assert "fresh   ▲ aborted" in shown.text
+
+        write_state(here, "aborted")
+        machine.runs.clear()
+        await shown.watch(2.0)
+        while office.app.browsed.reading:
+            await pilot.pause(0.005)
+        assert [r.state for r in office.app.browsed.runs if r.path == here] == ["aborted"]
 
 
 def test_a_folder_that_is_not_there_is_a_sentence(tmp_path: Path) -> None:

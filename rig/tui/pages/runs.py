@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from rig.queue.items import Item
@@ -10,6 +11,7 @@ from rig.runs.listing.summary import RunSummary
 from rig.tui.browse import TABS
 from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row, window, wrapped
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
+from rig.tui.following.link import ENDED_STATES
 from rig.tui.look import PlotView
 
 WIDE = 110  # from this width on, the verb's output is to the right of the list
@@ -51,8 +53,16 @@ def _lines(view: PlotView) -> list[Row]:
     if browsed.name == "protocols":
         return [row(f" {name}") for name in browsed.protocols]
     if browsed.name == "runs":
-        return columns([_run(run) for run in browsed.runs])
+        return columns([_run(_as_reported(view, run)) for run in browsed.runs])
     return columns([_item(item) for item in browsed.queue])
+
+
+def _as_reported(view: PlotView, run: RunSummary) -> RunSummary:
+    """Return a run with the final state that it reported; its folder has it once all is written."""
+    said = view.newest.snapshot
+    if said is None or said.state not in ENDED_STATES or said.run != str(run.path.absolute()):
+        return run
+    return replace(run, state=said.state, message=said.message)
 
 
 def _run(run: RunSummary) -> list[str | Part]:
