@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from rig.tui.following.event_lines import EventLine
 from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions
 from rig.tui.units import age_text, clock_text, shown
 from rig.tui.words import headline, nearest_margin, notices, run_time
@@ -58,16 +59,17 @@ class Reader:
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._written = 0
+        self._printed: tuple[EventLine, ...] = ()
         self._next = -float("inf")
         self._last = ""
 
     def read(self, frame: Frame, now: float) -> None:
         """Print what is new in a frame."""
-        fresh = min(frame.total_lines - self._written, len(frame.event_lines))
-        self._written = frame.total_lines
-        for what in frame.event_lines[len(frame.event_lines) - fresh :]:
-            self._say(f"  at {what.time:.2f} s: {what.text}")
+        known = set(map(id, self._printed))
+        for what in frame.event_lines:
+            if id(what) not in known:
+                self._say(f"  at {what.time:.2f} s: {what.text}")
+        self._printed = frame.event_lines
         quiet = frame.over or frame.snapshot is None
         line = status_line(frame, now)
         if quiet and line != self._last:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -16,7 +17,7 @@ import pytest
 from rig.tui.following.link import Link
 from rig.tui.plain import Reader
 from tests.tui.glass import Clock, Machine, Recorded, endpoint
-from tests.tui.recorded import Bench, followed, run, snapshot, tripped
+from tests.tui.recorded import Bench, followed, past, run, snapshot, tripped
 
 HERE = endpoint()
 ROOT = Path(__file__).parents[2]
@@ -69,6 +70,24 @@ def test_a_trip_is_said_at_once_and_then_it_is_silent() -> None:
     assert line.startswith("TRIPPED: ")
     assert any("TRIP  limit 'pressure'" in said for said in listener.heard)
     assert listener.listen(30.0) == []
+
+
+def test_a_line_is_printed_once_though_the_runs_own_log_has_it_too(tmp_path: Path) -> None:
+    bench = Bench(run=str(tmp_path))
+    message = snapshot(bench, 80).message
+    phases = [("settle", 2000, "filling the lines"), ("excite", 3000, message)]
+    lines = [{"event": "phase", "tick": tick, "step": "step1", "phase": phase, "message": said}
+             for phase, tick, said in phases]  # fmt: skip
+    (tmp_path / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    record = Recorded([snapshot(bench, 80)])
+    listener = Listener(Machine({HERE: record}))
+    record.lately = past(bench, 4.0)
+    listener.listen(0.5)
+    for text in (f"step1 excite  {message}", "step1 settle  filling the lines"):
+        assert len([said for said in listener.heard if text in said]) == 1
+    assert [line.text.split()[1] for line in listener.link.frame.event_lines] == [
+        "settle", "excite", "to",
+    ]  # fmt: skip
 
 
 def test_without_a_run_it_says_so_once() -> None:

@@ -185,13 +185,14 @@ def test_trouble_in_looking_for_runs_is_shown() -> None:
 def test_the_log_tells_each_turn_once() -> None:
     first = [line.text for line in new_lines(None, VIEW)]
     assert first[0].startswith("attached to run")
-    assert "step1 repeat 1 of 4 excite" in first
+    assert first[1] == "step1 excite  joint 1 locked at its retracted end"
     assert new_lines(VIEW, snapshot(Bench(), 81)) == []
     after = replace(VIEW, step="step2", repeat=2, message="on to joint 1", lost_samples=3)
     texts = [line.text for line in new_lines(VIEW, after)]
-    assert texts == ["step2 repeat 2 of 4 excite", "on to joint 1", "3 samples lost (3 in all)"]
-    trip = [line.text for line in new_lines(VIEW, tripped(VIEW))]
-    assert any(text.startswith("TRIP  limit 'pressure'") for text in trip)
+    assert texts == ["step2 excite  on to joint 1", "3 samples lost (3 in all)"]
+    last = tripped(VIEW)
+    trip = [line.text for line in new_lines(VIEW, replace(last, message=str(last.trip)))]
+    assert len([text for text in trip if "limit 'pressure'" in text]) == 1
     assert "state: running → tripped" in trip
 
 

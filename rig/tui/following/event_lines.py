@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,6 +24,7 @@ class EventLine:
 
 
 EventText = tuple[str, str, str]  # text, style, kind
+_ATTACHED: Final = "attached to run"
 _OWN: Final = ("event", "time", "tick", "t", "parameters")  # fields of an event that are not shown
 
 
@@ -33,10 +34,11 @@ def new_lines(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
     if last is not None and (last.run, last.pid) != (snapshot.run, snapshot.pid):
         last = None
     if last is None:
-        said.append((f"attached to run {snapshot.run} on {snapshot.rig}", STRONG, "people"))
+        said.append((f"{_ATTACHED} {snapshot.run} on {snapshot.rig}", STRONG, "people"))
     if last is None or _turn(snapshot) != _turn(last):
-        said.append((_turn(snapshot), STRONG, "protocol"))
-    if snapshot.message and (last is None or snapshot.message != last.message):
+        text = _phase(snapshot.step, snapshot.phase, snapshot.message)
+        said.append((text, PLAIN, "protocol"))
+    elif snapshot.message not in (last.message, snapshot.trip):  # a trip has its own line
         said.append((snapshot.message, PLAIN, "protocol"))
     more = snapshot.lost_samples - (last.lost_samples if last else 0)
     if more > 0:
@@ -77,9 +79,13 @@ def _people(last: Snapshot | None, snapshot: Snapshot) -> list[EventText]:
     return said
 
 
-def _turn(snapshot: Snapshot) -> str:
-    repeat = f" repeat {snapshot.repeat} of {snapshot.repeats}" if snapshot.repeats > 0 else ""
-    return f"{snapshot.step}{repeat} {snapshot.phase}".strip()
+def _turn(snapshot: Snapshot) -> tuple[str, str, int]:
+    return snapshot.step, snapshot.phase, snapshot.repeat
+
+
+def _phase(step: str, phase: str, message: str) -> str:
+    """Return a phase of a step as one line, in a running log as in a stored one."""
+    return f"{step} {phase}  {message}".strip()
 
 
 def trip_text(trip: str) -> str:
@@ -105,6 +111,15 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
     return lines
 
 
+def with_earlier(lines: Sequence[EventLine], earlier: Sequence[EventLine]) -> tuple[EventLine, ...]:
+    """Insert a run's event log where the screen attached to it; what both have stays once."""
+    attached = [k for k, line in enumerate(lines) if line.text.startswith(_ATTACHED)]
+    begin = attached[-1] if attached else 0
+    known = {line.text for line in earlier}
+    own = (line for line in lines[begin:] if line.text not in known)
+    return (*lines[:begin], *earlier, *own)
+
+
 def event_text(event: Mapping[str, Any]) -> EventText:
     """Return the line of an event; an event of an unknown kind is shown by its fields."""
 
@@ -112,7 +127,7 @@ def event_text(event: Mapping[str, Any]) -> EventText:
         return str(event.get(key, ""))
 
     texts: dict[str, EventText] = {
-        "phase": (f"{get('step')} {get('phase')}  {get('message')}", PLAIN, "protocol"),
+        "phase": (_phase(get("step"), get("phase"), get("message")), PLAIN, "protocol"),
         "state": (f"{get('before')} → {get('state')}: {get('why')}", DIM, "protocol"),
         "mark": (f"mark: {get('text')}", PLAIN, "protocol"),
         "alarm": (f"WARNING  {get('sentence')}", WARN_TEXT, "alarms"),

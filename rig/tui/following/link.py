@@ -19,7 +19,7 @@ from rig.bench.screens.commands import Command, own_command
 from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.runs.runstate import read_events
-from rig.tui.following.event_lines import EventLine, from_events, new_lines
+from rig.tui.following.event_lines import EventLine, from_events, new_lines, with_earlier
 from rig.tui.following.history import EMPTY, History, HistoryWindow
 
 log = logging.getLogger(__name__)
@@ -120,7 +120,6 @@ class Frame:
     window: HistoryWindow = EMPTY
     speed: float = 1.0  # device seconds per wall second
     event_lines: tuple[EventLine, ...] = ()  # oldest first, the newest KEPT_LINES of them
-    total_lines: int = 0  # number of lines so far
     plan: tuple[PlanLine, ...] = ()
     estimates: tuple[TrackedPoint, ...] = ()  # oldest first
     interval: float = 0.0  # between two snapshots, smoothed [s of wall time]
@@ -285,7 +284,6 @@ class Link:
             event_lines=(*before.event_lines, *lines)[-KEPT_LINES:]
             if lines
             else before.event_lines,
-            total_lines=before.total_lines + len(lines),
             estimates=estimates,
             interval=_interval(before, snapshot),
             worst_age=max(before.worst_age, snapshot.block_age),
@@ -308,11 +306,8 @@ class Link:
         event_lines = frame.event_lines
         if first and self._history.begin_with(past) and frame.snapshot.run:
             earlier = from_events(read_events(Path(frame.snapshot.run)), frame.snapshot)
-            event_lines = (*earlier, *event_lines)[-KEPT_LINES:]
-        total_lines = frame.total_lines + len(event_lines) - len(frame.event_lines)
-        self._frame = replace(
-            self._frame, plan=past.plan, event_lines=event_lines, total_lines=total_lines
-        )
+            event_lines = with_earlier(event_lines, earlier)[-KEPT_LINES:]
+        self._frame = replace(self._frame, plan=past.plan, event_lines=event_lines)
 
     def _follow_sessions(self) -> None:
         now = self._clock()
@@ -351,7 +346,6 @@ class Link:
             endpoint,
             received=self._clock(),
             event_lines=kept.event_lines,
-            total_lines=kept.total_lines,
         )
 
     def _drain(self) -> None:
