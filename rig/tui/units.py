@@ -37,12 +37,13 @@ class Format:
         text = f"{scaled:+.{self.decimals}f}" if sign else f"{scaled:.{self.decimals}f}"
         return text.replace("-", "−")
 
-    def short(self, value: float | None) -> str:
-        """Return the value with as few decimals as a limit needs: 9, −0.2, 36."""
+    def short(self, value: float | None, width: int = 12) -> str:
+        """Return the value with as few decimals as a limit needs, in `width`: 9, −0.2, 36."""
         if value is None or math.isnan(value):
             return ""
-        text = f"{round(value * self.factor, self.decimals) + 0.0:g}"
-        return text.replace("-", "−")
+        scaled = round(value * self.factor, self.decimals) + 0.0
+        texts = (f"{scaled:.{digits}g}" for digits in range(6, 0, -1))
+        return next((t for t in texts if len(t) <= width), "…").replace("-", "−")
 
 
 # Smallest height [SI] of a plot without limits: noise must not look like motion.

@@ -12,7 +12,7 @@ from rig.bench.screens.sockets import ChannelView
 from rig.model.alarms.states import Alarm, AlarmTable, raised, returned
 from rig.tui.app import farewell
 from rig.tui.drawing.bar import bar
-from rig.tui.drawing.rows import Row, width_of
+from rig.tui.drawing.rows import Row, block, box, row, width_of, window
 from rig.tui.following.event_lines import new_lines
 from rig.tui.following.history import History
 from rig.tui.following.link import Frame, LinkStage
@@ -262,3 +262,14 @@ def test_a_gauge_fills_its_line(width: int) -> None:
     assert width_of(line) == width
     assert "+10.0 mm −37.5 " in text_of(line)
     assert text_of(line).endswith(" 37.5")
+
+
+def test_what_does_not_fit_is_counted_or_ends_in_an_ellipsis() -> None:
+    lines = [row(f"line {k}") for k in range(9)]
+    assert text_of(block(lines, 20, 4)[-1]).strip() == "↓ 6 more lines"
+    assert list(map(text_of, window(lines, 4, 5))) == [
+        " ↑ 3 more lines", "line 3", "line 4", "line 5", " ↓ 3 more lines",
+    ]  # fmt: skip
+    assert text_of(window(lines, 0, 5)[0]) == "line 0"
+    assert "bramah check…" in text_of(box("bramah check evening.yaml", lines, 18, 4)[0])
+    assert shown("V").short(-250.881, 6) == "−250.9"

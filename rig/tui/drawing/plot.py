@@ -149,18 +149,18 @@ def _axis(
     labels: dict[int, Part] = {}
     marks = (*limits, *warnings)
     if zoomed or not any(m is not None and scale.low <= m <= scale.high for m in marks):
-        labels[height - 1] = (how.short(scale.low), DIM)
-        labels[0] = (how.short(scale.high), DIM)
+        labels[height - 1] = (how.short(scale.low, GUTTER - 1), DIM)
+        labels[0] = (how.short(scale.high, GUTTER - 1), DIM)
     for levels, style in ((warnings, WARN_LINE), (limits, TRIP_LINE)):
         for level in levels:
             if level is not None and scale.low <= level <= scale.high:
                 at = int(scale.row(level, 4 * height)) // 4
-                labels[at] = (how.short(level), style)
+                labels[at] = (how.short(level, GUTTER - 1), style)
     lines: list[tuple[Part, ...]] = []
     for k in range(height):
         text, style = labels.get(k, ("", DIM))
         tick = "┤" if text else "│"
-        lines.append(((f"{text:>{GUTTER - 1}}"[: GUTTER - 1], style), (tick, DIM)))
+        lines.append(((f"{text:>{GUTTER - 1}}", style), (tick, DIM)))
     return tuple(lines)
 
 

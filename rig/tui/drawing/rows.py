@@ -94,13 +94,27 @@ def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
 
 
 def window(rows: list[Row], at: int, height: int) -> list[Row]:
-    """Return `height` of the rows with the marked one among them."""
+    """Return `height` of the rows with the marked one among them; the ends count what is left."""
     first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
-    return rows[first : first + height]
+    shown, below = rows[first : first + height], len(rows) - first - height
+    if height < 3:  # the marked row has no neighbours on both sides
+        return shown
+    if first > 0:
+        shown[0] = _more("↑", first)
+    if below > 0:
+        shown[-1] = _more("↓", below)
+    return shown
+
+
+def _more(arrow: str, hidden: int) -> Row:
+    """Return the row in place of one that is hidden with `hidden` others."""
+    return row((f" {arrow} {hidden + 1} more lines", DIM))
 
 
 def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> list[Row]:
-    """Return exactly `height` rows of `width` cells."""
+    """Return exactly `height` rows of `width` cells; the last one counts what does not fit."""
+    if len(rows) > height > 0:
+        rows = [*rows[: height - 1], _more("↓", len(rows) - height)]
     kept = [fit(line, width, style) for line in rows[: max(height, 0)]]
     if len(kept) < height:
         kept += [fit(BLANK, width, style)] * (height - len(kept))
@@ -129,7 +143,8 @@ def box(
     if inner < 1 or height < 2:
         return block(body, width, height)
     head = f"─ {title} " if title else ""
-    head = set_cell_size(head, min(cell_len(head), width - 3))
+    if cell_len(head) > width - 3:
+        head = set_cell_size(head, width - 4) + "…"
     foot = f" {note} ─" if note else ""
     foot = foot if cell_len(foot) <= width - 3 else ""
     top = row((f"┌{head}{'─' * (width - 2 - cell_len(head))}┐", style))

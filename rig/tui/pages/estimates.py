@@ -140,7 +140,7 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
             for mark, line in zip(marks, lines, strict=True)
         ]
     unknown = ", ".join(name for name in newest if name not in names)
-    foot = wrapped(f" not known yet: {unknown}", width, DIM)[:1] if unknown else []
+    foot = [fit(row((f" not known yet: {unknown}", DIM)), width)] if unknown else []
     boxes = [*((_residual, family) for family in families(series)),
              *((_estimate, name) for name in names)]  # fmt: skip
     room = height - len(head) - len(foot)

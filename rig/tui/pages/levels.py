@@ -121,7 +121,7 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
     if width >= TWO:
         left = max(width // 2, 60)
         return hstack([(table, left), (listed, width - left - 1)], height)
-    return block([*table, row(), *listed][:height], width, height)
+    return block([*table, row(), *listed], width, height)
 
 
 def _state_of(view: PlotView, last: float) -> str:

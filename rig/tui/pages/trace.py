@@ -46,11 +46,7 @@ def run_trace_page(view: PlotView, width: int, height: int) -> list[Row]:
         return [*head, *hstack([(text, left), (plots, right)], room)]
     text += [row(), *free_run_rows(trace.stored, view.look.channel, width, 2 * PLOT + 4)]
     at = min(view.look.offset, max(len(text) - room, 0))
-    more = len(text) - room - at
-    rows = block(text[at:], width, room)
-    if more > 0:
-        rows[-1] = fit(row((f" ↓ {more + 1} more lines", DIM)), width)
-    return [*head, *rows]
+    return [*head, *block(text[at:], width, room)]
 
 
 def trace_text_rows(stored: StoredTrace, width: int) -> list[Row]:

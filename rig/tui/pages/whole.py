@@ -158,7 +158,7 @@ def notice_rows(view: PlotView, width: int) -> list[Row]:
             symbol = SYMBOLS[notice.level] if k == 0 else " "
             text = "".join(part for part, _ in line)
             rows.append(row((f" {symbol} {text:<{width - 3}}"[:width], style)))
-    return rows[:NOTICES]
+    return block(rows, width, min(len(rows), NOTICES))
 
 
 def _keys(view: PlotView, width: int) -> Row:
