@@ -77,7 +77,10 @@ def check(
         steps.append(replace(seen[same], step=step.name))
         if progress is not None:
             progress(len(steps) / len(plan.excitations))
-    return CheckReport(plan.protocol.name, rig.name, plan.seconds, tuple(steps), _timeline(plan))
+    return CheckReport(
+        plan.protocol.name, rig.name, plan.seconds, tuple(steps), _timeline(plan),
+        places=plan.places,
+    )  # fmt: skip
 
 
 def _content(step: StepPlan) -> Hashable:
@@ -172,7 +175,7 @@ def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None)
             return _Centred(biases, tried, began, last)
     which = ", ".join(str(part.joint + 1) for part in step.excite)
     raise NotCentred(
-        f"{step.name}: on the twin joint {which} cannot be centred: after {DESIGN.bias_tries} "
+        f"{step.located}: on the twin joint {which} cannot be centred: after {DESIGN.bias_tries} "
         "biases it still drifts, or its simulation fails (end of the linkage, vacuum); "
         "lower the amplitude, or allow more drift",
         step,
@@ -192,9 +195,11 @@ def _improve(
     span = slice(max(begin, good - step.period), good)
     seen = follow(commands[span, j], own[span], rate)
     if not seen.gain > 0.0:
-        raise InputError(
-            f"{step.name}: on the twin joint {j + 1} does not follow its command "
-            f"({seen.gain:.3g} m/s per volt); are the rig's nominal parameters right?"
+        raise NotCentred(
+            f"{step.located}: on the twin joint {j + 1} does not follow its command "
+            f"({seen.gain:.3g} m/s per volt, expected more than 0); lower the amplitude, or "
+            "correct the nominal parameters of the rig or the model of the twin",
+            step,
         )
     allowed = DESIGN.drift_share * part.settings.centring.drift
     off = float(np.mean(own[span])) - part.centre

@@ -96,7 +96,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The expected behaviour of a protocol on a rig; `twin` names the parameters simulated."""
+    """The expected behaviour of a protocol on a rig; `twin` names the parameters simulated.
+
+    `places` holds file and line of each step, by name; it is not part of the stored report.
+    """
 
     protocol: str
     rig: str
@@ -105,6 +108,7 @@ class CheckReport:
     timeline: tuple[Moment, ...] = ()
     scales: Mapping[str, float | None] = field(default_factory=dict)
     twin: str = NOMINAL
+    places: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -164,7 +168,9 @@ class CheckReport:
         """Raise InputError naming the first limit that would be exceeded."""
         if self.refused:
             more = f" (and {len(self.refused) - 1} more)" if len(self.refused) > 1 else ""
-            raise InputError(f"protocol {self.protocol!r} refused: {self.refused[0]}{more}")
+            first = next(check.step for check in self.steps if not check.ok)
+            where = f"{self.places[first]}: " if first in self.places else ""
+            raise InputError(f"{where}protocol {self.protocol!r} refused: {self.refused[0]}{more}")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain data in SI."""

@@ -11,13 +11,16 @@ import yaml
 
 from protocols.files.expansion import (
     Expander,
+    Lines,
     RawStep,
     Scope,
     made_unique,
     unknown_parameter,
 )
 from protocols.files.schema import INCOMPLETE, VERSION, Protocol, later_version
+from protocols.steps.base import StepKind
 from rig.model.parse import InputError, Problem, load_yaml, validate_model
+from rig.model.parse import Path as Keys
 
 _NOTHING = RawStep({"mark": "in place of steps that could not be read"}, {})
 
@@ -119,7 +122,19 @@ def _protocol(
             lines |= {("steps", number, *path): line for path, line in step.lines.items()}
     context = {"folder": folder, INCOMPLETE: bool(known)}
     made = validate_model(Protocol, data, lines, source, context, known)
+    _locate(made.steps, source, lines, ("steps",), 1)
     return made, [step.data for step in steps]
+
+
+def _locate(
+    steps: Sequence[StepKind], source: str, lines: Lines, path: Keys, line: int
+) -> None:  # fmt: skip
+    """Set file and line of steps, nested ones too; of an included one those of its `include`."""
+    for number, step in enumerate(steps):
+        here = (*path, number)
+        own = lines.get(here, line)
+        step.locate(f"{source}:{own}")
+        _locate(getattr(step, "steps", ()), source, lines, (*here, "steps"), own)
 
 
 class _Includes:

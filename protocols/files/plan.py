@@ -74,6 +74,11 @@ class Plan:
         return tuple(plan for part in self.sequence for plan in part.all_excitations)
 
     @property
+    def places(self) -> Mapping[str, str]:
+        """File and line of each excitation, by name, as far as they are known."""
+        return {step.name: step.where for step in self.excitations if step.where}
+
+    @property
     def seconds(self) -> float:
         """Expected length [s]; conditions count with their least time."""
         return sum(part.seconds for part in self.sequence)
@@ -205,7 +210,7 @@ class _RigPlanner:
             try:
                 planned.append(step.plan(self))
             except InputError as error:
-                problems += str(error).splitlines()
+                problems += [_located(line, step) for line in str(error).splitlines()]
                 if isinstance(step, LockStep):
                     break  # later steps would lack its joint
         if problems:
@@ -249,6 +254,7 @@ class _RigPlanner:
             warm_up=period * warm_up,
             ramp=step.ramp,
             settle=step.settle,
+            where=step.where,
         )
 
     def _excite(self, part: Excite, step: str) -> ExcitePlan:
@@ -257,6 +263,13 @@ class _RigPlanner:
         if name not in self._waves:
             self._waves[name] = _waveform(part, step, self._rig)
         return _excite(part, step, self._waves[name], self._rig)
+
+
+def _located(problem: str, step: StepKind) -> str:
+    """Return a problem with its step's file and line, unless a nested step's are before it."""
+    source = step.where.rpartition(":")[0]
+    named = not source or problem.startswith(f"{source}:")
+    return problem if named else f"{step.where}: {problem}"
 
 
 def _whole(step: str, duration: float, period: int, rate: float) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, ClassVar, Final, Protocol
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from protocols.language.conditions import Condition
 from protocols.language.part import ProtocolPart
@@ -135,7 +135,7 @@ class Question:
     timeout: float
 
 
-class StepKind(ProtocolPart):
+class StepKind(ProtocolPart):  # noqa: PLW1641 - pydantic hashes frozen models
     """A step of a protocol; `key` names its kind in a file."""
 
     key: ClassVar[str]
@@ -143,6 +143,20 @@ class StepKind(ProtocolPart):
     nests: ClassVar[bool] = False  # its key `steps` holds steps
 
     name: str | None = Field(default=None, pattern=NAME, description="of its records and log lines")
+    _where: str = PrivateAttr(default="")
+
+    @property
+    def where(self) -> str:
+        """Its file and line as `FILE:LINE`, for refusals; empty for a step of no file."""
+        return self._where
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether a step has the same fields, wherever it is written."""
+        return type(self) is type(other) and dict(self) == dict(other)
+
+    def locate(self, where: str) -> None:
+        """Set file and line, which the reader knows once the step is made."""
+        self._where = where
 
     @abstractmethod
     def plan(self, planner: Planner) -> PlannedStep:

@@ -42,6 +42,7 @@ class StepPlan:
 
     `period` is common to all its waveforms; `record`, `trial` (over which the bias is judged)
     and `warm_up` (under the slow loop) are multiples of it. `ramp` and `settle` are in seconds.
+    `where` is its file and line, for refusals.
     """
 
     name: str
@@ -54,6 +55,12 @@ class StepPlan:
     warm_up: int
     ramp: float
     settle: float
+    where: str = ""
+
+    @property
+    def located(self) -> str:
+        """Its name, after its file and line where they are known."""
+        return f"{self.where}: {self.name}" if self.where else self.name
 
     @property
     def lines(self) -> tuple[int, ...]:

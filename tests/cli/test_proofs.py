@@ -174,7 +174,8 @@ def test_the_amplitude_that_a_refusal_names_passes_and_one_hundredth_more_does_n
 
 def test_a_piston_that_cannot_be_centred_is_refused_with_an_amplitude_that_can(rig: Rig) -> None:
     wider = SHORT.replace("0.8 V", "3.2 V")
-    with pytest.raises(InputError, match="step1: on the twin joint 2 cannot be centred") as caught:
+    words = r"^short.yaml:6: step1: on the twin joint 2 cannot be centred"
+    with pytest.raises(InputError, match=words) as caught:
         proved(short(rig, wider), rig)
     named = re.search(r"; (0\.\d+) times this amplitude would pass", str(caught.value))
     assert named is not None

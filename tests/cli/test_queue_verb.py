@@ -26,7 +26,7 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
         assert "item 1 short: queued, about 0.5 min" in said
         code, _, error = add("--amplitude-scale", 9)
         assert code == 2
-        assert "not queued: step 'step1', joint 2: the command reaches 7.2 V" in error
+        assert "short.yaml:6: step 'step1', joint 2: the command reaches 7.2 V" in error
         for words in (("--if", "done"), ("--after", 7), ("--when", "oil > 3 degC")):
             assert add(*words)[0] == 2
         code, _, error = add("--after", 1, "--if", "C_pp2.rsd < 20 %")

@@ -83,7 +83,9 @@ def test_a_limit_that_would_be_passed_refuses_the_protocol(rig: Rig) -> None:
     with pytest.raises(InputError) as caught:
         report.require()
     message = str(caught.value)
-    assert message.startswith("protocol 'lock-and-excite' refused: step1, joint 2: piston -38.")
+    assert message.startswith(
+        "lock-and-excite.yaml:8: protocol 'lock-and-excite' refused: step1, joint 2: piston -38."
+    )
     assert "allowed -36 to 36 mm, about 0 s into the run (and 2 more)" in message
 
 

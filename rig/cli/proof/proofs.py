@@ -106,7 +106,7 @@ def proved(
     key = proof_key(plan, rig, source)
     kept = _from_cache(key)
     if kept is not None and (kept.text or not predict):
-        return replace(kept, source=source)
+        return replace(kept, source=source, report=replace(kept.report, places=plan.places))
     parameters = load_twin(source, rig)
     from protocols.design.check import NotCentred
     from protocols.design.check_report import remedy_text
