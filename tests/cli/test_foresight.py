@@ -62,6 +62,7 @@ def test_a_designed_protocol_is_a_file_like_any_other(tmp_path: Path) -> None:
     done = bramah_here(*line, "--json", told)
     assert done.returncode == 0
     assert f"written to {out}" in done.stdout
+    assert done.stderr.startswith("the twin uses the nominal values of the rig file\n")
     text = out.read_text()
     assert text.startswith("# Made by: bramah design ")
     before, after = json.loads(told.read_text())["parameters"]["b"].values()

@@ -179,6 +179,7 @@ def test_a_piston_that_cannot_be_centred_is_refused_with_an_amplitude_that_can(r
         proved(short(rig, wider), rig)
     named = re.search(r"; (0\.\d+) times this amplitude would pass", str(caught.value))
     assert named is not None
+    assert str(caught.value).endswith("; the twin uses nominal values")
     assert proved(short(rig, wider, amplitude_scale=float(named[1])), rig).report.ok
 
 

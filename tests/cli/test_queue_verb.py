@@ -24,6 +24,7 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
         code, said, error = add("--when", "oil_temperature > 5 degC")
         assert code == 0, error
         assert "item 1 short: queued, about 0.5 min" in said
+        assert "the twin uses nominal values" in error
         code, _, error = add("--amplitude-scale", 9)
         assert code == 2
         assert "short.yaml:6: step 'step1', joint 2: the command reaches 7.2 V" in error

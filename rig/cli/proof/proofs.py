@@ -24,8 +24,8 @@ from rig.cli.proof.twin_choice import (
     TwinParameters,
     TwinSource,
     load_twin,
-    source_text,
     twin_source,
+    twin_text,
 )
 from rig.cli.text.output import write_json
 from rig.model.parse import InputError
@@ -76,12 +76,7 @@ class PlanProof:
     @property
     def twin_text(self) -> str:
         """Return the source of the twin's parameters, or why it uses nominal values instead."""
-        if self.warning:
-            return f"WARNING: {self.warning}"
-        drawn = (
-            "" if self.source.path is None else "; limits hold at the edge of its 95 % intervals"
-        )
-        return f"the twin uses {source_text(self.source)}{drawn}"
+        return twin_text(self.source, self.warning)
 
     def keep(self, folder: Path) -> None:
         """Write the proof into a run's folder."""
@@ -115,7 +110,8 @@ def proved(
         report, prediction, text = _checked(plan, parameters, predict, progress)
     except NotCentred as refused:
         scale = _passing_scale(refused.step, parameters)
-        raise InputError(f"{refused}; {remedy_text(scale)}") from refused
+        remedy = remedy_text(scale)
+        raise InputError(f"{refused}; {remedy}; the twin uses {parameters.text}") from refused
     if not report.ok:
         bad = {check.step for check in report.steps if not check.ok}
         scales = {

@@ -127,6 +127,14 @@ def source_text(source: TwinSource, now: datetime | None = None) -> str:
     )
 
 
+def twin_text(source: TwinSource, warning: str = "") -> str:
+    """Return the source of the twin's parameters, or why it uses nominal values instead."""
+    if warning:
+        return f"WARNING: {warning}"
+    drawn = "" if source.path is None else "; limits hold at the edge of its 95 % intervals"
+    return f"the twin uses {source_text(source)}{drawn}"
+
+
 def _age_text(saved: str, now: datetime | None = None) -> str:
     try:
         written = datetime.fromisoformat(saved)

@@ -52,7 +52,7 @@ def check(
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
     source = twin_source(bench, model, nominal)
     proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)
-    if proof.warning:
+    if proof.warning or json == Path("-"):
         progress(proof.twin_text)
     document = proof.report.as_dict()
     used = {"model": proof.source.as_dict(), "warning": proof.warning}

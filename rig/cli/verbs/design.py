@@ -39,15 +39,15 @@ def design(
     Example: bramah design lock-and-excite-multisine --rig shinshu-2dof --criterion b --out b.yaml
     """
     from rig.cli.proof.predicted_errors import design_json, design_protocol, design_text
-    from rig.cli.proof.twin_choice import load_twin, twin_source
+    from rig.cli.proof.twin_choice import load_twin, twin_source, twin_text
     from rig.cli.text.output import progress, write_json
     from rig.runs.files import write_text
     from rig.runs.rigs import load_bench
 
     bench = load_bench(rig)
-    parameters = load_twin(twin_source(bench, model, nominal), bench)
-    if parameters.warning:
-        progress(parameters.warning)
+    source = twin_source(bench, model, nominal)
+    parameters = load_twin(source, bench)
+    progress(twin_text(source, parameters.warning))
     designed = design_protocol(protocol, rig, criterion, budget, seed, parameters)
     write_text(out, designed.text)
     write_json(json, design_json(designed))

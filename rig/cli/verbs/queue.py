@@ -190,6 +190,8 @@ def add(
     length = "" if seconds is None else f", about {seconds / 60.0:.1f} min of the device's time"
     if item.proof.get("warning"):
         progress(f"WARNING: {item.proof['warning']}")
+    elif "twin" in item.proof:
+        progress(f"the twin uses {item.proof['twin']}")
     _show(item, json, f"queued{length}; it will run into {item.job.out}")
 
 
