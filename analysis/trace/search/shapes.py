@@ -29,12 +29,6 @@ class ShapeFit:
     fit: ExactFit
 
 
-def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms of a model with open shapes fitted to the runs' rows (see `fit_shapes`)."""
-    found = fit_shapes(runs, terms)
-    return tuple(terms) if found is None else found.terms
-
-
 def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
     """Fit the open shapes of a model's terms to the runs' rows; return None where none is open.
 

@@ -28,7 +28,7 @@ from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.shapes import shapes_in, with_shapes
+from analysis.trace.search.shapes import fit_shapes, shapes_in
 from rig.cli.text.output import table
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
@@ -155,14 +155,16 @@ def known_band(runs: Sequence[Run], holdout_data: Sequence[Run]) -> tuple[str, T
     And the trace of what the flows lack when the dead band is taken as known.
     """
     plain = [Used(term) for term in baseline_of(runs[0].rig)]
-    band = with_shapes(runs, [*plain, *(Used(make(name, where)) for name, where in FLOW)])
+    found = fit_shapes(runs, [*plain, *(Used(make(name, where)) for name, where in FLOW)])
+    assert found is not None
+    band = found.terms
     rows = []
     for name, terms in (("baseline", plain), ("dead band known", band)):
-        (found,) = validate(identify(runs, terms=terms).model, holdout_data)
-        error = f"{1e3 * found.rmse['piston_1']:.1f} mm"
+        (run,) = validate(identify(runs, terms=terms).model, holdout_data)
+        error = f"{1e3 * run.rmse['piston_1']:.1f} mm"
         shapes = shapes_in(runs[0].rig, terms).items()
         edges = ", ".join(f"{n} {shape.value:.3g}" for n, shape in shapes)
-        rows.append([name, f"{found.fit['piston_1']:.1f} %", error, edges])
+        rows.append([name, f"{run.fit['piston_1']:.1f} %", error, edges])
     told = trace(runs, holdout_data, families=("fluid",), terms=band)
     return table(["model", "piston FIT", "RMSE", "edges"], rows), told
 
