@@ -254,7 +254,7 @@ def _traced(
     lines = spectral_lines(train_data, finding.winner.fit.residual)
     moves, formulas = (
         ((), ())
-        if finding.verdict in (CLEAN, EXPLAINED)
+        if finding.verdict in (CLEAN, EXPLAINED) or finding.held_out_only
         else clues_to(train_data, unseen.choosing, finding.winner, lines)
     )
     further = (
@@ -292,10 +292,11 @@ def _traced(
         *detection_limit_notes(hidden),
     ]
     runs_before, runs_after = held_out.free_runs([*records.holdout, *records.judge], before, after)
+    left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
     result = Trace(
         verdict, fitted.effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _remaining_fraction(hypotheses, winner, prepared.as_recorded), moves, further,
+        0.0 if finding.held_out_only else left, moves, further,
         prepared.as_recorded.floors, first, last, tuple(notes),
         refused=finding.refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,

@@ -42,7 +42,7 @@ from rig.model.rig import Rig
 ONLY_HELD_OUT_MISSED = (
     "the training records are met to within the noise, the held-out ones are not: train on "
     "records with as much excitation as the held-out ones; if these have it, the machine has "
-    "changed between the runs: train on records taken after the change"
+    "changed between the runs: train on records taken after the change to trace it"
 )
 
 
@@ -80,7 +80,10 @@ class TraceRows:
 
 @dataclass(frozen=True)
 class Finding:
-    """The answer on some rows: judged effects, the set of those that passed, and the verdict."""
+    """The answer on some rows: judged effects, the set of those that passed, and the verdict.
+
+    `held_out_only`: the training rows hold nothing above the noise, in contrast to held-out rows.
+    """
 
     rows: TraceRows
     hypotheses: HypothesisSet
@@ -89,6 +92,7 @@ class Finding:
     effects: tuple[JudgedEffect, ...] = ()
     remainders: tuple[Remainder, ...] = ()
     notes: tuple[str, ...] = ()
+    held_out_only: bool = False
 
     @property
     def named(self) -> tuple[JudgedEffect, ...]:
@@ -192,9 +196,12 @@ def search_and_judge(
     found = judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
     named = any(map(gates.passes_gates, found.effects))
     notes = remainder_notes(found.verdict, found.remainders, quiet, named)
-    if quiet and found.verdict == UNEXPLAINED:
-        notes = [*_held_out_only_notes(rows.train, found.remainders), *notes]
-    return finding_of(rows, found, notes)
+    if not quiet or found.verdict != UNEXPLAINED:
+        return finding_of(rows, found, notes)
+    notes = [*_held_out_only_notes(rows.train, found.remainders), *notes]
+    if not found.winner.effects:  # refused ones were fitted to noise
+        found = replace(found, effects=())
+    return replace(finding_of(rows, found, notes), held_out_only=not found.winner.effects)
 
 
 def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) -> list[str]:

@@ -59,6 +59,8 @@ def sentence(result: Trace) -> str:
             text += f" An experiment that separates them: {result.next_experiment['text']}."
         return f"{text} {errors}"
     prefix = f"Effects found: {named}. " if named else "No effect of the catalogue is named. "
+    if not named and result.unexplained_fraction == 0.0:
+        return f"{prefix}{_held_out_only(result)}"
     clue = ", ".join(d.text for d in result.depends_on[:2])
     return (
         f"{prefix}{100 * result.unexplained_fraction:.0f} % of the repeatable residual energy "
@@ -67,6 +69,17 @@ def sentence(result: Trace) -> str:
         + _symmetry(result)
         + _formula(result)
         + (f". {errors}" if named else ".")
+    )
+
+
+def _held_out_only(result: Trace) -> str:
+    """Say that only held-out records keep more than noise, and in which equations most."""
+    ratios = {e: result.after[e] / floor for e, floor in result.noise_floor.items() if floor > 0}
+    loud = sorted(ratios, key=lambda e: -ratios[e])[:2]
+    errors = " and ".join(f"{ratios[e]:.2g} in {e}" for e in loud)
+    return (
+        "The training records are met to within the noise, the held-out ones are not: errors over "
+        f"the noise floor of {errors}."
     )
 
 

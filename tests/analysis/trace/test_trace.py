@@ -166,6 +166,20 @@ def test_a_quiet_effect_is_found_beside_a_loud_one_of_other_equations(rig: Rig) 
     assert result.worst(result.after) < 1.3
 
 
+def test_a_leak_that_began_between_the_runs_gets_no_clue_from_the_noise_before_it(
+    rig: Rig, quiet: tuple[Run, Run]
+) -> None:
+    """Only the held-out run leaks: whatever fits the training run's residual fits its noise."""
+    leaking = pair_of_runs(rig, c_internal=5e-12)[1]
+    result = trace([quiet[0]], [leaking], look_ahead=False)
+    assert result.verdict == "unexplained"
+    assert (result.effects, result.refused, result.depends_on, result.formulas) == ((), (), (), ())
+    assert result.unexplained_fraction == 0.0
+    assert "the held-out ones are not: errors over the noise floor of" in result.sentence
+    assert "flow_cap_2" in result.sentence
+    assert any("the machine has changed between the runs" in note for note in result.notes)
+
+
 def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     quiet: tuple[Run, Run],
 ) -> None:
