@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from analysis.effects.base import Effect
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.terms.base import Used, equation
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.finding import (
@@ -112,7 +113,7 @@ def searched_in_motion(
 def _loud_joints(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:
     """Return the equations that keep too much, and the joints (0-based) whose rests may cause it.
 
-    These have friction in the set, or, where the residual is `unexplained`, may have it.
+    These have friction in the set, or, where the residual is `unexplained`, may have it and rest.
     """
     names = {e.name for e in friction}
     tied = {r.name for f in finding.effects for r in f.rivals if r.tied}
@@ -124,9 +125,20 @@ def _loud_joints(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str]
     joints = joints_with_friction(finding.winner, loud)
     if not explained:
         against = {r.equation for r in finding.remainders if r.veto}
-        joints |= {e.joint for e in friction if equation("torque", e.joint) in against}
+        may = {e.joint for e in friction if equation("torque", e.joint) in against}
+        joints |= {joint for joint in may if _rests(finding.rows.train.records, joint)}
         loud |= against
     return loud, joints
+
+
+def _rests(records: Sequence[ConditionedRecord], joint: int) -> bool:
+    """Return whether a joint (0-based), not locked, is often much slower than its rms speed."""
+    for record in records:
+        speed = np.abs(record.signals.sd[:, joint])
+        slow = speed < TRACE.rest_speed * float(np.sqrt(np.mean(speed**2)))
+        if joint + 1 not in record.record.locked and float(np.mean(slow)) > TRACE.rest_share:
+            return True
+    return False
 
 
 def _is_better(found: Finding, finding: Finding, joints: Collection[int]) -> bool:

@@ -60,6 +60,11 @@ class TraceSettings:
     noted_ratio: float = 1.3
     """Held-out rms of an equation over its noise floor, from which a note beside an explanation
     states what remains (contract)."""
+    rest_speed: float = 0.02
+    """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
+    rest_share: float = 0.035
+    """Share of a record's samples at rest, above which a joint rests beyond reversals: a Gaussian
+    speed has 0.016 (tuned: joints that stick had 0.042 to 0.12, others at most 0.024)."""
     visible_deviations: float = 8.0
     """Energy above noise of an equation over the standard deviation of the noise's own energy, from
     which a further effect is searched for in it (tuned)."""
