@@ -60,6 +60,23 @@ def test_every_form_of_dry_friction_slides_at_its_level_and_opposes_motion(form:
         assert force == pytest.approx(level, rel=0.01)
 
 
+def test_a_piston_that_sticks_displaces_no_oil() -> None:
+    """Within Karnopp's band the position stands still, so with a closed valve no pressure moves."""
+    bench = foreign.Bench(small_bench.shinshu(), TRUTH)
+    machine, joints = foreign._numbers(bench)
+    joints[0, [plant.AHEAD, plant.ASTERN, plant.WIDTH]] = 500.0, 500.0, 1e-3
+    joints[0, plant.DRY_FORM] = plant.KARNOPP
+    state, out = np.zeros(plant.SIZE), np.zeros(plant.SIZE)
+    state[plant.Q] = foreign.angle(bench, 0, 0.0)
+    state[plant.P : plant.P + 2] = 2e6, 2e6
+    lever = plant.stroke(state[plant.Q], joints[0])[1]
+    for speed, sticks in ((5e-4, True), (5e-3, False)):
+        state[plant.W] = speed / lever
+        plant.rates(state, 0.0, machine, joints, np.array([False, True]), np.zeros(2), out)
+        assert (out[plant.Q] == 0.0) == sticks
+        assert (not out[plant.P : plant.P + 2].any()) == sticks
+
+
 def test_a_seed_draws_the_same_bench_again_and_another_seed_another() -> None:
     one, again, other = case_of(4), case_of(4), case_of(6)
     assert (one.label, dict(one.bench.truth)) == (again.label, dict(again.bench.truth))

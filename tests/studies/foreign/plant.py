@@ -218,14 +218,17 @@ def rates(  # noqa: PLR0912  one branch an effect's form
         drawn += taken
         given += left
         half = j[HALF]
+        # Karnopp: within the band of standstill nothing moves.
+        sticks = j[DRY_FORM] == KARNOPP and j[AHEAD] > 0.0 and abs(v) < j[WIDTH]
+        swept = 0.0 if sticks else v
         out[P + 2 * i] = (
             modulus(cap, m)
-            * (into_cap - j[CAP_AREA] * v)
+            * (into_cap - j[CAP_AREA] * swept)
             / (j[CAP_VOLUME] + (half + s) * j[CAP_AREA])
         )
         out[P + 2 * i + 1] = (
             modulus(rod, m)
-            * (into_rod + j[ROD_AREA] * v)
+            * (into_rod + j[ROD_AREA] * swept)
             / (j[ROD_VOLUME] + (half - s) * j[ROD_AREA])
         )
         load = load0 if i == 0 else load1
@@ -242,8 +245,6 @@ def rates(  # noqa: PLR0912  one branch an effect's form
             tau0 = torque - lever * force
         else:
             tau1 = torque - lever * force
-        # Karnopp: within the band of standstill nothing moves.
-        sticks = j[DRY_FORM] == KARNOPP and j[AHEAD] > 0.0 and abs(v) < j[WIDTH]
         out[Q + i] = 0.0 if sticks else w
     if locked[0] and not locked[1]:
         out[W + 1] = tau1 / m22
