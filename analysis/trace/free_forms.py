@@ -65,13 +65,25 @@ def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -
             if wide.removes_too_little(start, single):  # a further effect would make it needless
                 continue
             enough = wide.within_form_tolerance(single)
-            hypothesis = single if enough else _with_further_effect(wide, single)
-            simpler = len(hypothesis.laws) < len(winner.laws)
-            less = simpler and hypothesis.total < SEARCH.free_form_ratio * winner.total
-            explains = wide.within_form_tolerance(hypothesis)
-            if explains and not wide.physical_problem(hypothesis) and (less or not fewer):
-                out.append(wide.prune(hypothesis))
+            for hypothesis in (single,) if enough else (single, _with_further_effect(wide, single)):
+                simpler = len(hypothesis.laws) < len(winner.laws)
+                less = simpler and hypothesis.total < SEARCH.free_form_ratio * winner.total
+                explains = _explains_what_it_alters(wide, start, hypothesis)
+                if explains and not wide.physical_problem(hypothesis) and (less or not fewer):
+                    out.append(wide.prune(hypothesis))
     return out
+
+
+def _explains_what_it_alters(wide: HypothesisSet, start: Hypothesis, other: Hypothesis) -> bool:
+    """Return whether the equations in which a set removes energy keep no more than form error.
+
+    Held-out records judge the others: what they keep may be too little to speak against the set.
+    """
+    removed = {e: start.excess_energy[e] - v for e, v in other.excess_energy.items()}
+    return all(
+        wide.negligible(e, v) or removed[e] < SEARCH.altered_share * start.excess_energy[e]
+        for e, v in other.excess_energy.items()
+    )
 
 
 def _simplest_first(sets: Sequence[Hypothesis]) -> list[Hypothesis]:

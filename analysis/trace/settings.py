@@ -291,6 +291,9 @@ class SearchSettings:
     free_form_ratio: float = 0.5
     """Largest remaining energy of a free form over that of the several named mechanisms which it
     replaces (tuned)."""
+    altered_share: float = 0.1
+    """Share of an equation's energy above noise that a set removes, from which a free form must
+    explain that equation (tuned)."""
     free_form_near: float = 2.0
     """Remaining energy over the least of all sets with a free form: of the sets with less, the
     simplest is judged first (tuned)."""
