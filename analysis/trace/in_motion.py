@@ -15,9 +15,6 @@ from analysis.trace.finding import (
     Finding,
     TraceRows,
     TraceRuns,
-    finding_of,
-    judge_winner,
-    remainder_notes,
     search_and_judge,
     trace_rows,
     without_unnamed_effects,
@@ -80,10 +77,9 @@ def searched_in_motion(
     """Search again in rows weighted by speed, where a joint's torque balance keeps too much.
 
     While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
-    these rows, and they hide the law in motion, and effects of other balances with it. After
-    `unexplained` all candidates are searched; after an explanation, friction of the joints beside
-    the other effects of `finding`. The result is used if friction acts in each joint whose rows are
-    weighted and it is better (`_is_better`), and the balances of other joints are looked at next.
+    these rows, and they hide the law in motion, and effects of other balances with it. The result
+    is used if friction acts in each joint whose rows are weighted and it is better (`_is_better`),
+    and the balances of other joints are looked at next.
     """
     loud, joints = _loud_joints(finding, [e for e in candidates if e.family == "friction"])
     weighted = set(finding.rows.in_motion)
@@ -92,10 +88,7 @@ def searched_in_motion(
 
     def searched(joints: Collection[int]) -> Finding:
         rows = trace_rows(rig, terms, records, moving_filtering({*weighted, *joints}))
-        if finding.verdict == UNEXPLAINED:
-            found = search_and_judge(rows, candidates, free, seed, lambda _: None)
-        else:
-            found = _search_friction(rows, (*candidates, *free), seed, finding.winner)
+        found = search_and_judge(rows, candidates, free, seed, lambda _: None)
         return replace(found, notes=(*rest_phase_notes(rows.in_motion, "leave out"), *found.notes))
 
     found = searched(joints)
@@ -115,15 +108,12 @@ def _loud_joints(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str]
 
     These have friction in the set, or, where the residual is `unexplained`, may have it and rest.
     """
-    names = {e.name for e in friction}
-    tied = {r.name for f in finding.effects for r in f.rivals if r.tied}
-    explained = finding.verdict != UNEXPLAINED
-    if finding.verdict == CLEAN or (explained and not tied <= names):  # other rivals would be lost
+    if finding.verdict == CLEAN:
         return set(), set()
     ratios = _held_out_ratios(finding.rows, finding.winner)
     loud = {e for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
     joints = joints_with_friction(finding.winner, loud)
-    if not explained:
+    if finding.verdict == UNEXPLAINED:
         against = {r.equation for r in finding.remainders if r.veto}
         may = {e.joint for e in friction if equation("torque", e.joint) in against}
         joints |= {joint for joint in may if _rests(finding.rows.train.records, joint)}
@@ -168,26 +158,6 @@ def _held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     """Return the error of a set in the choosing rows over the noise floor, by equation."""
     choosing = rows.unseen.choosing
     return gates.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
-
-
-def _search_friction(
-    rows: TraceRows, candidates: Sequence[Effect], seed: int, winner: Hypothesis
-) -> Finding:
-    """Search and judge friction of joints in motion beside the other effects of a set (`winner`).
-
-    Named forms are tried before free ones.
-    """
-    named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
-    tried = [
-        *(e for e in named if e.family != "friction" or e.joint not in rows.in_motion),
-        *(e for e in candidates if e.family == "friction" and e.joint in rows.in_motion),
-    ]
-    hypotheses = HypothesisSet(rows.train, [e for e in tried if not e.free])
-    free = [e for e in tried if e.free]
-    rng = np.random.default_rng(seed)
-    found = judge_winner(hypotheses, hypotheses.run(), free, rows.unseen.choosing, rng)
-    more = remainder_notes(found.verdict, found.remainders, quiet=False, named=True)
-    return finding_of(rows, found, more)
 
 
 def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:

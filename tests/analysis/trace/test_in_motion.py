@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import pytest
+
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
-from tests.studies.foreign.bench import runs_of
+from tests.analysis.small_bench import TRUTH, shinshu
+from tests.studies.foreign import plant
+from tests.studies.foreign.bench import Bench, runs_of
 from tests.studies.foreign.cases import case_of
 
 FRICTION = ("coulomb_friction", "stribeck_friction", "pressure_dependent_friction")
 
 
+@pytest.mark.slow
 def test_friction_of_two_joints_that_stick_is_found_where_both_move() -> None:
     """While rows at rest of either joint count, one level of joint 1 leaves 8 noise floors."""
     case = case_of(110031, kind="pair")
@@ -28,3 +33,22 @@ def test_friction_of_two_joints_that_stick_is_found_where_both_move() -> None:
     for joint in (1, 2):
         note = f"torque_{joint}: judged without the samples at which the joint rests"
         assert any(n.startswith(note) for n in found.notes)
+
+
+def test_a_tilt_is_found_beside_friction_whose_rests_hid_it() -> None:
+    """On all rows two levels of friction and a force over the position of joint 1 seem to fit."""
+    sticks = {"ahead": 80.0, "astern": 80.0, "dry_form": plant.KARNOPP, "width": 5e-4}
+    bench = Bench(
+        shinshu(), TRUTH, {"inclination": 0.05}, ({}, sticks), noise=0.5, seconds=6.0
+    )  # fmt: skip
+    train, held_out = runs_of(bench, 1)
+    names = ("coulomb_friction", "asymmetric_friction", "base_inclination")
+    found = trace(
+        [train], held_out, effects=catalogue(bench.rig, names), look_ahead=False,
+        families=("mechanical",),
+    )  # fmt: skip
+    assert found.verdict == "explained"
+    sizes = {e.name: next(iter(e.parameters.values())) for e in found.effects}
+    assert set(sizes) == {"coulomb_friction", "base_inclination"}
+    assert sizes["coulomb_friction"].value == pytest.approx(80.0, rel=0.02)
+    assert sizes["base_inclination"].value == pytest.approx(0.05, rel=0.02)
