@@ -10,9 +10,10 @@ are one-dimensional integer arrays, flags are 0 or 1, text is UTF-8. Read by
 
 from __future__ import annotations
 
+import io
 import os
-import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -124,22 +125,45 @@ def _attributes(
     }
 
 
-def create(path: Path, rig_name: str, values: int) -> h5py.File:
-    """Create an archive with its root attributes and disk space for `values` numbers.
+class _Output(io.FileIO):
+    """A new file that keeps its first write error as `failure` and discards what follows.
 
-    Raises OSError if the space is missing, because HDF5 may crash the process on a full disk.
-
-    Uses no HDF5 file lock: the file is private until `put_in_place`, and a child process started
-    meanwhile would inherit the lock and block the verification.
+    HDF5 never sees an error, because one may crash the process.
     """
-    needed = 8 * values
-    if shutil.disk_usage(path.parent).free < needed:
-        raise OSError(f"{needed / 1e6:.1f} MB are needed and not free")
-    file = h5py.File(path, "w", libver=("earliest", "v110"), locking=False)
-    file.attrs["format"] = FORMAT
-    file.attrs["creator"] = "bramah"
-    file.attrs["rig"] = rig_name
-    return file
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of `data`, unless a write has failed; return its length [bytes]."""
+        rest = memoryview(data)
+        size = len(rest)
+        try:
+            while rest and self.failure is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.failure = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the file's size [bytes], unless that fails; return it."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
+
+
+@contextmanager
+def create(path: Path, rig_name: str) -> Iterator[h5py.File]:
+    """Yield a new archive with its root attributes; raises OSError if a part cannot be written."""
+    with _Output(path, "w+") as output:
+        with h5py.File(output, "w", libver=("earliest", "v110")) as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["creator"] = "bramah"
+            file.attrs["rig"] = rig_name
+            yield file
+        if output.failure is not None:
+            raise output.failure
 
 
 def put_in_place(fresh: Path, path: Path) -> None:
@@ -158,11 +182,10 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
     sections = plan(journal, spans)
     columns, rate = journal.meta("columns"), float(journal.meta("sample_rate"))
     clocks = stream_clocks(read_events(folder))
-    values = sum(section.ticks for section in sections) * len(columns)
     fresh = folder / f"{NAME}.tmp"
     lost = 0
     try:
-        with create(fresh, rig_name, values) as file:
+        with create(fresh, rig_name) as file:
             for section in sections:
                 assembled = assemble(journal, spans, section)
                 attributes = _attributes(section, rate, assembled, clocks.get(section.stream))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.runs.rigs import load_rig
 from tests.cli.bench import ROOT
+from tests.full_disk import largest_file
 
 PAGES = ROOT / "docs" / "notebooks"
 
@@ -124,13 +124,8 @@ def test_a_plot_that_the_disk_does_not_take_leaves_the_one_before(tmp_path: Path
     saved = drawn.save(tmp_path / "stroke.svg")
     before = saved.read_bytes()
     assert before.rstrip().endswith(b"</svg>")
-    allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, allowed[1]))
-    try:
-        with pytest.raises(OSError, match="too large"):
-            drawn.save(saved)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
+    with largest_file(len(before) // 2), pytest.raises(OSError, match="too large"):
+        drawn.save(saved)
     assert saved.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["stroke.svg"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import sqlite3
 import tempfile
@@ -21,6 +20,7 @@ from rig.runs.listing.index import indexed_runs
 from rig.runs.recover import recover
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
+from tests.full_disk import largest_file
 from tests.services.children import RIG, acknowledged, assert_all_there, finish, measured, start
 from tests.services.fake_driver import samples
 from tests.variants import every_second
@@ -260,16 +260,14 @@ def test_a_disk_without_room_for_the_archive_either_is_recovered_when_there_is(
     assert_all_there(run)
 
 
+@pytest.mark.parametrize("size", [33_000, 50_000, 70_000])
 def test_a_disk_that_takes_the_journal_but_not_the_archive_keeps_the_journal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, size: int
 ) -> None:
     run = tmp_path / "run"
     finish(run, "kill at block", 45)
-    usage = shutil.disk_usage(run)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
-    with pytest.raises(RecordingFailed, match="needed and not free"):
+    with largest_file(size), pytest.raises(RecordingFailed, match=r"records.h5: .*too large"):
         recover(run)
-    monkeypatch.undo()
     assert (run / "journal.sqlite").exists()
     assert not (run / "records.h5.tmp").exists()
     recover(run)

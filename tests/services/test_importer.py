@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from rig.runs.exchange.importer import import_records
 from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
+from tests.full_disk import largest_file
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")
@@ -383,23 +383,16 @@ def test_channels_of_a_locked_joint_may_stand_still(tmp_path: Path) -> None:
     assert bring(tmp_path, ONE, a__csv=csv(data=data)).warnings == ()
 
 
-def test_a_full_disk_is_said_and_leaves_no_half_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
-    with monkeypatch.context() as full:
-        full.setattr(shutil, "disk_usage", lambda _: usage)
-        with pytest.raises(RecordingFailed, match=r"run: cannot be written: .*MB are needed"):
-            bring(tmp_path, ONE, a__csv=csv())
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "manifest.yaml"]
-    assert import_records(tmp_path / "manifest.yaml", tmp_path / "run").records == 1
-    # So is a run that is simulated.
-    with monkeypatch.context() as full:
-        full.setattr(shutil, "disk_usage", lambda _: usage)
-        with pytest.raises(RecordingFailed, match=r"again: cannot be written"):
+def test_a_full_disk_is_said_and_leaves_no_half_run(tmp_path: Path) -> None:
+    bring(tmp_path, ONE, a__csv=csv())
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with largest_file(20_000):
+        with pytest.raises(RecordingFailed, match=r"again: cannot be written: .*too large"):
+            import_records(tmp_path / "manifest.yaml", tmp_path / "again")
+        # So is a run that is simulated.
+        with pytest.raises(RecordingFailed, match=r"again: cannot be written: .*too large"):
             write_run(tmp_path / "again", load_run(tmp_path / "run"))
-    assert not (tmp_path / "again").exists()
-    assert list(tmp_path.glob(".*")) == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 TWO_STEPS = ONE + "  - {file: a.csv, step: heavy, repeat: 1%s}\n"

@@ -14,9 +14,8 @@ def write_run(folder: str | Path, run: Run) -> Path:
     Raises InputError if it is occupied, RecordingFailed if it cannot be written.
     """
     out = Path(folder)
-    values = sum(c.size for r in run.records for c in r.channels.values())
     with store.whole_run(out, run.rig, run.source) as path:
-        with archive.create(path / archive.NAME, run.rig.name, values) as file:
+        with archive.create(path / archive.NAME, run.rig.name) as file:
             for order, r in enumerate(run.records):
                 about = archive.record_attributes(
                     r.step, r.repeat, r.locked, r.sample_rate, r.start, r.period, r.lines, True

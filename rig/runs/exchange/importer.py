@@ -254,8 +254,7 @@ def _write(
 
 
 def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> None:
-    values = sum(c.size for r in records for c in r.channels.values())
-    with archive.create(folder / archive.NAME, source.rig.name, values) as file:
+    with archive.create(folder / archive.NAME, source.rig.name) as file:
         for order, r in enumerate(records):
             meta = r.entry.meta()
             about = archive.record_attributes(
