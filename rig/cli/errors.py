@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import sys
 import traceback
 from collections.abc import Callable
@@ -11,12 +12,16 @@ from collections.abc import Callable
 import typer
 from typer.exceptions import TyperException
 
+from rig.cli.text.output import discard, progress
+
 OK = 0
 FAILED = 1
 BAD_INPUT = 2
 TRIPPED = 3
 DEVICE_LOST = 4
 INTERRUPTED = 130
+
+_STDOUT = 1  # file descriptor
 
 
 class WorkError(Exception):
@@ -47,7 +52,7 @@ def _say(message: str) -> None:
 
     for part in message.strip().splitlines() or [""]:
         line = "bramah: " + " ".join(part.split())
-        print(alarm(line) if UNSURE in line else line, file=sys.stderr)
+        progress(alarm(line) if UNSURE in line else line)
 
 
 def _os_error(error: OSError) -> str:
@@ -108,13 +113,28 @@ def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
     except TyperException as error:
         _say(f"{error.format_message().rstrip('.')}; see --help")
         return BAD_INPUT
-    except BrokenPipeError:
-        # The reader of standard output has closed it (`| head`), which is not an error.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
+    except SystemExit as error:
+        # Typer ends the process at a closed pipe, without a message.
+        if not isinstance(error.__context__, BrokenPipeError):
+            raise
+        return OK if _reader_is_gone() else _failed(error.__context__, debug)
     except (Exception, KeyboardInterrupt) as error:
-        if debug:
-            traceback.print_exc()
-        code, message = _code_and_message(error)
-        _say(message)
-        return code
+        return _failed(error, debug)
+
+
+def _failed(error: BaseException, debug: bool) -> int:
+    if debug:
+        traceback.print_exception(error)
+    code, message = _code_and_message(error)
+    _say(message)
+    return code
+
+
+def _reader_is_gone() -> bool:
+    """Return whether the reader of standard output has closed it (`| head`); not an error."""
+    output = select.poll()
+    output.register(_STDOUT, 0)  # reports errors only
+    gone = bool(output.poll(0))
+    if gone:
+        discard(_STDOUT)
+    return gone

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import io
 import logging
 import os
 import signal
@@ -157,6 +158,9 @@ def run(arguments: list[str] | None = None) -> None:
     words = [word for word in words if word != "--debug"] or ["--help"]
     handler = logging.StreamHandler()
     handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # as standard error: characters that the terminal or a file's encoding lacks, as \xb1
+        sys.stdout.reconfigure(errors="backslashreplace")
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
     # Verbs then clean up as after Ctrl-C; while driving, a bench installs its own handlers.
     signal.signal(signal.SIGTERM, Interruption())

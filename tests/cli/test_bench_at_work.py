@@ -70,6 +70,21 @@ def ended_by(act: Callable[[subprocess.Popen[str], str], None], endless: Path, r
     return errors
 
 
+def test_a_run_goes_on_when_the_reader_of_its_progress_has_ended(
+    short: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "monday"
+    with simulated() as (endpoint, _):
+        line = ("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("warm-up", process)
+            assert process.stderr is not None
+            process.stderr.close()
+            assert process.wait(LONG) == 0
+    assert (run / "state").read_text().strip() == "done"
+    assert len(load_run(run).records) == 2
+
+
 def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: Path) -> None:
     checked = bramah_here("check", short, "--rig", RIG)
     assert checked.returncode == 0, checked.stderr

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -104,8 +106,6 @@ def test_a_run_is_refused_a_folder_below_a_file_before_its_check(lab: Path) -> N
 
 
 def test_a_disk_that_is_full_at_the_end_leaves_the_result_on_the_screen(lab: Path) -> None:
-    import subprocess
-
     line = words("identify", RUN, "--model", "full/m.json")
     # Python would keep bytecode that the limit cut off, and every later import of it would fail.
     variables = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
@@ -117,6 +117,42 @@ def test_a_disk_that_is_full_at_the_end_leaves_the_result_on_the_screen(lab: Pat
     assert "full/m.json" in done.stderr
     assert "W1" in done.stdout
     assert "condition number" in done.stdout
+
+
+def test_output_piped_into_head_is_no_error(lab: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        words("runs", "runs"),
+        cwd=lab,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_terminal_that_lacks_a_character_shows_its_code(lab: Path) -> None:
+    variables = {**os.environ, "PYTHONIOENCODING": "latin-1"}
+    folder = lab / "2 Ω"
+    folder.mkdir()
+    shutil.copytree(lab / RUN, folder / "µ – Ω")
+    done = subprocess.run(
+        words("runs", folder), capture_output=True, encoding="latin-1", env=variables, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert r"µ \u2013 \u03a9" in done.stdout
+
+
+def test_results_are_json_alone_where_standard_error_is_closed(lab: Path) -> None:
+    line = words("runs", "runs", "--json", "-", "--rebuild")
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$@" 2>&-', "sh", *line], cwd=lab, stdout=subprocess.PIPE, check=False
+    )
+    assert done.returncode == 0
+    assert [run["path"] for run in json.loads(done.stdout)] == [str(RUN)]
 
 
 @pytest.fixture(autouse=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,8 +16,23 @@ LINE_SECONDS: Final = 3.0  # [s] between the lines of a countdown, and before th
 
 
 def progress(message: str) -> None:
-    """Print a progress message to standard error."""
-    print(message, file=sys.stderr, flush=True)
+    """Print a message to standard error; after a failure nothing more is printed there.
+
+    A closed pipe, or a log on a full disk, must not end a run.
+    """
+    if sys.stderr is None:  # closed by the caller; print would write to standard output
+        return
+    try:
+        print(message, file=sys.stderr, flush=True)
+    except OSError:
+        discard(sys.stderr.fileno())
+
+
+def discard(descriptor: int) -> None:
+    """Discard what is still to be written to an open file and all that is written later."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
 
 
 def clock_text(seconds: float) -> str:
