@@ -8,7 +8,7 @@ selects it by `type: electric` at its joints, and `Rig.model_validate` returns t
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -40,6 +40,8 @@ from rig.model.tolerances import (
     uncertain_numbers,
 )
 
+MAX_SAMPLE_RATE: Final = 100e3  # [Hz], far above hydraulics; the twin's memory grows with it
+
 
 class Rig(Part):
     """A whole test bench."""
@@ -47,7 +49,7 @@ class Rig(Part):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")
     description: str = ""
     gravity: Acceleration = Field(default=9.8, gt=0)
-    sample_rate: Frequency = Field(gt=0)
+    sample_rate: Frequency = Field(gt=0, le=MAX_SAMPLE_RATE)
     supply: Supply
     oil: Oil
     joints: tuple[Joint, ...] = Field(min_length=1, max_length=MAX_JOINTS)

@@ -93,6 +93,7 @@ def test_limits_of_the_whole_bench_are_optional_and_have_units() -> None:
         ("  M1: 5.00", "  M7: 5.00", "nominal:", "M7"),
         ("name: boom", "name: [boom", "    link_length: 0.5 m", "not valid YAML"),
         ("bits: 16", "bits: 64", "spool: {range", "less than or equal to 16"),
+        ("sample_rate: 1 kHz", "sample_rate: 1 MHz", "sample_rate:", "less than or equal to 1000"),
     ],
 )
 def test_a_bench_that_cannot_be_built_is_refused_with_its_line(
