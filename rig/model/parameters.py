@@ -42,6 +42,11 @@ def parameter_names(joints: int) -> tuple[str, ...]:
     return (*mechanical_names(joints), *fluid_names(joints))
 
 
+def is_positive(name: str) -> bool:
+    """Return whether a baseline parameter is above 0 in every machine: b, gains, M_i, R_ii."""
+    return name[0] in "bCM" or (name[0] == "R" and name[1] == name[2])
+
+
 def parameter_unit(name: str) -> str:
     """Return the SI unit of a baseline parameter, in the form pint reads."""
     if name == "b":

@@ -30,7 +30,7 @@ from rig.model.electric import (
     si_pair,
     si_value,
 )
-from rig.model.parameters import MAX_JOINTS, parameter_names, parameter_unit
+from rig.model.parameters import MAX_JOINTS, is_positive, parameter_names, parameter_unit
 from rig.model.parts import Array, BenchLimits, Joint, Oil, Part, Sensors, Supply, Wire
 from rig.model.quantity import Acceleration, Angle, Frequency, parse_quantity
 from rig.model.tolerances import (
@@ -98,7 +98,11 @@ class Rig(Part):
                 )
         if not info.context:
             return value
-        return {k: parse_quantity(str(v), parameter_unit(k)) for k, v in value.items()}
+        values = {k: parse_quantity(str(v), parameter_unit(k)) for k, v in value.items()}
+        for name, number in values.items():
+            if number <= 0.0 and is_positive(name):
+                raise ValueError(f"{name!r} is {value[name]}; expected greater than 0")
+        return values
 
     @model_validator(mode="after")
     def _limits_can_be_seen(self) -> Self:

@@ -91,6 +91,8 @@ def test_limits_of_the_whole_bench_are_optional_and_have_units() -> None:
         ("rod_area: 5.4e-4", "rod_area: 9.4e-4", "cylinder: &cylinder", "exceeds cap_area"),
         ("mid_length: 0.30 m", "mid_length: 0.20 m", "- name: boom", "close a triangle"),
         ("  M1: 5.00", "  M7: 5.00", "nominal:", "M7"),
+        ("  M1: 5.00", "  M1: -5.00", "nominal:", "'M1' is -5.00 kg*m^2; expected greater than 0"),
+        ("  b: 250 MPa", "  b: 0 MPa", "nominal:", "'b' is 0 MPa; expected greater than 0"),
         ("name: boom", "name: [boom", "    link_length: 0.5 m", "not valid YAML"),
         ("bits: 16", "bits: 64", "spool: {range", "less than or equal to 16"),
         ("sample_rate: 1 kHz", "sample_rate: 1 MHz", "sample_rate:", "less than or equal to 1000"),
