@@ -19,6 +19,7 @@ from protocols.steps.lock import LockStep
 from protocols.steps.parts import Place
 from protocols.steps.warm_up import WarmUpStep
 from rig.model.parameters import MAX_JOINTS
+from rig.model.parts import Name
 from rig.model.quantity import Time
 
 VERSION: Final = 2
@@ -58,7 +59,7 @@ class Protocol(ProtocolPart):
     """A whole experiment."""
 
     version: int = Field(default=VERSION, ge=1, description="of this language")
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")
+    name: Name
     description: str = ""
     joints: int = Field(ge=1, le=MAX_JOINTS, description="size of the rigs it is written for")
     parameters: dict[str, Any] = Field(

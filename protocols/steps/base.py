@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, ClassVar, Final, Protocol
+from typing import Annotated, Any, ClassVar, Final, Protocol
 
 from pydantic import Field, PrivateAttr
 
@@ -18,10 +18,11 @@ from protocols.language.conditions import Condition
 from protocols.language.part import ProtocolPart
 from protocols.steps.parts import Place
 from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
+from rig.model.parts import MAX_NAME
 from rig.model.rig import Rig
 
 MISSPELT: Final = 0.8  # similarity (difflib) from which an unknown key is a kind's, misspelt
-NAME = r"^[a-z0-9]+(?:_[a-z0-9]+)*$"
+StepName = Annotated[str, Field(pattern=r"^[a-z0-9]+(?:_[a-z0-9]+)*$", max_length=MAX_NAME)]
 
 
 class Planner(Protocol):
@@ -142,7 +143,7 @@ class StepKind(ProtocolPart):  # noqa: PLW1641 - pydantic hashes frozen models
     rank: ClassVar[int] = 1  # kinds of lower rank are recognised first
     nests: ClassVar[bool] = False  # its key `steps` holds steps
 
-    name: str | None = Field(default=None, pattern=NAME, description="of its records and log lines")
+    name: StepName | None = Field(default=None, description="of its records and log lines")
     _where: str = PrivateAttr(default="")
 
     @property

@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
-from protocols.steps.base import NAME, Actions, PlannedStep, Planner, StepKind
+from protocols.steps.base import Actions, PlannedStep, Planner, StepKind, StepName
 from protocols.steps.parts import Excite, Lock, require_one_role
 from rig.model.quantity import Time
 
@@ -20,7 +20,7 @@ class Step(StepKind):
     key: ClassVar[str] = "excite"
     rank: ClassVar[int] = 0  # it may also have the keys `lock` and `warm_up`
 
-    name: str = Field(pattern=NAME)
+    name: StepName
     lock: tuple[Lock, ...] = ()
     excite: tuple[Excite, ...] = Field(min_length=1)
     repeats: int = Field(default=1, ge=1, le=MAX_REPEATS)

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from protocols.steps.base import NAME, Actions, PlannedStep, Planner, StepKind
+from protocols.steps.base import Actions, PlannedStep, Planner, StepKind, StepName
 from protocols.steps.excite import MOVE_SECONDS
 from protocols.steps.parts import Excite, Lock
 from rig.model.quantity import Time
@@ -17,7 +17,7 @@ class WarmUpStep(StepKind):
 
     key: ClassVar[str] = "warm_up"
 
-    name: str = Field(default="warm_up", pattern=NAME)
+    name: StepName = "warm_up"
     warm_up: str = Field(description="condition, like 'oil_temperature > 40 degC'")
     timeout: Time = Field(gt=0, description="after which the step has failed")
     move: tuple[Excite, ...] = Field(min_length=1, description="what moves the oil")

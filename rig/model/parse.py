@@ -183,6 +183,8 @@ def problem_text(problem: ErrorDetails) -> str:
         most = problem["type"] == "too_long"
         number = context["max_length" if most else "min_length"]
         text = f"{'at most' if most else 'at least'} {number} of them"
+    elif problem["type"] == "string_too_long":
+        text = f"text of at most {context['max_length']} characters"
     elif problem["type"] == "string_pattern_mismatch":
         text = f"text that matches {context['pattern']}"
     text = text.removeprefix("Input should be ")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 from urllib.parse import urlencode
 
 import numpy as np
@@ -35,6 +35,9 @@ from rig.model.quantity import (
 Array = linkage.Array
 
 WATCHDOG_RANGE: Final = (0.02, 10.0)  # [s] that a device can be set to (docs/wire-modbus-tcp.md)
+
+MAX_NAME: Final = 80  # characters; a name becomes part of a file's name
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=MAX_NAME)]
 
 
 class Part(BaseModel):

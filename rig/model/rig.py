@@ -31,7 +31,7 @@ from rig.model.electric import (
     si_value,
 )
 from rig.model.parameters import MAX_JOINTS, is_positive, parameter_names, parameter_unit
-from rig.model.parts import Array, BenchLimits, Joint, Oil, Part, Sensors, Supply, Wire
+from rig.model.parts import Array, BenchLimits, Joint, Name, Oil, Part, Sensors, Supply, Wire
 from rig.model.quantity import Acceleration, Angle, Frequency, parse_quantity
 from rig.model.tolerances import (
     Tolerances,
@@ -46,7 +46,7 @@ MAX_SAMPLE_RATE: Final = 100e3  # [Hz], far above hydraulics; the twin's memory 
 class Rig(Part):
     """A whole test bench."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")
+    name: Name
     description: str = ""
     gravity: Acceleration = Field(default=9.8, gt=0)
     sample_rate: Frequency = Field(gt=0, le=MAX_SAMPLE_RATE)

@@ -75,6 +75,12 @@ REFUSED = [
         "name: Step 1",
         "mine.yaml:5: steps.0.name: expected text that matches .*Step 1",
     ),
+    (
+        "name: step1",
+        f"name: step{'1' * 80}",
+        "mine.yaml:5: steps.0.name: expected text of at most 80 characters, found",
+    ),
+    ("name: mine", f"name: mine{'1' * 80}", "mine.yaml:1: name: expected text of at most 80"),
 ]
 
 
