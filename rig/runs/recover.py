@@ -170,17 +170,21 @@ def _without_journal(folder: Path) -> RecoverReport:
                 f"{folder}: samples were recorded, and neither {runstate.JOURNAL} nor "
                 f"{store.ARCHIVE} is here; copy the missing file from where the run was taken"
             )
-        runstate.write_state(folder, state)
         message = "nothing had been recorded"
+        _end(folder, state)
         _note(folder, state, message)
         return _report(folder, state, Written(0, 0, 0, 0, 0), message)
     from rig.runs.archive_reader import count  # noqa: PLC0415 - h5py loads slowly
 
     written = count(archive)
+    _end(folder, state)
+    return _report(folder, state, written, "was finalised already")
+
+
+def _end(folder: Path, state: str) -> None:
     runstate.write_state(folder, state)
     with suppress(OSError):
         runstate.release_ownership(folder)
-    return _report(folder, state, written, "was finalised already")
 
 
 def _report(folder: Path, state: str, written: Written, message: str) -> RecoverReport:

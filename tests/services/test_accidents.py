@@ -81,6 +81,7 @@ def test_killed_while_the_folder_is_made_it_is_an_empty_run_or_none(
     else:
         report = recover(run)
         assert (report.state, report.records) == ("interrupted", 0)
+        assert not (run / "owner.json").exists()
         assert [s.state for s in indexed_runs(tmp_path)] == ["interrupted"]
         with pytest.raises(InputError):
             load_run(run)
