@@ -60,3 +60,20 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
     held = (Path(runs[0]["path"]) / "run.yaml").read_text()
     assert "sha256:" in held
     assert "command: bramah run" in held
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ("--not-after", "2020-01-01T06:00"),
+        ("--not-before", "2099-01-02T22:30", "--not-after", "2099-01-02T06:00"),
+    ],
+)
+def test_an_item_that_could_never_start_is_refused_when_it_is_queued(
+    tmp_path: Path, times: tuple[str, ...]
+) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    done = bramah_here("queue", "add", "short.yaml", "--rig", RIG, *times, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"--not-after {times[-1]}: is 0" in done.stderr
+    assert "cannot start before" in done.stderr

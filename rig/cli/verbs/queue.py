@@ -137,11 +137,10 @@ def add(
     from protocols.files.library import shipped_names
     from rig.cli.execution.queue_add import prove
     from rig.model.parse import InputError
-    from rig.queue.items import DONE, QueueJob, channel_condition, parse_time
+    from rig.queue.items import DONE, QueueJob, channel_condition
     from rig.runs.rigs import shipped_rigs
     from rig.runs.store import refuse_occupied
 
-    now = datetime.now(UTC)
     changed = _arguments(
         ("--repeats", repeats), ("--duration", duration), ("--wave-seed", wave_seed),
         ("--amplitude-scale", None if amplitude_scale == 1.0 else amplitude_scale),
@@ -155,15 +154,7 @@ def add(
         )
     if when is not None:
         channel_condition(when)
-    times = {
-        option: ""
-        if text is None
-        else parse_time(text, now, f"--{option.replace('_', '-')}").isoformat()
-        for option, text in (("not_before", not_before), ("not_after", not_after))
-    }
-    if when is not None and not_after is None:  # an item whose condition is never met expires
-        begin = datetime.fromisoformat(times["not_before"]) if not_before else now
-        times["not_after"] = (begin + timedelta(hours=WAIT_HOURS)).isoformat()
+    times = _times(not_before, not_after, when, datetime.now(UTC))
     with _opened(queue, create=True) as store:
         title = name or Path(protocol).stem
         folder = (out or Path("runs", f"{store.next_number():03d}-{title}")).absolute()
@@ -193,6 +184,29 @@ def add(
     elif "twin" in item.proof:
         progress(f"the twin uses {item.proof['twin']}")
     _show(item, json, f"queued{length}; it will run into {item.job.out}")
+
+
+def _times(
+    not_before: str | None, not_after: str | None, when: str | None, now: datetime
+) -> dict[str, str]:
+    """Return when an item may start, as ISO 8601; raises InputError if it never could."""
+    from rig.model.parse import InputError
+    from rig.queue.items import parse_time
+
+    begin = parse_time(not_before, now, "--not-before") if not_before else None
+    end = parse_time(not_after, now, "--not-after") if not_after else None
+    earliest = max(begin or now, now)
+    if end is not None and end <= earliest:
+        raise InputError(
+            f"--not-after {not_after}: is {_local(end.isoformat())}, but the item cannot start "
+            f"before {_local(earliest.isoformat())}; name a later time, such as 2026-03-01T22:30"
+        )
+    if end is None and when is not None:  # an item whose condition is never met expires
+        end = (begin or now) + timedelta(hours=WAIT_HOURS)
+    return {
+        "not_before": begin.isoformat() if begin else "",
+        "not_after": end.isoformat() if end else "",
+    }
 
 
 def _refuse_wanted(earlier: Item, wanted: str) -> None:
