@@ -29,6 +29,14 @@ _FLOAT = re.compile(r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)$")
 class _Loader(yaml.SafeLoader):
     """A separate safe loader, so that its resolver does not change the library's."""
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """Return a node's value; raises YAMLError with the line, also for the date 2026-13-01."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, AttributeError) as error:
+            problem = f"{_cut(repr(node.value))} cannot be read ({error})"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from error
+
 
 _Loader.yaml_implicit_resolvers = {
     key: list(value) for key, value in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -75,10 +83,10 @@ def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
         raise InputError(f"{source}:{line}: not valid YAML: {problem}") from error
     except RecursionError as error:
         raise InputError(f"{source}:1: nested too deeply to be a description") from error
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:  # an escape beyond Unicode
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{source}:1: not valid YAML: {error}") from error
+        raise InputError(f"{source}:{loader.line + 1}: not valid YAML: {error}") from error
     finally:
         loader.dispose()
 
@@ -191,7 +199,13 @@ def problem_text(problem: ErrorDetails) -> str:
     wanted = next((wanted for kind, wanted in WANTED.items() if problem["type"] in kind), text)
     value = problem["input"]
     found = f"the keys {', '.join(map(str, value))}" if value and isinstance(value, dict) else ""
-    return f"expected {wanted}, found {shorten(found or repr(value), FOUND_AT_MOST)}"
+    return f"expected {wanted}, found {_cut(found or repr(value))}"
+
+
+def _cut(text: str) -> str:
+    """Return a text in one line of FOUND_AT_MOST characters, cut between words if it has any."""
+    cut = shorten(text, FOUND_AT_MOST)
+    return cut if cut != "[...]" else f"{text[: FOUND_AT_MOST - 6]} [...]"
 
 
 def parse_model(model: type[Model], text: str, source: str) -> Model:

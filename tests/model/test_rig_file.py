@@ -94,7 +94,20 @@ def test_limits_of_the_whole_bench_are_optional_and_have_units() -> None:
         ("  M1: 5.00", "  M1: -5.00", "nominal:", "'M1' is -5.00 kg*m^2; expected greater than 0"),
         ("  b: 250 MPa", "  b: 0 MPa", "nominal:", "'b' is 0 MPa; expected greater than 0"),
         ("name: boom", "name: [boom", "    link_length: 0.5 m", "not valid YAML"),
+        (
+            "  skew: 10 us",
+            "  calibrations: {cap_pressure_1: {date: 2026-13-01, serial: A}}",
+            "  skew: 10 us",
+            "'2026-13-01' cannot be read (month must be in 1..12)",
+        ),
+        (
+            "description: Two",
+            'description: "\\U00110000" # Two',
+            "description: Two",
+            "not valid YAML: chr() arg not in range",
+        ),
         ("bits: 16", "bits: 64", "spool: {range", "less than or equal to 16"),
+        ("name: shinshu-2dof", "name: " + 81 * "x", "name: shinshu", "found 'xxxxx"),
         ("sample_rate: 1 kHz", "sample_rate: 1 MHz", "sample_rate:", "less than or equal to 1000"),
     ],
 )
