@@ -61,6 +61,12 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_work(
     assert f"{option} results/night/x.out: {lab / 'results'} is no folder" in done.stderr
 
 
+def test_a_demo_without_a_place_for_its_folder_is_refused(lab: Path) -> None:
+    done = bramah_here("demo", "--out", "results/demo", cwd=lab)
+    assert done.returncode == 2
+    assert f"{lab / 'results'} is no folder; name another folder" in done.stderr
+
+
 def test_a_new_folder_named_for_every_result_is_made(lab: Path) -> None:
     files = ("new/deep/p.json", "new/models/m.json", "new/reports/r.html")
     options = zip(("--json", "--model", "--report"), files, strict=True)

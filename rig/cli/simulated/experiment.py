@@ -28,7 +28,7 @@ from rig.cli.text.output import Countdown, progress, write_json
 from rig.cli.text.render import identification_text, parameter_table, validation_text
 from rig.cli.text.reports import provenance
 from rig.model.records import Run
-from rig.runs.store import load_run
+from rig.runs.store import load_run, refuse_occupied
 
 IDENTIFY = "lock-and-excite-multisine"
 VALIDATE = "validate"
@@ -61,6 +61,7 @@ def experiment(
     `scenario` (a bench's hidden effects) is passed to the bench alone; with one, a third run of
     another waveform and amplitude is taken as a hold-out for the trace.
     """
+    refuse_occupied(folder)
     folder.mkdir(parents=True)
     truth = folder / "truth.json"
     say(f"starting the simulated bench {RIG}, seed {seed}")
