@@ -72,6 +72,16 @@ def _folder_name(wire: Wire) -> str:
     return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{place}")
 
 
+def tripped_run(rig: str) -> Path | None:
+    """Return the folder of the run in which a bench of the named rig tripped, not reset since."""
+    for path in sorted(state_folder().glob(f"*/{_TRIP}")):
+        with suppress(OSError, ValueError):
+            stored = json.loads(path.read_text(encoding="utf-8"))
+            if stored["rig"] == rig and stored["run"]:
+                return Path(stored["run"])
+    return None
+
+
 class BenchState:
     """The files of the bench at one wire; `root` is `state_folder()` by default."""
 

@@ -113,9 +113,11 @@ def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def simulated(*more: object) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def simulated(
+    *more: object, rig: str | Path = "shinshu-2dof"
+) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """A simulated bench on a free port: (endpoint, process)."""
-    line = ["sim", "--rig", "shinshu-2dof", "--port", 0, "--parent", os.getpid(), *more]
+    line = ["sim", "--rig", rig, "--port", 0, "--parent", os.getpid(), *more]
     with started(*line) as process:
         assert process.stdout is not None
         yield process.stdout.readline().strip(), process

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -22,12 +24,16 @@ def short(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def faulty(tmp_path: Path) -> Iterator[str]:
-    """The endpoint of a bench whose sensor reads 6 MPa too high: every run of it trips."""
-    scenario = tmp_path / "scenario.yaml"
-    scenario.write_text(
-        "effects: [{name: sensor_offset, channel: cap_pressure_2, offset: 6 MPa}]\n"
-    )
+def scenario(tmp_path: Path) -> Path:
+    """A sensor reads 6 MPa too high: every run trips."""
+    path = tmp_path / "scenario.yaml"
+    path.write_text("effects: [{name: sensor_offset, channel: cap_pressure_2, offset: 6 MPa}]\n")
+    return path
+
+
+@pytest.fixture
+def faulty(scenario: Path) -> Iterator[str]:
+    """The endpoint of a bench whose runs trip."""
     with simulated("--scenario", scenario) as (endpoint, _):
         yield endpoint
 
@@ -90,6 +96,25 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     assert again.returncode == 3, again.stderr
     assert "still" not in again.stderr
     assert (tmp_path / "fifth" / "state").read_text() == "tripped\n"
+
+
+def test_the_command_that_a_trip_names_works_for_a_rig_file_of_any_name(
+    short: Path, scenario: Path, tmp_path: Path
+) -> None:
+    shipped = (resources.files("rig") / "shipped" / f"{RIG}.yaml").read_text("utf-8")
+    mine = tmp_path / "arm in lab 2.yaml"
+    mine.write_text(shipped.replace(f"name: {RIG}", "name: left-arm", 1), encoding="utf-8")
+    with simulated("--scenario", scenario, rig=mine) as (endpoint, _):
+        at = ("--rig", mine, "--endpoint", endpoint)
+        tripped = bramah("run", short, *at, "--out", tmp_path / "run")
+        assert tripped.returncode == 3, tripped.stderr
+        (command,) = set(re.findall(r"`bramah (reset [^`]*) --reason TEXT`", tripped.stderr))
+        assert command == f"reset --rig left-arm --endpoint {endpoint}"
+        cleared = bramah_here(*command.split(), "--reason", "sensor looked at")
+        assert cleared.returncode == 0, cleared.stderr
+        unknown = bramah_here(*command.split(), "--reason", "again")
+        assert unknown.returncode == 2
+        assert "left-arm" in unknown.stderr
 
 
 def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path) -> None:

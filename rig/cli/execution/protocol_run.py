@@ -15,7 +15,7 @@ from protocols.engine.desk import Desk
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
-from rig.bench.latch import reset_bench
+from rig.bench.latch import reset_bench, tripped_run
 from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
@@ -27,7 +27,9 @@ from rig.cli.proof.twin_choice import twin_source
 from rig.cli.provenance import provenance_of
 from rig.cli.text.output import Countdown, clock_text
 from rig.cli.text.sheets import plan_text
+from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.runs import runstate
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
 from rig.runs.store import refuse_occupied
@@ -164,6 +166,16 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
 
 
 def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
-    """Clear a bench's latched trip for a person's `reason`; return the cause of the trip."""
-    described, driver = device_of(rig, endpoint)
+    """Clear a bench's latched trip for a person's `reason`; return the cause of the trip.
+
+    `rig` may be the name in a rig file too, as messages on a trip state it: the rig is then that of
+    the run that tripped.
+    """
+    try:
+        described, driver = device_of(rig, endpoint)
+    except InputError:
+        run = tripped_run(rig)
+        if run is None:
+            raise
+        described, driver = device_of(str(run / runstate.HEADER), endpoint)
     return reset_bench(described, driver, reason)
