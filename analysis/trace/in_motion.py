@@ -96,7 +96,7 @@ def searched_in_motion(
     if acting and acting != joints:  # an effect of several balances had spread friction to others
         found = searched(acting)
     unmet = joints_with_friction(found.winner, loud) != acting
-    if not acting or unmet or not _is_better(found, finding, acting):
+    if acting <= weighted or unmet or not _is_better(found, finding, acting):
         return finding
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
     found = replace(found, effects=(*found.effects, *failed))
