@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import select
+import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -82,10 +83,13 @@ def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., 
 
 
 def _code_and_message(error: BaseException) -> tuple[int, str]:
-    # An error that is not listed is a bug; its type is shown.
     for kinds, code, text in _codes():
         if isinstance(error, kinds):
             return code, _with_notes(error, text(error))
+    # pydantic reports an interruption within a serializer as an error of its own.
+    if any(getattr(signal.getsignal(n), "heard", False) for n in (signal.SIGINT, signal.SIGTERM)):
+        return INTERRUPTED, _with_notes(error, "stopped")
+    # An error that is not listed is a bug; its type is shown.
     return FAILED, f"{type(error).__name__}: {error}; --debug shows where"
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
 from rig.bench.stops import StopFlag
+from rig.cli.errors import FAILED, INTERRUPTED, guarded
 from rig.cli.main import Interruption
 
 
@@ -36,6 +38,30 @@ def test_a_swallowed_signal_stops_the_bench_that_is_driven_next(
     flag.install()
     assert flag.reason == reason
     flag.restore()
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_signal_that_a_library_reports_as_its_own_error_is_a_stop(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Pydantic calls it "Error serializing to JSON: KeyboardInterrupt"."""
+
+    def serialised() -> int:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        raise ValueError("Error serializing to JSON: KeyboardInterrupt: ")
+
+    assert guarded(serialised, debug=False) == INTERRUPTED
+    assert capsys.readouterr().err == "bramah: stopped\n"
+
+
+@pytest.mark.usefixtures("handlers")
+def test_an_error_without_a_signal_is_no_stop(capsys: pytest.CaptureFixture[str]) -> None:
+    def failing() -> int:
+        raise ValueError("wrong")
+
+    assert guarded(failing, debug=False) == FAILED
+    assert "ValueError: wrong" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("handlers")
