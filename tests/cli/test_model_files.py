@@ -94,11 +94,18 @@ def test_record_by_record_the_same_terms_give_the_same_numbers(folder: Path, rub
         bramah("identify", rubbed, "--with", "valve_deadband@joint 2", "--stream")
 
 
-def test_a_shape_that_the_records_give_is_stated_with_its_interval(rubbed: Path) -> None:
+def test_a_shape_that_the_records_give_is_stated_with_its_interval(
+    rubbed: Path, tmp_path: Path
+) -> None:
     """A dead band of edges that nothing on this bench has, in JSON and in text."""
     line = ("identify", rubbed, "--with", "coulomb_friction@joint 2")
     line = (*line, "--with", "valve_deadband@joint 2")
-    shape = json.loads(bramah(*line, "--json", "-"))["shapes"]["w_ahead_2"]
+    model = tmp_path / "model.json"
+    found = json.loads(bramah(*line, "--json", "-", "--model", model))
+    for name, estimate in load_model(model).parameters.items():
+        if estimate.identified:
+            assert found["parameters"][name]["ci95"] == pytest.approx(estimate.ci95), name
+    shape = found["shapes"]["w_ahead_2"]
     low, high = shape["ci95"]
     assert low < shape["value"] < high
     assert (shape["unit"], shape["std"] > 0.0) == ("V", True)

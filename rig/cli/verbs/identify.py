@@ -120,7 +120,7 @@ def _with_shape_errors(
     from analysis.trace.judge.given_effects import with_shape_errors
 
     model, shapes = with_shape_errors(found, result.model)
-    return replace(result, model=model), shapes
+    return replace(result, model=model, estimates=model.parameters), shapes
 
 
 def identify(
