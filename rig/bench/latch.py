@@ -72,13 +72,19 @@ def _folder_name(wire: Wire) -> str:
     return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{place}")
 
 
+def _load_trip(path: Path) -> LatchedTrip:
+    """Read a stored trip; raises OSError, ValueError, KeyError or TypeError."""
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    return LatchedTrip(**{key: str(stored[key]) for key in LatchedTrip.__annotations__})
+
+
 def tripped_run(rig: str) -> Path | None:
     """Return the folder of the run in which a bench of the named rig tripped, not reset since."""
     for path in sorted(state_folder().glob(f"*/{_TRIP}")):
-        with suppress(OSError, ValueError):
-            stored = json.loads(path.read_text(encoding="utf-8"))
-            if stored["rig"] == rig and stored["run"]:
-                return Path(stored["run"])
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            trip = _load_trip(path)
+            if trip.rig == rig and trip.run:
+                return Path(trip.run)
     return None
 
 
@@ -109,8 +115,7 @@ class BenchState:
         """Return the latched trip, None if there is none; a damaged file counts as a trip."""
         path = self.folder / _TRIP
         try:
-            stored = json.loads(path.read_text(encoding="utf-8"))
-            return LatchedTrip(**{key: str(stored[key]) for key in LatchedTrip.__annotations__})
+            return _load_trip(path)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:

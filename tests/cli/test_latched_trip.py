@@ -99,8 +99,11 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
 
 
 def test_the_command_that_a_trip_names_works_for_a_rig_file_of_any_name(
-    short: Path, scenario: Path, tmp_path: Path
+    short: Path, scenario: Path, tmp_path: Path, state: Path
 ) -> None:
+    """Also where the stored trip of another bench is damaged."""
+    (state / "another").mkdir(parents=True)
+    (state / "another" / "trip.json").write_text("[]")
     shipped = (resources.files("rig") / "shipped" / f"{RIG}.yaml").read_text("utf-8")
     mine = tmp_path / "arm in lab 2.yaml"
     mine.write_text(shipped.replace(f"name: {RIG}", "name: left-arm", 1), encoding="utf-8")
