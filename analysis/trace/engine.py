@@ -37,7 +37,7 @@ from analysis.trace.in_motion import (
 )
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
-from analysis.trace.judge.scatter import with_form_errors
+from analysis.trace.judge.scatter import form_shift, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import detection_limit_notes, detection_limits
@@ -292,11 +292,13 @@ def _traced(
         *detection_limit_notes(hidden),
     ]
     runs_before, runs_after = held_out.free_runs([*records.holdout, *records.judge], before, after)
-    left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
+    left = 0.0  # of training rows that hold noise alone
+    if not finding.held_out_only:
+        left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
     result = Trace(
         verdict, fitted.effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        0.0 if finding.held_out_only else left, moves, further,
+        left, moves, further,
         prepared.as_recorded.floors, first, last, tuple(notes),
         refused=finding.refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
@@ -423,9 +425,9 @@ def _identified_with_effects(
         return before, {}
     train_data = rows.train
     found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion, rows.lines)
-    return at_nominal_temperature(
-        with_form_errors(train_data, winner.fit, found.model)
-    ), by_geometry(found)
+    shift = form_shift(train_data, winner.fit)
+    model = with_form_errors(train_data, winner.fit, found.model, shift)
+    return at_nominal_temperature(model), by_geometry(found)
 
 
 def _identified(

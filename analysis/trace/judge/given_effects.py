@@ -27,4 +27,4 @@ def with_shape_errors(found: ShapeFit, model: Model) -> tuple[Model, dict[str, E
         own = {s.parameter for s in shapes_of(data.rig, used)}
         estimates = inference.estimates(data, used, errors, shift)
         shapes |= {name: e for name, e in estimates.items() if name in own}
-    return with_form_errors(data, fit, model), shapes
+    return with_form_errors(data, fit, model, shift), shapes

@@ -8,7 +8,7 @@ come from a model error that is the same in every repeat, and enter as a systema
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -151,20 +151,21 @@ def _growth_shift_squares(train_data: RegressionData, fit: ExactFit) -> dict[str
     return squares
 
 
-def with_form_errors(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
+def with_form_errors(
+    train_data: RegressionData, fit: ExactFit, model: Model, shift: Mapping[str, float]
+) -> Model:
     """Return the model with intervals that include the uncertainty of shapes and forms.
 
     `model` was identified with the shapes taken as exact. With shapes t of covariance S, X the
     columns of the coefficients, J_t those of the shapes and A = X'X, to first order
     beta(t) = beta - A^-1 X' J_t (t - t0). Variances grow by that of beta(t), and by the square of
-    `form_shift`.
+    `shift`, which `form_shift` returns.
     """
     rows = design_matrix(train_data, fit.terms)
     size = np.linalg.norm(rows.matrix, axis=0)
     more = _variance_from_shapes(
         train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names
     )
-    shift = form_shift(train_data, fit)
     parameters, covariance = dict(model.parameters), model.covariance.copy()
     names = list(parameters)
     for k, name in enumerate(rows.names):
