@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from rig.model.parse import InputError, problem_text
+from rig.model.parse import NO_NUMBER, InputError, boolean_numbers, problem_text
 from rig.model.parts import Part, Wire
 from rig.model.rig import Rig
 
@@ -108,7 +108,7 @@ class WireSettings(Part):
     def of(cls, wire: Wire) -> Self:
         """Read the settings of a wire; raises InputError naming the key and what was expected."""
         try:
-            return cls.model_validate(wire.settings)
+            made = cls.model_validate(wire.settings)
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])
@@ -121,6 +121,9 @@ class WireSettings(Part):
             else:
                 text = problem_text(first)
             raise InputError(f"wire: {key}: {text}") from error
+        for path in boolean_numbers(wire.settings, made):
+            raise InputError(f"wire: {'.'.join(map(str, path))}: {NO_NUMBER}")
+        return made
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from rig.model.parse import InputError, problem_text, read_quantity
+from rig.model.parse import NO_NUMBER, InputError, boolean_numbers, problem_text, read_quantity
 from rig.model.parts import Part
 from rig.model.rig import Rig
 
@@ -26,7 +26,7 @@ def read_entry(model: type[Entry], raw: Any, key: str) -> Entry:
     if not isinstance(raw, Mapping):
         raise InputError(f"wire: {key}: expected keys and values, found {raw!r}")
     try:
-        return model.model_validate(raw)
+        made = model.model_validate(raw)
     except ValidationError as error:
         problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         problem = problems[0]
@@ -39,6 +39,9 @@ def read_entry(model: type[Entry], raw: Any, key: str) -> Entry:
         else:
             text = problem_text(problem)
         raise InputError(f"wire: {where}: {text}") from error
+    for path in boolean_numbers(raw, made):
+        raise InputError(f"wire: {key}.{'.'.join(map(str, path))}: {NO_NUMBER}")
+    return made
 
 
 def inputs_by_channel(model: type[Entry], raw: Mapping[str, Any], rig: Rig) -> tuple[Entry, ...]:

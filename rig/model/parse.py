@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from textwrap import shorten
 from typing import Any, Final, TypeVar
 
@@ -118,6 +118,9 @@ WANTED: Final = {
     ("int_type", "int_parsing", "int_from_float"): "a whole number",
     ("float_type", "float_parsing"): "a number",
 }
+NO_NUMBER: Final = (
+    "expected a number, found true or false (YAML reads yes, no, on and off as these)"
+)
 FOUND_AT_MOST: Final = 60  # characters of a wrong value that a message repeats
 
 
@@ -152,6 +155,19 @@ def _problems(
         where = ".".join(str(part) for part in path) or model.__name__.lower()
         problems.append((line, f"{source}:{line}: {where}: {text}"))
     return problems
+
+
+def boolean_numbers(data: Any, made: Any, path: Path = ()) -> Iterator[Path]:
+    """Yield where a boolean of a file became a number: pydantic reads `yes` as 1."""
+    if isinstance(data, bool) and isinstance(made, int | float) and not isinstance(made, bool):
+        yield path
+    elif isinstance(data, dict) and isinstance(made, BaseModel | dict):
+        fields = made if isinstance(made, dict) else dict(made)
+        for key, value in data.items():
+            yield from boolean_numbers(value, fields.get(key), (*path, key))
+    elif isinstance(data, list | tuple) and isinstance(made, list | tuple):
+        for index, (value, inner) in enumerate(zip(data, made, strict=False)):
+            yield from boolean_numbers(value, inner, (*path, index))
 
 
 def _causes(error: ValidationError) -> list[ErrorDetails]:
@@ -236,8 +252,12 @@ def validate_model(
         raise refusal([*known, *_problems(error, lines, source, model)], source) from error
     except RecursionError as error:
         raise InputError(f"{source}:1: refers to itself (a YAML alias?)") from error
-    if known:
-        raise refusal(known, source)
+    wrong: dict[tuple[int, str | int], str] = {}  # a value repeated by a YAML alias counts once
+    for path in boolean_numbers(data, made):
+        wrong.setdefault((lines.get(path, 1), path[-1]), f"{'.'.join(map(str, path))}: {NO_NUMBER}")
+    if known or wrong:
+        found = [(line, f"{source}:{line}: {text}") for (line, _), text in wrong.items()]
+        raise refusal([*known, *found], source)
     return made
 
 

@@ -125,6 +125,8 @@ def test_a_missing_port_and_a_wrong_key_say_what_to_change() -> None:
         make_driver(rig.wire.reached_by("carrier-pigeon", {}), rig)
     with pytest.raises(InputError, match="wire: prot: unknown key of wire modbus-tcp; expected"):
         make_driver(rig.wire.reached_by("modbus-tcp", {"prot": 502}), rig)
+    with pytest.raises(InputError, match="wire: port: expected a number, found true or false"):
+        make_driver(rig.wire.reached_by("modbus-tcp", {"port": True}), rig)
 
 
 def test_after_a_late_answer_the_next_request_gets_its_own(

@@ -106,6 +106,13 @@ def test_limits_of_the_whole_bench_are_optional_and_have_units() -> None:
             "description: Two",
             "not valid YAML: chr() arg not in range",
         ),
+        (
+            "spool_gain: 0.1",
+            "spool_gain: yes",
+            "spool_gain:",
+            "spool_gain: expected a number, found",
+        ),
+        ("command_bits: 12", "command_bits: yes", "command_bits:", "found True"),
         ("bits: 16", "bits: 64", "spool: {range", "less than or equal to 16"),
         ("name: shinshu-2dof", "name: " + 81 * "x", "name: shinshu", "found 'xxxxx"),
         ("sample_rate: 1 kHz", "sample_rate: 1 MHz", "sample_rate:", "less than or equal to 1000"),

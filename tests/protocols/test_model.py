@@ -69,6 +69,7 @@ REFUSED = [
     ),
     ("kind: sine, ", "", "mine.yaml:10: .*expected a key 'kind', found"),
     ("limit: 500 mV", "limit: 100 mV", "mine.yaml:3: .*push 0.4 V is above the limit 0.1 V"),
+    ("repeats: 3", "repeats: yes", "mine.yaml:12: steps.0.repeats: expected a number, found true"),
     ("repeats: 3", "repeats: 0", "mine.yaml:12: steps.0.repeats"),
     (
         "name: step1",
