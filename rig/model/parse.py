@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from textwrap import shorten
@@ -14,6 +15,7 @@ from pydantic_core import ErrorDetails
 from rig.model.quantity import FROM_FILE, UnitError, parse_quantity
 
 _MOST = 30  # problems of one file that are listed; a file with more is of another kind
+_MOST_REPEATED = 100_000  # values that the aliases of a file may add; more only fill the memory
 Model = TypeVar("Model", bound=BaseModel)
 Path = tuple[str | int, ...]
 
@@ -62,6 +64,21 @@ def _lines(node: yaml.Node, path: Path, numbers: dict[Path, int], source: str) -
             _lines(value, (*path, index), numbers, source)
 
 
+def _expanded(node: yaml.Node, sizes: dict[int, int], source: str) -> int:
+    """Return the number of values of a node with its aliases written out; InputError if huge."""
+    if id(node) not in sizes:
+        sizes[id(node)] = 1  # where a node contains itself
+        inner = node.value if isinstance(node, yaml.CollectionNode) else []
+        parts = itertools.chain(*inner) if isinstance(node, yaml.MappingNode) else inner
+        sizes[id(node)] = size = 1 + sum(_expanded(part, sizes, source) for part in parts)
+        if size > _MOST_REPEATED + len(sizes):
+            raise InputError(
+                f"{source}:{node.start_mark.line + 1}: {size} values once its aliases (*name) are "
+                f"written out; expected at most {_MOST_REPEATED} repeated ones in a file"
+            )
+    return sizes[id(node)]
+
+
 def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
     """Parse YAML safely into (data, line of each path); raises InputError with the line."""
     try:
@@ -73,6 +90,7 @@ def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
         node = loader.get_single_node()
         if node is None:
             raise InputError(f"{source}:1: the file is empty")
+        _expanded(node, {}, source)
         lines: dict[Path, int] = {}
         _lines(node, (), lines, source)
         return loader.construct_document(node), lines

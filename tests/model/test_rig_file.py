@@ -180,6 +180,16 @@ def test_yaml_that_is_no_bench_is_refused(bad: str) -> None:
         parse_model(Rig, bad, "x.yaml")
 
 
+@pytest.mark.parametrize("one", ["[{}]", "{{<<: [{}]}}"])
+def test_aliases_of_aliases_are_refused_with_their_line_before_they_are_written_out(
+    one: str,
+) -> None:
+    lines = ["a0: &a0 {x: 1}"]
+    lines += [f"a{k}: &a{k} {one.format(','.join(9 * [f'*a{k - 1}']))}" for k in range(1, 30)]
+    with pytest.raises(InputError, match=r"^x.yaml:6: \d+ values once its aliases"):
+        parse_model(Rig, "\n".join(lines), "x.yaml")
+
+
 def with_tolerances(block: str) -> str:
     return TEXT.replace("wire:", f"tolerances: {block}\nwire:", 1)
 
