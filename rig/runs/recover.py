@@ -14,7 +14,7 @@ from rig.model.trips import RecordingFailed
 from rig.runs import runstate, store
 from rig.runs.journal import Journal
 from rig.runs.recorder import finalise
-from rig.runs.salvage.rebuild import find_damage, rebuild, set_aside
+from rig.runs.salvage.rebuild import CUT_OFF, find_damage, rebuild, set_aside
 from rig.runs.sections import Written
 
 log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ def _from_journal(folder: Path, rig: Rig, stood: str) -> RecoverReport:
 
 
 def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverReport:
-    """Finalise the readable part of a damaged journal and keep the journal."""
+    """Finalise the readable part of a damaged or cut off journal and keep the journal."""
     path = folder / runstate.JOURNAL
     state = _outcome(path) or stood
     journal, rebuilt = rebuild(path, rig, damage)
@@ -121,10 +121,13 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
     kept = set_aside(path)
     seconds = rebuilt.lost / rig.sample_rate
     loss = f"lost: {rebuilt.lost} samples ({seconds:.3f} s)" if rebuilt.lost else "no loss is known"
+    # A full disk cuts the last write off; every block before it is there.
+    early = damage == CUT_OFF and not rebuilt.lost and not rebuilt.nameless
+    ends_early = "ends early: its last write is cut off, as by a full disk"
     message = (
-        f"the journal is damaged: {damage}; read from it: {rebuilt.samples} samples; {loss}; what "
-        f"came after its last readable sample cannot be counted; {_counts(written)}; the damaged "
-        f"journal is kept as {kept.name}"
+        f"the journal {ends_early if early else f'is damaged: {damage}'}; read from it: "
+        f"{rebuilt.samples} samples; {loss}; what came after its last readable sample cannot be "
+        f"counted; {_counts(written)}; the journal is kept as {kept.name}"
     )
     if rebuilt.nameless:
         message += (
@@ -133,7 +136,10 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
         )
     _note(folder, state, message)
     report = _report(folder, state, written, message)
-    return replace(report, damaged_blocks=rebuilt.lost_blocks, damaged=kept, missing=rebuilt.lost)
+    damaged = None if early else kept
+    return replace(
+        report, damaged_blocks=rebuilt.lost_blocks, damaged=damaged, missing=rebuilt.lost
+    )
 
 
 def _outcome(path: Path) -> str | None:

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from rig.cli.main import app
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
 from rig.runs.journal import TAIL_BLOCKS, BlockRow, JournalTail, read_tail, tail_of
@@ -133,6 +135,16 @@ def test_a_torn_end_of_the_log_costs_the_blocks_on_it_and_says_how_many(interrup
     assert report.missing == lost
     assert report.damaged is not None
     assert (report.damaged.parent / f"{report.damaged.name}-tail").exists()
+
+
+def test_a_last_write_cut_off_by_a_full_disk_is_no_damage(interrupted: Path) -> None:
+    log = interrupted / "journal.sqlite-wal"
+    log.write_bytes(log.read_bytes() + bytes(1000))  # a part of a page
+    done = CliRunner().invoke(app, ["recover", str(interrupted)], standalone_mode=False)
+    assert done.exception is None
+    assert "the journal ends early: its last write is cut off" in done.stdout
+    assert "read from it: 450 samples; no loss is known" in done.stdout
+    assert found_as_measured(interrupted) == 0
 
 
 @pytest.mark.parametrize("kept", [0, 3, 500, 5000])

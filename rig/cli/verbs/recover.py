@@ -28,6 +28,5 @@ def recover(
     report = recover_run(run, force=force)
     typer.echo(report.message)
     if report.damaged is not None:
-        raise WorkError(
-            f"{run}: {report.missing} samples are lost; the damaged {report.damaged.name} is kept"
-        )
+        lost = f"{report.missing} samples are lost" if report.missing else "no loss is known"
+        raise WorkError(f"{run}: its journal was damaged: {lost}; {report.damaged.name} is kept")

@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 REBUILT: Final = "journal.rebuilt.sqlite"
 DAMAGED: Final = "journal.damaged"
+CUT_OFF: Final = "the end of its write-ahead log is cut off"
 _WAL_HEADER, _FRAME_HEADER = 32, 24
 _AT_ONCE = 256  # rows per query; if one is unreadable, each is read alone
 _UNREADABLE = (
@@ -75,7 +76,7 @@ def find_damage(path: Path, rig: Rig) -> str | None:
     rows = (_as_block(row.values, rig) for row in block_rows(raw))
     if any(block is not None and (block.stream, block.tick) > newest for block in rows):
         return "its write-ahead log is damaged before its end"
-    return "the end of its write-ahead log is cut off" if _torn(raw) else None
+    return CUT_OFF if _torn(raw) else None
 
 
 def _open(path: Path) -> sqlite3.Connection:
