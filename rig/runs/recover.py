@@ -7,6 +7,7 @@ import sqlite3
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -18,6 +19,7 @@ from rig.runs.salvage.rebuild import CUT_OFF, find_damage, rebuild, set_aside
 from rig.runs.sections import Written
 
 log = logging.getLogger(__name__)
+FINALISED: Final = "was finalised already; there is nothing to recover"
 
 
 @dataclass(frozen=True)
@@ -162,8 +164,9 @@ def _counts(written: Written) -> str:
 
 def _tidy(folder: Path) -> None:
     """Remove the temporary files of a killed process."""
-    for stray in folder.glob("*.tmp*"):
-        stray.unlink(missing_ok=True)
+    with suppress(OSError):  # a disk that cannot be written: what has to be written says so
+        for stray in folder.glob("*.tmp*"):
+            stray.unlink(missing_ok=True)
 
 
 def _without_journal(folder: Path) -> RecoverReport:
@@ -184,7 +187,7 @@ def _without_journal(folder: Path) -> RecoverReport:
 
     written = count(archive)
     _end(folder, state)
-    return _report(folder, state, written, "was finalised already")
+    return _report(folder, state, written, FINALISED)
 
 
 def _end(folder: Path, state: str) -> None:

@@ -122,7 +122,10 @@ def owner_alive(owner: Owner | None) -> bool:
 
 
 def write_state(folder: Path, state: str) -> None:
-    """Replace the state; raises OSError."""
+    """Replace the state; raises OSError. One that stands already is not written again."""
+    with suppress(OSError):
+        if (folder / _STATE).read_bytes() == f"{state}\n".encode():
+            return
     replace_text(folder / _STATE, state + "\n")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import sqlite3
 import tempfile
@@ -19,7 +20,7 @@ from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
 from rig.runs.journal import TAIL_BLOCKS, BlockRow, JournalTail, read_tail, tail_of
 from rig.runs.listing.index import indexed_runs
-from rig.runs.recover import recover
+from rig.runs.recover import FINALISED, recover
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
 from tests.full_disk import largest_file
@@ -51,7 +52,20 @@ def test_killed_while_recording_every_acknowledged_sample_is_recovered(
     else:
         with pytest.raises(InputError, match="before any record was complete"):
             load_run(run)
-    assert recover(run).message == "was finalised already"
+    assert recover(run).message == FINALISED
+
+
+def test_a_finalised_run_on_a_disk_for_reading_only_has_nothing_to_recover(
+    interrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recover(interrupted)
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("rig.runs.runstate.replace_text", refused)
+    monkeypatch.setattr(Path, "unlink", refused)
+    assert recover(interrupted).message == FINALISED
 
 
 @pytest.mark.parametrize("place", every_second(range(10)))

@@ -16,7 +16,7 @@ from rig.bench.session import Bench
 from rig.cli.main import app
 from rig.model.trips import RecordingFailed
 from rig.runs.recorder import Recorder
-from rig.runs.recover import recover
+from rig.runs.recover import FINALISED, recover
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
@@ -128,7 +128,7 @@ def test_whatever_is_damaged_is_said_kept_and_read_as_far_as_it_goes(run: Path, 
         assert f"read from it: {there} samples" in report.message
         assert report.missing <= BLOCKS * 10 - there
     assert not (run / "journal.rebuilt.sqlite").exists()
-    assert recover(run).message == "was finalised already"
+    assert recover(run).message == FINALISED
 
 
 def test_zeroed_pages_cost_the_blocks_on_them_and_no_others(run: Path) -> None:

@@ -35,7 +35,7 @@ from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
-from rig.runs.recover import recover
+from rig.runs.recover import FINALISED, recover
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events, read_state
 from rig.runs.store import is_run
@@ -192,7 +192,7 @@ def _one(folder: Path, rig: Rig, plan: Plan, moment: tuple[str, float], wire: st
             recover(folder)
             if read_state(folder) not in expected:
                 wrong.append(f"state {read_state(folder)}, expected one of {expected}")
-            if recover(folder).message != "was finalised already" and _acknowledged(folder):
+            if recover(folder).message != FINALISED and _acknowledged(folder):
                 wrong.append("recovered twice with two results")
         elif _acknowledged(folder):
             wrong.append("samples were acknowledged and there is no run")
