@@ -283,8 +283,20 @@ class Journal:
         if not kept or len(self._newest) >= TAIL_BLOCKS:
             self.flush()
 
+    def require_folder(self) -> None:
+        """Raise RecordingFailed if the run folder was deleted or moved: SQLite does not notice."""
+        if not self.path.exists():
+            raise RecordingFailed(
+                f"{self.path.parent}: this run folder was deleted or moved during the run, which "
+                f"ends with its outputs at zero; its {self.spans().samples.sum()} samples are lost "
+                "if it was deleted; if it was moved, `bramah recover` it at its new place"
+            )
+
     def flush(self) -> None:
-        """Move the tail's blocks into the database; after RecordingFailed they are in the tail."""
+        """Move the tail's blocks into the database; after RecordingFailed they are in the tail.
+
+        Raises as `require_folder`.
+        """
         with self._failing(), self._db:
             self._db.execute("BEGIN")
             self._db.executemany(
@@ -293,6 +305,7 @@ class Journal:
         self._newest = []
         if self._tail is not None:
             self._tail.clear()
+        self.require_folder()
 
     def begin_mark(self, stream: int, start: int, meta: dict[str, Any]) -> int:
         """Open a mark at a tick; returns its number."""

@@ -240,6 +240,7 @@ class Recorder:
             self.event("end", state=state, message=message, records=written.records)
 
         try:
+            journal.require_folder()
             finalise(journal, self.folder, self.rig.name, state, note)
         except RecordingFailed as error:
             journal.close()

@@ -15,17 +15,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from rig.bench.session import Bench
 from rig.cli.main import app
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
 from rig.runs.journal import TAIL_BLOCKS, BlockRow, JournalTail, read_tail, tail_of
 from rig.runs.listing.index import indexed_runs
+from rig.runs.recorder import Recorder
 from rig.runs.recover import FINALISED, recover
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
 from tests.full_disk import largest_file
 from tests.services.children import RIG, acknowledged, assert_all_there, finish, measured, start
-from tests.services.fake_driver import samples
+from tests.services.fake_driver import FakeDriver, samples
 from tests.variants import every_second
 
 
@@ -299,6 +301,28 @@ def test_a_disk_that_takes_the_journal_but_not_the_archive_keeps_the_journal(
     assert not (run / "records.h5.tmp").exists()
     recover(run)
     assert_all_there(run)
+
+
+def test_a_run_folder_deleted_or_moved_stops_the_run_and_says_what_is_left(tmp_path: Path) -> None:
+    run, moved = tmp_path / "run", tmp_path / "moved"
+    driver = FakeDriver(RIG)
+    said = (
+        r"run: this run folder was deleted or moved .* its \d+ samples are lost if it was deleted"
+    )
+
+    def move_it_during_the_run() -> None:
+        with Bench(RIG, driver, Recorder(run, RIG), signals=False) as bench:
+            bench.run_for(1.0)
+            run.rename(moved)
+            bench.run_for(10.0)
+
+    with pytest.raises(RecordingFailed, match=said):
+        move_it_during_the_run()
+    assert driver.calls[-3:] == ["zero", "stop", "close"]
+    assert not run.exists()
+    (moved / "owner.json").unlink()  # as if this process had ended
+    recover(moved)
+    assert len(measured(moved)) > 1000
 
 
 def test_ctrl_c_twice_still_zeroes_and_finishes_the_run(tmp_path: Path) -> None:
