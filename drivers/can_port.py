@@ -61,8 +61,8 @@ class BusPlace:
         if interface == SOCKETCAND:
             address, _, channel = channel.partition("/")
             host, _, port = address.rpartition(":")
-            if not host or not port.isdigit() or not channel:
-                raise ValueError("expected socketcand/HOST:PORT/CHANNEL")
+            if not (host and channel and port.isdigit() and 1 <= int(port) <= 65535):
+                raise ValueError("expected socketcand/HOST:PORT/CHANNEL, the port 1 to 65535")
             return cls(text, interface, channel, host.strip("[]"), int(port))
         if interface == SLCAN and "/" in channel:
             channel = f"/{channel.lstrip('/')}"  # a device file; COM3 has no slash

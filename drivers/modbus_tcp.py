@@ -57,7 +57,7 @@ class TcpSettings(WireSettings):
     example: ClassVar = "modbus-tcp://127.0.0.1:5020"
 
     host: str = LOCALHOST
-    port: int = Field(default=PORT, ge=0, le=65535)
+    port: int = Field(default=PORT, ge=1, le=65535)
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:

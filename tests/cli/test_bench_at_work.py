@@ -265,13 +265,20 @@ def test_bad_input_is_one_line_that_names_it(
 
 def test_a_wire_that_no_driver_serves_is_named_with_its_rig(tmp_path: Path) -> None:
     text, _ = rig_text(RIG)
-    for right, wrong in (("kind: modbus-tcp", "kind: modbus-tpc"), ("port: 5020", "port: 502000")):
+    for right, wrong in (
+        ("kind: modbus-tcp", "kind: modbus-tpc"),
+        ("port: 5020", "port: 502000"),
+        ("port: 5020", "port: 0"),
+    ):
         path = tmp_path / "bench.yaml"
         path.write_text(text.replace(right, wrong))
         done = bramah_here("probe", "--rig", path)
         assert done.returncode == 2
         assert f"rig '{RIG}': wire: {wrong.split(':')[0]}: " in done.stderr
         assert wrong.split()[1] in done.stderr
+        checked = bramah_here("check", "validate", "--rig", path)
+        assert checked.returncode == 2
+        assert f"bench.yaml:52: wire: {wrong.split(':')[0]}: " in checked.stderr
 
 
 def test_nobody_at_the_other_end_is_exit_code_4(tmp_path: Path) -> None:

@@ -240,6 +240,7 @@ def test_a_bench_with_a_file_of_its_own(tmp_path: Path) -> None:
         ({"bus": "canbus/can0"}, "no interface 'canbus'; expected INTERFACE/CHANNEL"),
         ({"bus": "socketcan"}, "the channel is missing"),
         ({"bus": "socketcand/localhost/can0"}, "socketcand/HOST:PORT/CHANNEL"),
+        ({"bus": "socketcand/localhost:70000/can0"}, "the port 1 to 65535"),
         ({"bus": "socketcand/h:1/can0", "data_bitrate": 2_000_000}, "data_bitrate: socketcand"),
         ({"bus": "slcan/dev/ttyACM0", "data_bitrate": 3_000_000}, "data_bitrate: slcan has"),
         ({"bus": "socketcan/can0", "dbc": "absent.dbc"}, "dbc: absent.dbc: No such file"),

@@ -29,6 +29,22 @@ def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
     return described, make_driver(described.wire, described)
 
 
+def require_wire(name: str, rig: Rig) -> None:
+    """Raise InputError with file and line for a wire without driver, or with wrong settings."""
+    from drivers.registry import driver_class
+    from rig.model.parse import InputError, load_yaml
+    from rig.runs.rigs import rig_text
+
+    try:
+        driver = driver_class(rig.wire.kind)
+        if rig.wire.settings:  # without any, --endpoint states them
+            driver.settings.of(rig.wire)
+    except InputError as error:
+        text, source = rig_text(name)
+        line = load_yaml(text, source)[1].get(("wire",), 1)
+        raise InputError(f"{source}:{line}: {error}") from error
+
+
 def print_pressure(places: list[str], *, aside: bool = False) -> None:
     """Print the places still under pressure, if any; `aside`: to standard error."""
     if places:

@@ -42,6 +42,7 @@ def check(
     """
     from protocols.files import library
     from protocols.files.plan import resolve
+    from rig.cli.execution.device import require_wire
     from rig.cli.proof.proofs import proved
     from rig.cli.proof.twin_choice import twin_source
     from rig.cli.text.sheets import check_text
@@ -49,6 +50,7 @@ def check(
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
     bench = load_bench(rig)
+    require_wire(rig, bench)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
     source = twin_source(bench, model, nominal)
     proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)
