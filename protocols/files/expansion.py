@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from protocols.steps import STEPS, kind_of_step
@@ -25,11 +25,19 @@ Lines = Mapping[Path, int]
 
 @dataclass(frozen=True)
 class RawStep:
-    """A step as plain data, the line of each of its keys, and whether another file defines it."""
+    """A step as plain data, and the line of each of its keys.
+
+    `places` are file and line of the steps in it that another file defines: of itself at `()`.
+    """
 
     data: Any
     lines: Lines
-    included: bool = False
+    places: Mapping[Path, str] = field(default_factory=dict)
+
+    @property
+    def included(self) -> bool:
+        """Whether another file defines it."""
+        return () in self.places
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,8 @@ class Scope:
         return Scope({**self.values, **values}, {**self.swept, **more})
 
 
-Include = Callable[[str, Mapping[str, Any], int], Sequence[Any]]
+# Returns each step as plain data, with `RawStep.places`.
+Include = Callable[[str, Mapping[str, Any], int], Sequence[tuple[Any, Mapping[Path, str]]]]
 
 
 @dataclass(frozen=True)
@@ -114,15 +123,17 @@ class Expander:
         nested = isinstance(item, dict) and kind is not None and STEPS[kind].nests
         own = {k: v for k, v in item.items() if k != "steps"} if nested else item
         data = self.substituted(own, where, scope)
+        places: dict[Path, str] = {}
         if nested and "steps" in item:
             inner = self.steps(item["steps"], (*where, "steps"), scope)
             data["steps"] = [part.data for part in inner]
             lines = {p: n for p, n in lines.items() if p[:1] != ("steps",) or len(p) == 1}
             for number, part in enumerate(inner):
                 lines |= {("steps", number, *p): n for p, n in part.lines.items()}
+                places |= {("steps", number, *p): at for p, at in part.places.items()}
         if kind == "excite" and scope.swept:
             data = {**data, "parameters": dict(scope.swept)}
-        return RawStep(data, lines)
+        return RawStep(data, lines, places)
 
     def _sweep(self, item: Any, where: Path, scope: Scope) -> list[RawStep]:
         self._keys(item, "sweep", where)
@@ -179,7 +190,7 @@ class Expander:
         except InputError as error:
             self.problems.append((line, str(error)))
             return []
-        return [RawStep(step, {(): line}, included=True) for step in steps]
+        return [RawStep(step, {(): line}, places) for step, places in steps]
 
     def _values(self, item: Any, key: str, where: Path, scope: Scope) -> Mapping[str, Any]:
         self._keys(item, key, where)
@@ -233,7 +244,7 @@ def unknown_parameter(name: str, known: Mapping[str, Any]) -> str:
 
 def _numbered(step: RawStep, number: int) -> RawStep:
     """Return a step with a number appended to its name and those nested in it."""
-    return RawStep(_renamed(step.data, f"_{number}"), step.lines, step.included)
+    return replace(step, data=_renamed(step.data, f"_{number}"))
 
 
 def _renamed(data: Any, ending: str) -> Any:
@@ -262,5 +273,5 @@ def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
                 ending = f"_{number}"
             data = _renamed(data, ending) if ending else data
             taken.add(data["name"])
-        unique.append(RawStep(data, step.lines, step.included))
+        unique.append(replace(step, data=data))
     return unique

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -122,19 +122,32 @@ def _protocol(
             lines |= {("steps", number, *path): line for path, line in step.lines.items()}
     context = {"folder": folder, INCOMPLETE: bool(known)}
     made = validate_model(Protocol, data, lines, source, context, known)
-    _locate(made.steps, source, lines, ("steps",), 1)
+    places = {("steps", k, *p): at for k, step in enumerate(steps) for p, at in step.places.items()}
+    _locate(made.steps, source, lines, places, ("steps",), 1)
     return made, [step.data for step in steps]
 
 
 def _locate(
-    steps: Sequence[StepKind], source: str, lines: Lines, path: Keys, line: int
-) -> None:  # fmt: skip
-    """Set file and line of steps, nested ones too; of an included one those of its `include`."""
+    steps: Sequence[StepKind],
+    source: str,
+    lines: Lines,
+    places: Mapping[Keys, str],
+    path: Keys,
+    line: int,
+) -> None:
+    """Set file and line of steps, nested ones too; `places` are those of included ones."""
     for number, step in enumerate(steps):
         here = (*path, number)
         own = lines.get(here, line)
-        step.locate(f"{source}:{own}")
-        _locate(getattr(step, "steps", ()), source, lines, (*here, "steps"), own)
+        step.locate(places.get(here, f"{source}:{own}"))
+        _locate(getattr(step, "steps", ()), source, lines, places, (*here, "steps"), own)
+
+
+def _places(step: StepKind, path: Keys = ()) -> Iterator[tuple[Keys, str]]:
+    """Yield file and line of a step at `path`, and of those nested in it."""
+    yield path, step.where
+    for number, inner in enumerate(getattr(step, "steps", ())):
+        yield from _places(inner, (*path, "steps", number))
 
 
 class _Includes:
@@ -143,8 +156,10 @@ class _Includes:
     def __init__(self, folder: Path | None, chain: tuple[str, ...], source: str) -> None:
         self._folder, self._chain, self._source = folder, chain, source
 
-    def __call__(self, name: str, values: Mapping[str, Any], line: int) -> Sequence[Any]:
-        """Return the raw steps of a protocol; InputError for a cycle, or what is wrong in it."""
+    def __call__(
+        self, name: str, values: Mapping[str, Any], line: int
+    ) -> Sequence[tuple[Any, Mapping[Keys, str]]]:
+        """Return the raw steps of a protocol with places; InputError for a cycle, or its errors."""
         try:
             text, shown, folder = _text(name, self._folder)
         except InputError as error:
@@ -153,8 +168,9 @@ class _Includes:
         if same:
             circle = " -> ".join((*self._chain[self._chain.index(same[0]) :], shown))
             raise InputError(f"{self._source}:{line}: include: a circle: {circle}")
-        _, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
-        return steps
+        made, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
+        places = (dict(_places(step)) for step in made.steps)
+        return list(zip(steps, places, strict=True))
 
 
 def _same_file(path: str, other: str) -> bool:

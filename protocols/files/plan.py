@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from protocols.files.schema import Protocol
+from protocols.files.schema import Protocol, every_step
 from protocols.language.conditions import Condition, parse_condition, require_known
 from protocols.language.waveforms import LONGEST_PERIOD, Waveform, highest_line
 from protocols.steps.base import PlannedStep, StepKind
@@ -267,8 +267,8 @@ class _RigPlanner:
 
 def _located(problem: str, step: StepKind) -> str:
     """Return a problem with its step's file and line, unless a nested step's are before it."""
-    source = step.where.rpartition(":")[0]
-    named = not source or problem.startswith(f"{source}:")
+    named = any(problem.startswith(f"{part.where}: ") for part in every_step([step]))
+    named = named or not step.where
     return problem if named else f"{step.where}: {problem}"
 
 

@@ -150,6 +150,27 @@ def test_what_is_wrong_in_an_included_file_names_that_file(tmp_path: Path) -> No
         load(tmp_path / "outer.yaml")
 
 
+def test_an_included_step_that_does_not_fit_a_rig_is_named_with_its_own_file_and_line(
+    tmp_path: Path, rig: Rig
+) -> None:
+    inner = tmp_path / "inner.yaml"
+    body = HEAD + "steps:\n  - mark: begin\n" + SINE.replace("$amplitude", "9 V")
+    inner.write_text(body, encoding="utf-8")
+    last = tmp_path / "last.yaml"
+    last.write_text(body.replace("sine\n", "last\n"), encoding="utf-8")
+    outer = tmp_path / "outer.yaml"
+    outer.write_text(
+        HEAD + "steps:\n  - mark: a\n  - mark: b\n  - include: inner.yaml\n  - repeat_until: "
+        "oil_temperature > 40 degC\n    at_most: 2\n    steps: [{include: last.yaml}]\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(InputError) as caught:
+        resolve(load(outer), rig)
+    first, second = str(caught.value).splitlines()
+    assert first.startswith(f"{inner}:5: step 'sine', joint 2: ")
+    assert second.startswith(f"{last}:5: step 'last', joint 2: ")
+
+
 def test_all_mistakes_of_a_file_are_listed_at_once(tmp_path: Path) -> None:
     """In steps, sweeps, `set`, templates and an included file: each with its file and line."""
     (tmp_path / "inner.yaml").write_text(
