@@ -352,6 +352,10 @@ async def test_after_the_run_its_last_picture_stays_and_the_next_run_is_joined()
         assert "RUN ENDED, done: below is its last picture" in shown.text
         assert "joint 1 ▣ locked · last picture" in shown.text
         assert "NO DATA" not in shown.text
+        assert "%  ended" in shown.lines[1]
+        await shown.press("6")
+        assert "left" not in shown.text
+        await shown.press("1")
         machine.runs[endpoint(pid=4712)] = running(1.0, Bench(pid=4712, run="runs/second"))
         await shown.watch(2.0)
         assert "second" in shown.lines[0]

@@ -109,12 +109,12 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
         holder = f"read-only: {snapshot.holder} is in command; t takes the controls"
     else:
         holder = "nobody is in command; t takes the controls"
-    left = max(snapshot.total_s - snapshot.done_s, 0.0)
+    left = f"{clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))} left"
     head = [
         row((" command ", DIM), (holder, STRONG if view.in_command else "")),
         row((" engine  ", DIM), (snapshot.engine or snapshot.state, STRONG),
             (f"   {clock_text(snapshot.done_s)} of {clock_text(snapshot.total_s)}", ""),
-            (f"   {clock_text(left)} left", STRONG)),
+            ("   ended" if view.newest.over else f"   {left}", STRONG)),
     ]  # fmt: skip
     if snapshot.prompt and not view.newest.over:
         answers = " / ".join(snapshot.answers)

@@ -126,8 +126,9 @@ def _where(view: PlotView, width: int) -> Row:
     share = min(max(snapshot.done_s / snapshot.total_s, 0.0), 1.0)
     room = max(min(width - 70, 40), 0)
     full = round(share * room)
-    left = clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))
-    progress = row(("━" * full, ""), ("─" * (room - full), DIM), f" {share:.0%}  left {left}", lost)
+    left = f"left {clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))}"
+    left = "ended" if view.newest.over else left
+    progress = row(("━" * full, ""), ("─" * (room - full), DIM), f" {share:.0%}  {left}", lost)
     return ends(line, (*progress, (" ", "")), width)
 
 
