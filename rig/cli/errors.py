@@ -6,9 +6,11 @@ import logging
 import os
 import select
 import signal
+import stat
 import sys
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 
 import typer
 from typer.exceptions import TyperException
@@ -57,8 +59,21 @@ def _say(message: str) -> None:
 
 
 def _os_error(error: OSError) -> str:
-    name = f" ({error.filename})" if error.filename else ""
-    return f"{error.strerror or error}{name}"
+    name = error.filename or _unwritable_output()
+    return f"{error.strerror or error}{f' ({name})' if name else ''}"
+
+
+def _unwritable_output() -> str:
+    """Return the name of standard output if it is a full file or device, '' if it is not."""
+    full = False
+    try:
+        kept = stat.S_ISREG(os.fstat(_STDOUT).st_mode)
+        full = kept and not os.fstatvfs(_STDOUT).f_bavail
+        os.write(_STDOUT, b"")  # /dev/full refuses even this
+    except OSError:
+        full = True
+    name = Path(f"/proc/self/fd/{_STDOUT}")
+    return f"standard output: {name.resolve() if name.exists() else 'closed'}" if full else ""
 
 
 def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., str]], ...]:

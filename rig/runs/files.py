@@ -83,8 +83,11 @@ def write_text(path: Path, text: str) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Replace a file atomically: a reader sees the old or the new text; raises OSError."""
-    replace_bytes(path, text.encode("utf-8"))
+    """Replace a file atomically: a reader sees the old or the new text; raises OSError.
+
+    A byte of a file's name that is not UTF-8 is written as the terminal shows it, like \\udcff.
+    """
+    replace_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def replace_bytes(path: Path, content: bytes) -> None:

@@ -125,6 +125,26 @@ def test_a_disk_that_is_full_at_the_end_leaves_the_result_on_the_screen(lab: Pat
     assert "condition number" in done.stdout
 
 
+def test_a_full_device_behind_standard_output_is_named(lab: Path) -> None:
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        done = subprocess.run(
+            words("schema"), cwd=lab, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr == "bramah: No space left on device (standard output: /dev/full)\n"
+
+
+def test_a_file_name_that_is_not_utf_8_is_a_name(lab: Path) -> None:
+    new = os.fsdecode(b"new/\xff")
+    line = words("identify", RUN, "--report", f"{new}.html", "--model", f"{new}.json")
+    subprocess.run(line, cwd=lab, check=True, capture_output=True)
+    assert rb"\udcff.html" in (lab / f"{new}.html").read_bytes()  # the command, as shown
+    for kind in ("parquet", "fmu"):
+        out = ("--model", f"{new}.json", "--out", f"{new}.{kind}")
+        done = bramah_here("export", RUN, "--format", kind, *out, cwd=lab)
+        assert done.returncode == 0, done.stderr
+
+
 def test_output_piped_into_head_is_no_error(lab: Path) -> None:
     reader, writer = os.pipe()
     os.close(reader)

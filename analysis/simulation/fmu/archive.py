@@ -111,9 +111,8 @@ def _content(
     sources = _sources(version) | {"model.h": model_header(model, variables, token)}
     describe = description_2 if version == 2 else description_3
     step = 1.0 / model.rig.sample_rate
-    content: dict[str, bytes] = {
-        "modelDescription.xml": describe(identifier, about, token, step, variables).encode()
-    }
+    text = describe(identifier, about, token, step, variables)  # may name a file not in UTF-8
+    content = {"modelDescription.xml": text.encode("utf-8", "backslashreplace")}
     content |= {f"sources/{file}": text.encode() for file, text in sources.items()}
     if version == 3:
         content["sources/buildDescription.xml"] = build_description(identifier).encode()

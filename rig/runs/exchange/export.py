@@ -127,7 +127,8 @@ def _write_parquet(path: Path, sheet: Sheet) -> None:
     fields = [pa.field(n, pa.float64(), metadata={"unit": sheet.units[n]}) for n in sheet.columns]
     about = {name: json.dumps(value) for name, value in sheet.about.items()}
     table = pa.table(list(sheet.columns.values()), schema=pa.schema(fields, metadata=about))
-    parquet.write_table(table, path)
+    with path.open("wb") as file:  # it opens names in UTF-8 only
+        parquet.write_table(table, file)
 
 
 def _write_mf4(path: Path, sheet: Sheet) -> None:
