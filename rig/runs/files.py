@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
+import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rig.model.parse import InputError
 
 MAX_TEXT = 1 << 20  # [bytes], far above any real text file
 CACHE_VARIABLE = "BRAMAH_CACHE"
+_SCRATCH = "bramah-scratch-"
+_UNLOCKED_SECONDS = 5.0  # a new scratch folder is locked long before
 
 
 def cache_folder() -> Path:
@@ -105,6 +110,34 @@ def replace_bytes(path: Path, content: bytes) -> None:
     finally:
         fresh.unlink(missing_ok=True)
     sync_to_disk(path.parent)
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Yield a temporary folder; removes first those that killed processes of this user left."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*"):
+        with suppress(OSError):
+            _remove_abandoned(folder)
+    with tempfile.TemporaryDirectory(prefix=_SCRATCH) as name:
+        handle = os.open(name, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)  # held until this process ends, however it ends
+            yield Path(name)
+        finally:
+            os.close(handle)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove a scratch folder of this user; raises OSError if its process holds it."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        found = os.fstat(handle)
+        # A younger one may not be locked yet.
+        if found.st_uid == os.getuid() and time.time() - found.st_mtime > _UNLOCKED_SECONDS:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder)
+    finally:
+        os.close(handle)
 
 
 @contextmanager

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
 import signal
 import sqlite3
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -19,6 +22,7 @@ from rig.bench.session import Bench
 from rig.cli.main import app
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
+from rig.runs.files import scratch_folder
 from rig.runs.journal import TAIL_BLOCKS, BlockRow, JournalTail, read_tail, tail_of
 from rig.runs.listing.index import indexed_runs
 from rig.runs.recorder import Recorder
@@ -323,6 +327,28 @@ def test_a_run_folder_deleted_or_moved_stops_the_run_and_says_what_is_left(tmp_p
     (moved / "owner.json").unlink()  # as if this process had ended
     recover(moved)
     assert len(measured(moved)) > 1000
+
+
+def test_a_killed_process_leaves_its_temporary_folder_to_the_next_one_to_remove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = (
+        "import time; from rig.runs.files import scratch_folder; hold = scratch_folder(); "
+        "print(hold.__enter__(), flush=True); time.sleep(600)"
+    )
+    variables = {**os.environ, "TMPDIR": str(tmp_path)}
+    line = [sys.executable, "-c", code]
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with subprocess.Popen(line, env=variables, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        left = Path(child.stdout.readline().strip())
+        os.utime(left, (0, 0))
+        with scratch_folder() as own:
+            assert sorted(tmp_path.iterdir()) == sorted((left, own))
+        child.kill()
+    with scratch_folder() as own:
+        assert list(tmp_path.iterdir()) == [own]
+    assert not list(tmp_path.iterdir())
 
 
 def test_ctrl_c_twice_still_zeroes_and_finishes_the_run(tmp_path: Path) -> None:

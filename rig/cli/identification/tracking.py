@@ -12,9 +12,9 @@ import logging
 import math
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -34,6 +34,7 @@ from rig.model.parse import InputError
 from rig.model.records import RecordHead
 from rig.model.rig import Rig
 from rig.model.units import with_interval
+from rig.runs.files import scratch_folder
 from rig.runs.recorder import RecordMeta
 from rig.runs.runstate import EventLog
 
@@ -99,8 +100,8 @@ class Tracking:
         self._shows.append(show)
 
     def __enter__(self) -> Self:
-        self._folder = tempfile.TemporaryDirectory(prefix="bramah-")  # accessible to this user only
-        endpoint = f"ipc://{self._folder.name}/track"
+        self._folder = ExitStack()  # the folder is accessible to this user only
+        endpoint = f"ipc://{self._folder.enter_context(scratch_folder())}/track"
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
         self._socket.set(zmq.SNDHWM, WAITING)
@@ -130,7 +131,7 @@ class Tracking:
                 self._process.kill()
                 self._process.join()
             self._process.close()
-            self._folder.cleanup()
+            self._folder.close()
 
     @property
     def alive(self) -> bool:

@@ -8,10 +8,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from rig.bench.latch import STATE_VARIABLE
 from rig.cli.errors import WorkError
+from rig.runs.files import scratch_folder
 
 _START = "from rig.cli.main import run; run()"
 _END_SECONDS = 10.0
@@ -24,8 +24,8 @@ def _state_of_its_own() -> Iterator[None]:
     A trip latched by an earlier simulated bench on the same port must not block a new one.
     """
     before = os.environ.get(STATE_VARIABLE)
-    with TemporaryDirectory(prefix="bramah-") as folder:
-        os.environ[STATE_VARIABLE] = folder
+    with scratch_folder() as folder:
+        os.environ[STATE_VARIABLE] = str(folder)
         try:
             yield
         finally:
