@@ -58,6 +58,15 @@ def writable_file(
     return path
 
 
+def one_line(param: typer.CallbackParam, text: str | None) -> str | None:
+    """Return a name; raises InputError for one with a line break."""
+    from rig.queue.items import require_one_line
+
+    if text is not None:
+        require_one_line(text, param.opts[0])
+    return text
+
+
 RigOption = Annotated[
     str,
     typer.Option(

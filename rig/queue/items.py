@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import operator
 import re
+import unicodedata
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -148,6 +149,15 @@ def parse_time(text: str, now: datetime, option: str) -> datetime:
         naive = datetime.combine(datetime.fromordinal(day).date(), clock)
         wanted = naive.astimezone()
     return wanted.astimezone(UTC)
+
+
+def require_one_line(text: str, option: str) -> None:
+    """Raise InputError for a name with a line break or another control character."""
+    if any(unicodedata.category(letter) in ("Cc", "Zl", "Zp") for letter in text):
+        raise InputError(
+            f"{option} {text!r}: found a line break or another control character; expected a name "
+            "of one line"
+        )
 
 
 @dataclass(frozen=True)

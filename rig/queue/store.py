@@ -21,6 +21,7 @@ from rig.queue.items import (
     RUNNING,
     Item,
     QueueJob,
+    require_one_line,
 )
 from rig.runs.runstate import utc_now
 
@@ -176,7 +177,8 @@ class QueueStore:
     # Changes by the user
 
     def add(self, job: QueueJob, priority: int, proof: dict[str, Any]) -> Item:
-        """Add an item as the last of its priority."""
+        """Add an item as the last of its priority; raises InputError for a name of two lines."""
+        require_one_line(job.name, "--name")
         with self._transaction():
             if job.after is not None:
                 self.item(job.after)

@@ -77,3 +77,16 @@ def test_an_item_that_could_never_start_is_refused_when_it_is_queued(
     assert done.returncode == 2
     assert f"--not-after {times[-1]}: is 0" in done.stderr
     assert "cannot start before" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [("queue", "add", "--name"), ("queue", "add", "--operator"), ("run", "--operator")]
+)
+def test_a_name_of_two_lines_is_refused(words: tuple[str, ...], tmp_path: Path) -> None:
+    *verb, option = words
+    out = tmp_path / "out"
+    given = ("validate", "--rig", RIG, "--out", out, option, "night\n2")
+    done = bramah_here(*verb, *given, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"{option} 'night\\n2': found a line break or another control character" in done.stderr
+    assert not out.exists()

@@ -47,6 +47,12 @@ def test_a_night_ends_with_each_item_in_a_named_state_and_a_reason(night: Night)
     assert night.run().ended == ()
 
 
+def test_a_name_of_two_lines_is_not_queued(night: Night) -> None:
+    with pytest.raises(InputError, match="expected a name of one line"):
+        night.add("done\nagain")
+    assert night.states() == []
+
+
 def test_the_reason_of_a_verb_is_all_that_it_said_last() -> None:
     log = "bramah: an earlier word\nprogress\nbramah: sheet.yaml:3: a\nbramah: sheet.yaml:9: b\n"
     assert reason_in(log + "the last line of another\n") == "sheet.yaml:3: a; sheet.yaml:9: b"

@@ -22,6 +22,7 @@ from rig.cli.options import (
     ScaleOption,
     StepOption,
     WaveSeedOption,
+    one_line,
     writable_file,
 )
 from rig.cli.text.output import progress, table, write_json
@@ -122,8 +123,12 @@ def add(
         str | None,
         typer.Option(help="Wait for a measured condition, such as 'oil_temperature > 40 degC'."),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the item in lists.")] = None,
-    operator: Annotated[str | None, typer.Option(help="Name written into the run.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the item in lists.", callback=one_line)
+    ] = None,
+    operator: Annotated[
+        str | None, typer.Option(help="Name written into the run.", callback=one_line)
+    ] = None,
     model: ModelOption = None,
     nominal: NominalOption = False,
     identify: Annotated[bool, typer.Option(help="Identify from the run when it is done.")] = True,

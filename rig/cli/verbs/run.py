@@ -19,6 +19,7 @@ from rig.cli.options import (
     SetOption,
     StepOption,
     WaveSeedOption,
+    one_line,
     overridden,
 )
 from rig.cli.text.output import progress
@@ -44,7 +45,8 @@ def run(
     step: StepOption = None,
     set_: SetOption = None,
     operator: Annotated[
-        str | None, typer.Option(help="Name written into the run.  [default: the user]")
+        str | None,
+        typer.Option(help="Name written into the run.  [default: the user]", callback=one_line),
     ] = None,
     model: ModelOption = None,
     nominal: NominalOption = False,
