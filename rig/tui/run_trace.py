@@ -106,6 +106,12 @@ class StoredTrace(_Stored):
     next_experiment: StoredNext | None = None
     notes: tuple[str, ...] = ()
 
+    @property
+    def changed(self) -> bool:
+        """Whether the model after differs: a clean bench keeps the model that it had."""
+        pairs = ((self.error.before, self.error.after), (self.fit.before, self.fit.after))
+        return any(before != after for before, after in pairs)
+
 
 @dataclass(frozen=True)
 class RunTrace:

@@ -168,6 +168,21 @@ def test_an_effect_of_a_sensor_is_shown_with_it() -> None:
     assert StoredEffect(name="sensor_lag", where="joint 1 cap").location == "joint 1, cap"
 
 
+def test_a_model_that_a_trace_left_as_it_was_has_one_column(tmp_path: Path) -> None:
+    data = trace_json() | {"verdict": "clean", "effects": []}
+    data["error"]["after"] = data["error"]["before"]
+    data["fit"]["after"] = data["fit"]["before"]
+    folder = run_folder(tmp_path / "run")
+    (folder / "trace.json").write_text(json.dumps(data))
+    browsed = BrowserState(trace=read_trace(folder))
+    rows = run_trace_page(PlotView(Frame(), Frame(), 0.0, browsed=browsed), 120, 40)
+    text = "\n".join("".join(part[0] for part in line) for line in rows)
+    assert "before" not in text
+    assert "after" not in text
+    assert "1.1×" in text
+    assert "→" not in text
+
+
 def test_a_trace_without_curves_and_with_gaps_is_drawn(tmp_path: Path) -> None:
 
     data = trace_json()

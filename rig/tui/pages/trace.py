@@ -95,13 +95,18 @@ def estimate_text(estimate: StoredEstimate) -> str:
 
 
 def _errors(stored: StoredTrace) -> list[Row]:
-    """Return the held-out errors: noise floor, before, after, and both over the floor."""
-    words = ("held-out rms", "floor", "before", "after", "unit", "over floor")
+    """Return the held-out errors: noise floor, before, after, and both over the floor.
+
+    A model that did not change has one error.
+    """
+    models = ("before", "after") if stored.changed else ("rms",)
+    words = ("held-out rms", "floor", *models, "unit", "over floor")
     cells: list[list[str | Part]] = [[(f" {word}", DIM) for word in words]]
     for name, before in stored.error.before.items():
         floor, after = stored.error.noise_floor.get(name), stored.error.after.get(name)
-        over = f" {_over(before, floor)} → {_over(after, floor)}"
-        numbers = [f" {_number(value)}" for value in (floor, before, after)]
+        errors = (before, after)[: len(models)]
+        over = f" {' → '.join(_over(error, floor) for error in errors)}"
+        numbers = [f" {_number(value)}" for value in (floor, *errors)]
         cells.append([f" {name}", *numbers, f" {UNITS.get(name.split('_')[0], 'SI')}", over])
     return columns(cells)
 
@@ -109,12 +114,11 @@ def _errors(stored: StoredTrace) -> list[Row]:
 def _fits(stored: StoredTrace) -> list[Row]:
     if not stored.fit.before:
         return []
-    cells: list[list[str | Part]] = [
-        [(f" {word}", DIM) for word in ("held-out free run", "FIT before", "after")]
-    ]
+    models = ("FIT before", "after") if stored.changed else ("FIT",)
+    cells: list[list[str | Part]] = [[(f" {word}", DIM) for word in ("held-out free run", *models)]]
     for name, before in stored.fit.before.items():
-        after = stored.fit.after.get(name)
-        cells.append([f" {name}", f" {_percent(before)}", f" {_percent(after)}"])
+        fits = (before, stored.fit.after.get(name))[: len(models)]
+        cells.append([f" {name}", *(f" {_percent(share)}" for share in fits)])
     return [row(), *columns(cells)]
 
 
@@ -133,9 +137,10 @@ def free_run_rows(stored: StoredTrace, chosen: int, width: int, height: int) -> 
     largest = float(np.nanmax(np.abs(np.concatenate((before, after, [0.0])))))
     ends = (-largest, largest) if largest > 0.0 else (None, None)
     head = row((f" {name}", STRONG), (f"  free run minus measured, {run.record} [{how.unit}]", DIM))
-    each = max((height - 3) // 2 - 1, 1)
+    errors = (("before", before), ("after", after)) if stored.changed else (("error", before),)
+    each = max((height - 3) // len(errors) - 1, 1)
     rows: list[Row] = [fit(head, width)]
-    for word, error in (("before", before), ("after", after)):
+    for word, error in errors:
         kept = error[np.isfinite(error)]
         rms = float(np.sqrt(np.mean(kept**2))) if len(kept) else math.nan
         title = row((f" {word}", STRONG), (f"  rms {plain(how.factor * rms, 3)} {how.unit}", DIM))
