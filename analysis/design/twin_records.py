@@ -32,7 +32,8 @@ class TwinStep:
     valve, to its piston position [m]; `centres` and `biases` [V] belong to the excited joints;
     `samples` are those of one record. A closed joint may yield by `yields` [m]; an excited one is
     centred to within `offsets` [m], by a loop of `loops` [V/m] before the records; `strokes` are
-    the piston positions [m] it starts from, if not its centres.
+    the piston positions [m] it starts from, if not its centres. `where` is its file and line as
+    `FILE:LINE`, for refusals; empty for a step of no file.
     """
 
     name: str
@@ -48,6 +49,12 @@ class TwinStep:
     yields: Mapping[int, float] = field(default_factory=dict)
     offsets: Mapping[int, float] = field(default_factory=dict)
     loops: Mapping[int, float] = field(default_factory=dict)
+    where: str = ""
+
+    @property
+    def located(self) -> str:
+        """Its name, after its file and line where they are known."""
+        return f"{f'{self.where}: ' if self.where else ''}step {self.name!r}"
 
     @property
     def period(self) -> int:
@@ -102,7 +109,7 @@ def play(rig: Rig, step: TwinStep) -> Played:
             motion["command"] = commands[lead:]
             return Played(step, _record(rig, step, motion), motion, gains)
     raise InputError(
-        f"step {step.name!r}: on the twin the state ceases to exist (end of the linkage, vacuum); "
+        f"{step.located}: on the twin the state ceases to exist (end of the linkage, vacuum); "
         "lower the amplitude"
     )
 
@@ -146,7 +153,11 @@ def _trimmed(
         )
         _, drift, gain = np.linalg.lstsq(basis, s, rcond=None)[0]
         if not gain > 0:
-            raise InputError(f"step {step.name!r}: the twin of joint {joint + 1} does not follow")
+            raise InputError(
+                f"{step.located}: the twin of joint {joint + 1} does not follow its command "
+                f"({gain:.3g} m/s per volt, expected more than 0); lower the amplitude, or correct "
+                "the nominal parameters of the rig"
+            )
         gains[joint] = float(gain)
         off = float(s.mean()) - step.centres.get(joint, 0.0)
         calm = abs(drift) * step.samples / rate < DESIGN.drift and abs(off) < 4 * DESIGN.drift

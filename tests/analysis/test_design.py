@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,11 @@ from analysis.design.moves import tone_of
 from analysis.design.optimise import Design, improve
 from analysis.design.predict import predict
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import play
+from analysis.design.twin_records import Array, play
+from analysis.simulation.twin import simulate_commands
+from protocols.files.library import load
+from protocols.files.plan import resolve
+from rig.cli.proof.planned import planned_steps
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.analysis.designed_steps import LINES, steps
@@ -96,3 +102,19 @@ def test_what_cannot_be_designed_is_said(rig: Rig) -> None:
                           "lines": (2,)}) for s in sine]  # fmt: skip
     with pytest.raises(InputError, match="no step has a multisine"):
         improve(rig, one, {}, "b", 5, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(40.0, "on the twin the state ceases"), (-1.0, "the twin of joint 2 does")]
+)
+def test_a_step_that_the_twin_cannot_follow_is_named_with_its_file_and_line(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, factor: float, said: str
+) -> None:
+    step = planned_steps(resolve(load("lock-and-excite"), rig))[0]
+
+    def moved(rig: Rig, commands: Array, *rest: Any) -> dict[str, Array]:
+        return simulate_commands(rig, factor * commands, *rest)
+
+    monkeypatch.setattr("analysis.design.twin_records.simulate_commands", moved)
+    with pytest.raises(InputError, match=rf"^lock-and-excite\.yaml:8: step 'step1': {said}"):
+        play(rig, step)

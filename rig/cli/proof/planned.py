@@ -39,6 +39,7 @@ def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
         repeats=step.repeats,
         yields={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
         offsets={e.joint: e.settings.centring.offset for e in step.excite},
+        where=step.where,
     )
 
 
