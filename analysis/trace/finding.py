@@ -11,6 +11,7 @@ from analysis.effects.base import Effect
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Filtering
 from analysis.terms.base import Used
+from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import (
     conditioned_records,
     trace_filtering,
@@ -113,11 +114,12 @@ def _is_named(effect: JudgedEffect, verdict: str) -> bool:
 
 def trace_rows(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns,
-    filtering: Callable[[Record], Filtering] = trace_filtering,
+    filtering: Callable[[Record], Filtering] = trace_filtering, cache: RowCache | None = None,
 ) -> TraceRows:  # fmt: skip
     """Return the whitened rows of all runs under a model of `terms`.
 
-    `filtering` gives the row filter of each record. Coefficients are fitted to the training rows.
+    `filtering` gives the row filter of each record; `cache` may hold training rows under the same
+    filters. Coefficients are fitted to the training rows.
     Raises InputError where a step leaves too few rows of an equation (`_without_masked_steps`).
     """
 
@@ -127,7 +129,7 @@ def trace_rows(
     def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
         return conditioned_records(rig, runs, filters, records.families)
 
-    train_data = _training_rows(rig, terms, conditioned(records.train))
+    train_data = _training_rows(rig, terms, conditioned(records.train), cache)
     terms, beta = train_data.terms, train_data.beta
     members = conditioned(records.holdout)
     data = regression_data(rig, terms, members, beta)
@@ -139,14 +141,14 @@ def trace_rows(
 
 
 def _training_rows(
-    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord]
+    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord], cache: RowCache | None
 ) -> RegressionData:
     """Return the training rows, with the columns of the spools' paths between samples."""
-    data = _without_masked_steps(regression_data(rig, terms, train))
+    data = _without_masked_steps(regression_data(rig, terms, train, cache=cache))
     paths = path_terms(data)
     if not paths:
         return data
-    return _without_masked_steps(regression_data(rig, (*terms, *paths), train))
+    return _without_masked_steps(regression_data(rig, (*terms, *paths), train, cache=cache))
 
 
 def _without_masked_steps(train_data: RegressionData) -> RegressionData:

@@ -87,7 +87,9 @@ def searched_in_motion(
         return finding
 
     def searched(joints: Collection[int]) -> Finding:
-        rows = trace_rows(rig, terms, records, moving_filtering({*weighted, *joints}))
+        unweighted = finding.rows.train.cache.without_family("mechanical")
+        moving = moving_filtering({*weighted, *joints})
+        rows = trace_rows(rig, terms, records, moving, unweighted)
         found = search_and_judge(rows, candidates, free, seed, lambda _: None)
         return replace(found, notes=(*rest_phase_notes(rows.in_motion, "leave out"), *found.notes))
 

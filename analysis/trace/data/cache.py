@@ -36,6 +36,13 @@ class Cache:
             self.used -= self._values.pop(next(iter(self._values)))[1]
         return value
 
+    def selected(self, keep: Callable[[Any], bool]) -> Cache:
+        """Return a cache that begins with the values whose keys `keep` accepts."""
+        out = Cache(self.most)
+        out._values = {key: entry for key, entry in self._values.items() if keep(key)}
+        out.used = sum(size for _, size in out._values.values())
+        return out
+
 
 class _RecordingSignals(Signals):
     """Signals that record which of their fields are read."""
@@ -77,6 +84,12 @@ class RowCache:
         self.rows, self.signals = Cache(DATA.cached_row_bytes), Cache(DATA.cached_signal_bytes)
         self.parts, self.fits = SignalCache(), Cache(DATA.cached_row_bytes)
         self.families: dict[Term, frozenset[str]] = {}
+
+    def without_family(self, family: str) -> RowCache:
+        """Return a cache that begins with the rows of all other families."""
+        out = RowCache()
+        out.rows = self.rows.selected(lambda key: key[1] != family)
+        return out
 
 
 def _bytes(value: Any) -> int:

@@ -174,11 +174,12 @@ def regression_data(
     terms: Sequence[Used],
     members: Sequence[ConditionedRecord],
     beta: Mapping[str, float] | None = None,
+    cache: RowCache | None = None,
 ) -> RegressionData:
     """Return the whitened rows of records under a model (see the module).
 
-    Without `beta` the coefficients are fitted to these records. Raises InputError where filter
-    edges leave no rows.
+    Without `beta` the coefficients are fitted to these records; `cache` may hold rows of the same
+    records and filters. Raises InputError where filter edges leave no rows.
     """
     every = [model_rows(rig, terms, conditioned) for conditioned in members]
     beta = least_squares(rig, every) if beta is None else beta
@@ -224,7 +225,7 @@ def regression_data(
         )
     return RegressionData(
         rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(residual, axis=1),
-        tuple(segments), tuple(split), tuple(averages), tuple(kept_rows),
+        tuple(segments), tuple(split), tuple(averages), tuple(kept_rows), cache or RowCache(),
     )  # fmt: skip
 
 
