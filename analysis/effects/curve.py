@@ -41,21 +41,31 @@ def bending(knots: Array) -> Array:
 def spline(knots: Sequence[float], x: Array) -> Array:
     """Return the basis (n, K) of the curve at x (n,): its value per unit value at every knot."""
     t = np.asarray(knots, dtype=np.float64)
-    S, K = bending(t), len(t)
-    j = np.clip(np.searchsorted(t, x, side="right") - 1, 0, K - 2)
-    h = t[j + 1] - t[j]
-    inner = np.clip(x, t[0], t[-1])
-    b = (inner - t[j]) / h
-    a = 1.0 - b
-    unit = np.eye(K)
-    out = a[:, None] * unit[j] + b[:, None] * unit[j + 1]
-    out += ((a**3 - a) * h**2 / 6.0)[:, None] * S[j]
-    out += ((b**3 - b) * h**2 / 6.0)[:, None] * S[j + 1]
-    first = (unit[1] - unit[0]) / (t[1] - t[0]) - (t[1] - t[0]) / 6.0 * (2.0 * S[0] + S[1])
-    last = (unit[-1] - unit[-2]) / (t[-1] - t[-2])
-    last = last + (t[-1] - t[-2]) / 6.0 * (S[-2] + 2.0 * S[-1])
-    slope = np.where((x < t[0])[:, None], first, last)
-    return np.asarray(out + (x - inner)[:, None] * slope)
+    return np.asarray(_basis(t, bending(t), np.ascontiguousarray(x, dtype=np.float64)))
+
+
+@njit(cache=True, error_model="numpy")
+def _basis(t, S, x):  # type: ignore[no-untyped-def]
+    K = len(t)
+    out = np.empty((len(x), K))
+    for k in range(len(x)):
+        inner = min(max(x[k], t[0]), t[-1])
+        j = 0
+        while j < K - 2 and inner >= t[j + 1]:
+            j += 1
+        h = t[j + 1] - t[j]
+        b = (inner - t[j]) / h
+        a, beyond = 1.0 - b, x[k] - inner
+        m, n = (a * a - 1.0) * a * h * h / 6.0, (b * b - 1.0) * b * h * h / 6.0
+        if beyond < 0.0:  # the slope at the first knot
+            m, n = m - beyond * h / 3.0, n - beyond * h / 6.0
+        elif beyond > 0.0:  # at the last
+            m, n = m + beyond * h / 6.0, n + beyond * h / 3.0
+        for i in range(K):
+            out[k, i] = m * S[j, i] + n * S[j + 1, i]
+        out[k, j] += a - beyond / h
+        out[k, j + 1] += b + beyond / h
+    return out
 
 
 def packed(knots: Sequence[float], values: Array) -> Array:

@@ -389,16 +389,17 @@ def drop_and_slope(Q, turbulent, turning):  # type: ignore[no-untyped-def]
 def _line(ratio, step, turbulent, share, capacity):  # type: ignore[no-untyped-def]
     # Between two samples the demand is linear and the time constant is constant.
     drop = np.zeros_like(ratio)
-    through = ratio[0]
+    through, slope = ratio[0], 0.0
     for k in range(len(ratio)):
         if k and capacity > 0.0:
-            late = max(capacity * drop_and_slope(through, turbulent, share)[1], 1e-9)
+            late = max(capacity * slope, 1e-9)
             kept = math.exp(-step / late)
             rise = ratio[k] - ratio[k - 1]
             through = ratio[k] - rise * (1 - kept) * late / step + kept * (through - ratio[k - 1])
         else:
             through = ratio[k]
-        drop[k] = drop_and_slope(max(through, 0.0), turbulent, share)[0]
+        lost, slope = drop_and_slope(through, turbulent, share)
+        drop[k] = max(lost, 0.0)
     return drop
 
 

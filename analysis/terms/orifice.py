@@ -20,7 +20,6 @@ from analysis.terms.base import (
     P_ROD,
     P_S,
     P_TANK,
-    Array,
     Coefficient,
     Columns,
     Kernel,
@@ -90,15 +89,19 @@ def _gains(joints: int) -> tuple[Coefficient, ...]:
     return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
 
 
-def root_of_drop(drop: Array) -> Array:
-    """Return the signed roots [Pa^0.5] of pressure drops [Pa]."""
-    return np.copysign(np.sqrt(np.abs(drop)), drop)
-
-
 @njit(cache=True)
 def signed_root(drop):  # type: ignore[no-untyped-def]
     """Return the signed root [Pa^0.5] of one pressure drop [Pa]."""
     return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
+
+
+@njit(cache=True)
+def root_of_drop(drop):  # type: ignore[no-untyped-def]
+    """Return the signed roots [Pa^0.5] of pressure drops (n,) [Pa]."""
+    out = np.empty_like(drop)
+    for k in range(len(drop)):
+        out[k] = signed_root(drop[k])
+    return out
 
 
 @kernel
