@@ -385,7 +385,7 @@ def _judging_rows_above_band(
     known = rows_within_curves(judge_data, after.fit)
     kept = gates.held_out_above_band(known, before.fit, after.fit)
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
-    return {e for e, _ in kept}, [*words, *beyond_curve_notes(judge_data, known)]
+    return {e for e, _ in kept}, [*words, *beyond_curve_notes(judge_data, after.fit)]
 
 
 def _remaining_fraction(

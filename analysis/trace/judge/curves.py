@@ -43,29 +43,40 @@ def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return the data with only the rows within the outermost knots of a model's free curves.
 
     Beyond them a curve is extrapolated by a straight line, which is no evidence on the mechanism.
-    All rows are returned where an equation would keep fewer than `TRACE.least_rows`.
+    All rows are returned where a step would keep fewer than `TRACE.least_rows` of an equation.
     """
+    inside = _within_knots(data, model)
+    return data.at(inside) if not inside.all() and _enough_within(data, inside) else data
+
+
+def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
+    """Return a note for every equation of which judging rows lie beyond a model's free curves."""
+    inside = _within_knots(data, model)
+    beyond = data.at(~inside).row_counts if not inside.all() else {}
+    role = "they are in the errors, but speak neither for nor against it"
+    if not _enough_within(data, inside):
+        role = "a step would keep too few without them, so that they judge the extrapolated curve"
+    return [
+        f"{e}: {plain(100 * beyond[e] / rows, 2)} % of the judging rows lie beyond the range of "
+        f"the fitted curve: {role}; train with motions at least as large"
+        for e, rows in data.row_counts.items()
+        if e in beyond
+    ]
+
+
+def _within_knots(data: RegressionData, model: ExactFit) -> NDArray[np.bool_]:
+    """Return which rows (M,) lie within the outermost knots of all free curves of a model."""
     inside = np.ones(len(data.base), dtype=bool)
     for used in model.terms:
         if isinstance(used.term, Effect) and used.term.free:
             inside &= _between_knots(data, used)
-    least = min(
-        (np.count_nonzero(inside[s.where]) for s in data.segments if not inside[s.where].all()),
-        default=TRACE.least_rows,
-    )
-    return data if inside.all() or least < TRACE.least_rows else data.at(inside)
+    return inside
 
 
-def beyond_curve_notes(whole: RegressionData, known: RegressionData) -> list[str]:
-    """Return a note for every equation of which `known` lacks rows (see `rows_within_curves`)."""
-    rows, left = whole.row_counts, known.row_counts
-    return [
-        f"{e}: {plain(100 * (1 - left[e] / rows[e]), 2)} % of the judging rows lie beyond the "
-        "range of the fitted curve: they are in the errors, but speak neither for nor against it; "
-        "train with motions at least as large"
-        for e in rows
-        if left[e] < rows[e]
-    ]
+def _enough_within(data: RegressionData, inside: NDArray[np.bool_]) -> bool:
+    """Return whether each equation of each step keeps `TRACE.least_rows` rows inside (M,)."""
+    kept = [inside[s.where] for s in data.segments]
+    return all(k.all() or np.count_nonzero(k) >= TRACE.least_rows for k in kept)
 
 
 def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:

@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from analysis.simulation.model import Estimate, nominal_model
 from analysis.simulation.simulate import compiled
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import with_curve_values
+from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
 from analysis.trace.result import JudgedEffect
+from analysis.trace.search.refinement import fit_coefficients
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment
 
 KNOTS = (0.0, 0.02, 0.06, 0.12, 2e-5)  # [m/s] of |s'|, then the presliding distance [m]
 
@@ -42,3 +48,26 @@ def test_a_model_with_an_undetermined_value_of_a_curve_can_be_simulated(rig: Rig
     compiled(with_curve_values(known, (found,)))
     with pytest.raises(InputError, match=lost):
         compiled(with_curve_values(known, (replace(found, free=False),)))
+
+
+@pytest.mark.parametrize(
+    ("reach", "says"), [(0.9, "neither for nor against"), (0.01, "the extrapolated curve")]
+)
+def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
+    rig: Rig, reach: float, says: str
+) -> None:
+    """The knots span `reach` of the piston's travel; too few rows within them cannot judge."""
+    run = experiment(rig, Hidden(spring=20.0), repeats=1, seed=1, rms=RMS)
+    terms = [Used(term) for term in baseline_of(rig)]
+    data = regression_data(rig, terms, conditioned_records(rig, [run]))
+    s = data.records[0].signals.s[:, 1]
+    middle, half = 0.5 * (s.min() + s.max()), 0.5 * reach * np.ptp(s)
+    knots = np.linspace(middle - half, middle + half, 6)
+    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(6)[0]))
+    fit = fit_coefficients(data, (*terms, curve))
+    notes = beyond_curve_notes(data, fit)
+    assert [note.partition(":")[0] for note in notes] == ["torque_2"]
+    assert says in notes[0]
+    known = rows_within_curves(data, fit).row_counts
+    assert (known["torque_2"] < data.row_counts["torque_2"]) is (reach > 0.1)
+    assert known["flow_cap_2"] == data.row_counts["flow_cap_2"]

@@ -265,7 +265,7 @@ def test_a_spring_that_hardens_is_a_force_over_position(rig: Rig) -> None:
     (line,) = result.effects[0].curves
     q = np.array([float(rig.joints[1].geometry(s)[0]) for s in line.x])
     lever = np.array([float(rig.joints[1].geometry(s)[1]) for s in line.x])
-    # The weight of one pose is a force over position too: what is told is the sum.
+    # The weight in one pose is a force over position too: only the sum is determined.
     weight = 9.8 * (result.model_after.values["W2"] - 3.30) * np.sin(q + rig_angle(rig))
     pull = (20.0 * (q + 1.44) + 150.0 * (q + 1.44) ** 3) / lever
     assert line.y + weight / lever == pytest.approx(pull, abs=0.03 * np.abs(pull).max())

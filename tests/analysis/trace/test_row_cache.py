@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from analysis.signals.conditioning import Array, Signals
-from analysis.trace.data.cache import Cache, SignalCache
+from analysis.trace.data.cache import Cache, RowCache, SignalCache
 from rig.model.rig import Rig
 
 
@@ -28,6 +28,21 @@ def test_the_oldest_goes_first() -> None:
         asked(key)
     assert made == ["a", "b", "c", "a"]
     assert cache.used <= cache.most
+
+
+def test_flow_rows_stay_where_torque_rows_are_weighted_anew() -> None:
+    """The keys are record group, family of rows, terms."""
+    cache, made = RowCache(), []
+
+    def ask(rows: Cache) -> None:
+        for family in ("mechanical", "fluid"):
+            rows.get(((0, "step1"), family, ()), lambda f=family: made.append(f) or np.zeros(10))
+
+    ask(cache.rows)
+    kept = cache.without_family("mechanical")
+    assert kept.rows.used == cache.rows.used / 2
+    ask(kept.rows)
+    assert made == ["mechanical", "fluid", "mechanical"]
 
 
 def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
