@@ -36,8 +36,12 @@ class NotCentred(InputError):
     """A step whose pistons cannot be kept centred on the twin."""
 
     def __init__(self, message: str, step: StepPlan) -> None:
-        super().__init__(message)
+        super().__init__(message, step)  # so that it can be pickled
         self.step = step
+
+    def __str__(self) -> str:
+        """Return the message alone."""
+        return str(self.args[0])
 
 
 class Twin(Protocol):

@@ -111,13 +111,18 @@ class LockFailed(ProtocolAborted):
     """A locked joint moved; `joint` is 1-based, lengths in m."""
 
     def __init__(self, step: str, joint: int, what: str, measured: float, expected: str) -> None:
+        super().__init__(step, joint, what, measured, expected)  # so that it can be pickled
         self.step = step
         self.joint = joint
+        self.what = what
         self.measured = measured
         self.expected = expected
-        super().__init__(
-            f"lock failed in {step}: joint {joint} {what}: piston measured at "
-            f"{1e3 * measured:.2f} mm, expected {expected}"
+
+    def __str__(self) -> str:
+        """Name the step, the joint, what happened, and the piston measured and expected."""
+        return (
+            f"lock failed in {self.step}: joint {self.joint} {self.what}: piston measured at "
+            f"{1e3 * self.measured:.2f} mm, expected {self.expected}"
         )
 
 

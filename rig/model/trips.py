@@ -100,7 +100,11 @@ class SafetyTrip(Exception):
         self.channel = violation.channel
         self.tick = violation.tick
         self.device_time = violation.tick / rig.sample_rate
-        super().__init__(f"safety trip: limit '{self.limit}', {describe(violation, rig)}")
+        super().__init__(violation, rig)  # so that it can be pickled
+
+    def __str__(self) -> str:
+        """Name the limit, the joint, what was measured and what is allowed."""
+        return f"safety trip: limit '{self.limit}', {describe(*self.args)}"
 
 
 def reset_command(rig: Rig) -> str:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
+from protocols.design.check import NotCentred
 from protocols.engine.engine import run
 from protocols.engine.states import LockFailed, ProtocolAborted
 from protocols.files.plan import Plan, resolve
 from protocols.files.schema import Protocol
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
+from rig.model.trips import SafetyTrip, Violation
 from rig.runs.rigs import load_rig
 from tests.protocols.little_bench import Cylinder, Handle, LittleBench, default_cylinders
 
@@ -174,3 +178,15 @@ def test_a_disturbed_bench_never_makes_a_record_with_a_jump_in_its_command(rig: 
         command = bench.channel("command_2", record.start, record.ticks)
         wave = np.tile(plan.steps[0].excite[0].wave.samples, 4)
         assert np.ptp((command - wave)[20:]) < 1e-12
+
+
+def test_what_ends_a_run_can_be_raised_in_another_process(rig: Rig) -> None:
+    """A pool of processes breaks when an exception of a worker cannot be unpickled."""
+    violation = Violation("pressure", 9.31e6, (-2e5, 9e6), "Pa", 1, "cap_pressure_1", 12345)
+    lock = LockFailed("step1", 2, "moved while locked (closed)", 5.79e-3, "0.67 mm +- 5 mm")
+    step = next(iter(plan_of(rig).steps))
+    assert "joint 2 moved while locked (closed): piston measured at 5.79 mm" in str(lock)
+    for error in (lock, SafetyTrip(violation, rig), NotCentred("not centred", step)):
+        same = pickle.loads(pickle.dumps(error))
+        assert type(same) is type(error)
+        assert str(same) == str(error)
