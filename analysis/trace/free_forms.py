@@ -64,8 +64,7 @@ def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -
         for single in wide.extensions(start, free=True):
             if wide.removes_too_little(start, single):  # a further effect would make it needless
                 continue
-            enough = wide.within_form_tolerance(single)
-            for hypothesis in (single,) if enough else (single, _with_further_effect(wide, single)):
+            for hypothesis in (single, _with_further_effect(wide, single)):
                 simpler = len(hypothesis.laws) < len(winner.laws)
                 less = simpler and hypothesis.total < SEARCH.free_form_ratio * winner.total
                 explains = _explains_what_it_alters(wide, start, hypothesis)
@@ -95,8 +94,13 @@ def _simplest_first(sets: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
-    """Return the set with one more effect for the equations that keep too much, if there is one."""
+    """Return the set with one more effect for the equations that keep too much, if there is one.
+
+    Where all keep no more than form error, an effect must leave only noise.
+    """
     loud = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
+    if not loud:
+        return wide.completed_to_noise(hypothesis)
     if len(hypothesis.effects) >= SEARCH.largest_set:
         return hypothesis
     return wide.extended_in(hypothesis, loud) or hypothesis

@@ -250,8 +250,11 @@ class SearchSettings:
     number_price: float = 20.0
     """Energy that each further free number must remove: ten times what noise gives it (tuned)."""
     least_projected_length: float = 0.03
-    """Length of a column orthogonal to the baseline's columns over its whole length: a column with
-    less does not show (arithmetic)."""
+    """Length of a column orthogonal to the baseline's columns over its whole length, from which the
+    first-order column of a signal change shows: less may be of second order (arithmetic)."""
+    least_exact_length: float = 0.003
+    """The same for the column of a coefficient, which has no error of first order: a torque offset
+    on a joint that turns by 0.8 rad has 0.03 (arithmetic)."""
     size_ratio: float = 3.0
     """Largest fitted size over the size for which the first-order column of a signal change was
     computed; smaller sizes are closer to linear (tuned)."""

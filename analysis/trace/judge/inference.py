@@ -23,7 +23,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.scatter import parameter_covariance
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, tangent
-from analysis.trace.settings import SEARCH, TRACE
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -78,7 +78,7 @@ def null_maximum(
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
-    shows = (diagonal > SEARCH.least_projected_length**2 * candidates.raw) & (candidates.raw > 0)
+    shows = diagonal > candidates.least
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()

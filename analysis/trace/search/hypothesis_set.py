@@ -274,7 +274,7 @@ class HypothesisSet:
 
     def _singles(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         g = linear_fit.gains(
-            candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw
+            candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least
         )
         out: dict[Key, tuple[Used, ...]] = {}
         least = SEARCH.near_gain * float(np.max(g, initial=0.0))

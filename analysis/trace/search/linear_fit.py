@@ -29,8 +29,9 @@ class CandidateColumns:
     """Candidates (`entries`) with columns orthogonal to the data's own.
 
     `columns` (M, V), `K` (V, V) their products, `basis` (M, r) of the data's own columns, `groups`
-    the column numbers of each entry, `raw` (V,) the squared lengths before projection, `rows` the
-    row numbers of each equation, `band` its noise band, `size` the free numbers of each entry.
+    the column numbers of each entry, `least` (V,) the squared lengths from which columns show,
+    `rows` the row numbers of each equation, `band` its noise band, `size` the free numbers of each
+    entry.
     `admissible(entry, coefficients)` says whether physics allows these sizes.
     """
 
@@ -39,7 +40,7 @@ class CandidateColumns:
     K: Array
     basis: Array
     groups: tuple[tuple[int, ...], ...]
-    raw: Array
+    least: Array
     rows: dict[str, Array]
     band: dict[str, float]
     size: tuple[int, ...]
@@ -80,7 +81,9 @@ def project(
         start += entry.columns.shape[1]
     stack = np.column_stack([e.columns for e in columns]) if columns else np.zeros((len(keep), 0))
     stack = stack * keep[:, None]
-    raw = np.sum(stack**2, axis=0)
+    names = [name for entry in columns for name in entry.names]
+    shows = (SEARCH.least_exact_length if n else SEARCH.least_projected_length for n in names)
+    least = np.square(list(shows)) * np.sum(stack**2, axis=0)
     projected = stack - basis @ (basis.T @ stack)
     rows: dict[str, list[Array]] = {}
     band: dict[str, float] = {}
@@ -91,7 +94,7 @@ def project(
         noise = SEARCH.band**2 * segment.repeats * len(where)
         band[segment.equation] = band.get(segment.equation, 0.0) + noise
     return CandidateColumns(
-        tuple(columns), projected, projected.T @ projected, basis, tuple(groups), raw,
+        tuple(columns), projected, projected.T @ projected, basis, tuple(groups), least,
         {name: np.concatenate(parts) for name, parts in rows.items()}, band,
         tuple(size(entry) for entry in columns), admissible,
     )  # fmt: skip
@@ -105,22 +108,17 @@ def orthonormal(columns: Array) -> Array:
     return np.asarray(U[:, sigma > TRACE.rank_limit * sigma[0]]) if len(sigma) else U
 
 
-def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> Array:
-    """Return the energy that each group of columns removes.
+def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], least: Array) -> Array:
+    """Return the energy that each group of columns removes, 0 for groups that do not show.
 
-    It is 0 for groups without a column of `SEARCH.least_projected_length`.
+    `least` (V,) holds the squared lengths from which columns show.
     """
     out = np.zeros(len(groups))
     for g, group in enumerate(groups):
-        if len(group) == 1:
-            j = group[0]
-            if K[j, j] > SEARCH.least_projected_length**2 * raw[j] and raw[j] > 0:
-                out[g] = c[j] ** 2 / K[j, j]
-            continue
-        seen = [
-            j for j in group if K[j, j] > SEARCH.least_projected_length**2 * raw[j] and raw[j] > 0
-        ]
-        if seen:
+        seen = [j for j in group if K[j, j] > least[j]]
+        if len(seen) == 1:
+            out[g] = c[seen[0]] ** 2 / K[seen[0], seen[0]]
+        elif seen:
             index = np.ix_(seen, seen)
             out[g] = c[seen] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[seen]
     return out
@@ -180,7 +178,7 @@ def sets_with_one_more(
     K, c = candidates.K, candidates.columns.T @ r
     for m in members:
         K, c = schur_complement(K, c, candidates.groups[m])
-    g = gains(K, c, candidates.groups, candidates.raw)
+    g = gains(K, c, candidates.groups, candidates.least)
     taken = {candidates.entries[m].variant.key for m in members}
     trials: list[LinearFit] = []
     for i in map(int, np.argsort(-g)[: SEARCH.full_fits]):
@@ -252,7 +250,7 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
 
 def _best_singles(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
     """Return the best single entries, even if none removes enough alone: a pair may."""
-    g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw)
+    g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least)
     return [
         fit_members(candidates, (int(i),), r, 1.0)
         for i in np.argsort(-g)[: 6 * SEARCH.pair_starts]

@@ -20,7 +20,6 @@ from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns
-from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -106,9 +105,7 @@ def gains(candidates: CandidateColumns, r: Array) -> Array:
     out = []
     for group in candidates.groups:
         X = candidates.columns[:, list(group)]
-        visible = np.linalg.norm(X, axis=0) > SEARCH.least_projected_length * np.sqrt(
-            candidates.raw[list(group)]
-        )
+        visible = np.linalg.norm(X, axis=0) > np.sqrt(candidates.least[list(group)])
         X = X[:, visible]
         out.append(r @ X @ np.linalg.lstsq(X, r, rcond=1e-6)[0] if X.shape[1] else 0.0)
     return np.array(out)
