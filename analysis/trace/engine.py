@@ -36,7 +36,11 @@ from analysis.trace.in_motion import (
     rest_phase_notes,
 )
 from analysis.trace.judge import gates, held_out
-from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
+from analysis.trace.judge.curves import (
+    beyond_curve_notes,
+    curves_that_limit,
+    rows_within_curves,
+)
 from analysis.trace.judge.scatter import form_shift, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
@@ -271,7 +275,8 @@ def _traced(
         held_out.refitted_to_held_out(unseen.judging, fit)
         for fit in (hypotheses.empty.fit, winner.fit)
     )
-    error = held_out.errors(rig, unseen.members, first, last, unseen.divided)
+    curves = curves_that_limit(unseen.judging, winner.fit)
+    error = held_out.errors(rig, unseen.members, first, last, unseen.divided, curves)
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
         detection_limits(train_data, prepared.candidates, winner, after)

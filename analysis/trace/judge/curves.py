@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
+from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Curve
 from analysis.trace.search.refinement import ExactFit, tangent
 from analysis.trace.settings import TRACE
+from rig.model.rig import Rig
 from rig.model.units import plain
 
 Array = NDArray[np.float64]
@@ -43,19 +50,35 @@ def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return the data with only the rows within the outermost knots of a model's free curves.
 
     Beyond them a curve is extrapolated by a straight line, which is no evidence on the mechanism.
-    All rows are returned where a step would keep fewer than `TRACE.least_rows` of an equation.
+    All rows are returned where an equation would keep fewer than `TRACE.least_rows`.
     """
     inside = _within_knots(data, model)
     return data.at(inside) if not inside.all() and _enough_within(data, inside) else data
+
+
+def curves_that_limit(data: RegressionData, model: ExactFit) -> tuple[Used, ...]:
+    """Return the free curves of a model beyond which `rows_within_curves` leaves rows out."""
+    curves = _free_curves(model)
+    return curves if _enough_within(data, _within_knots(data, model)) else ()
+
+
+def rows_within(
+    rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, equation: str, rows: Rows
+) -> Rows:
+    """Return a record's rows of an equation that lie within the outermost knots of all curves."""
+    inside = np.ones(len(rows.time), dtype=bool)
+    for used in curves:
+        inside &= _between_knots(rig, used, conditioned, equation, rows)
+    return replace(rows, matrix=rows.matrix[inside], rhs=rows.rhs[inside], time=rows.time[inside])
 
 
 def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
     """Return a note for every equation of which judging rows lie beyond a model's free curves."""
     inside = _within_knots(data, model)
     beyond = data.at(~inside).row_counts if not inside.all() else {}
-    role = "they are in the errors, but speak neither for nor against it"
+    role = "they speak neither for nor against it, and are left out of the errors"
     if not _enough_within(data, inside):
-        role = "a step would keep too few without them, so that they judge the extrapolated curve"
+        role = "too few remain without them, so that they judge the extrapolated curve"
     return [
         f"{e}: {plain(100 * beyond[e] / rows, 2)} % of the judging rows lie beyond the range of "
         f"the fitted curve: {role}; train with motions at least as large"
@@ -64,37 +87,44 @@ def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
     ]
 
 
+def _free_curves(model: ExactFit) -> tuple[Used, ...]:
+    return tuple(u for u in model.terms if isinstance(u.term, Effect) and u.term.free)
+
+
 def _within_knots(data: RegressionData, model: ExactFit) -> NDArray[np.bool_]:
     """Return which rows (M,) lie within the outermost knots of all free curves of a model."""
     inside = np.ones(len(data.base), dtype=bool)
-    for used in model.terms:
-        if isinstance(used.term, Effect) and used.term.free:
-            inside &= _between_knots(data, used)
+    for used in _free_curves(model):
+        for segment in data.segments:
+            record, rows = data.source(segment)
+            inside[segment.where] &= _between_knots(data.rig, used, record, segment.equation, rows)
     return inside
 
 
 def _enough_within(data: RegressionData, inside: NDArray[np.bool_]) -> bool:
-    """Return whether each equation of each step keeps `TRACE.least_rows` rows inside (M,)."""
-    kept = [inside[s.where] for s in data.segments]
-    return all(k.all() or np.count_nonzero(k) >= TRACE.least_rows for k in kept)
+    """Return whether each equation keeps at least `TRACE.least_rows` of its rows inside (M,)."""
+    kept: Counter[str] = Counter()
+    for s in data.segments:
+        kept[s.equation] += int(np.count_nonzero(inside[s.where]))
+    least = {e: min(rows, TRACE.least_rows) for e, rows in data.row_counts.items()}
+    return all(kept[e] >= count for e, count in least.items())
 
 
-def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:
-    """Return in which rows (M,) the variable of a curve lies between its outermost knots."""
-    inside, effect = np.ones(len(data.base), dtype=bool), used.term
-    assert isinstance(effect, Effect)
-    named = zip(shapes_of(data.rig, used), used.shape, strict=True)
+def _between_knots(
+    rig: Rig, used: Used, conditioned: ConditionedRecord, equation: str, rows: Rows
+) -> NDArray[np.bool_]:
+    """Return in which rows (m,) the variable of a curve lies between its outermost knots."""
+    assert isinstance(used.term, Effect)
+    values = used.term.abscissa(rig, conditioned.signals).get(equation)
+    if values is None:
+        return np.ones(len(rows.time), dtype=bool)
+    named = zip(shapes_of(rig, used), used.shape, strict=True)
     knots = [value for shape, value in named if "_knot_" in shape.parameter]
     margin = TRACE.knot_margin * (knots[-1] - knots[0])
-    for segment in data.segments:
-        conditioned, rows = data.source(segment)
-        values = effect.abscissa(data.rig, conditioned.signals).get(segment.equation)
-        if values is not None:
-            x = values[conditioned.samples_at(rows.time)]
-            # A curve whose knots begin at zero is over the absolute value.
-            x = np.abs(x) if knots[0] == 0.0 else x
-            inside[segment.where] = (x >= knots[0] - margin) & (x <= knots[-1] + margin)
-    return inside
+    x = values[conditioned.samples_at(rows.time)]
+    # A curve whose knots begin at zero is over the absolute value.
+    x = np.abs(x) if knots[0] == 0.0 else x
+    return np.asarray((x >= knots[0] - margin) & (x <= knots[-1] + margin))
 
 
 def _covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:

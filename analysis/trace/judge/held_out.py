@@ -16,11 +16,13 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
+from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import Group, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import judging_rows
 from analysis.trace.data.temperature_nuisance import within_plausible_slope
+from analysis.trace.judge.curves import rows_within
 from analysis.trace.result import FreeCurves
 from analysis.trace.search.refinement import DesignMatrix, ExactFit, design_matrix
 from analysis.trace.settings import TRACE
@@ -113,13 +115,15 @@ def errors(
     before: ExactFit,
     after: ExactFit,
     divided: Collection[Group] = (),
+    curves: Sequence[Used] = (),
 ) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
     `members` are the records, each repeat by itself; of those in `divided` groups only the judging
-    rows count. The noise floor is that of the residual under the model `after`. A record without
-    repeats has a floor by its periods or neighbouring states, for which all its rows are used.
-    Sines that are taken out of the rows are part of what the model `before` leaves.
+    rows count, and only rows within the outermost knots of `curves`. The noise floor is that of the
+    residual under the model `after`. A record without repeats has a floor by its periods or
+    neighbouring states, for which all its rows are used. Sines that are taken out of the rows are
+    part of what the model `before` leaves.
     """
     bare = [replace(c, filtering=replace(c.filtering, lines=())) for c in members]
     whole = [model_rows(rig, after.terms, conditioned) for conditioned in members]
@@ -137,6 +141,13 @@ def errors(
     ]
     split = floors(rig, after.terms, members, compared, after.beta)
     floor = {(f.group, f.equation): f.noise for f in split}
+    first, other = (
+        [
+            {e: rows_within(rig, curves, c, e, rows) for e, rows in rows_of.items()}
+            for c, rows_of in zip(members, built, strict=True)
+        ]
+        for built in (first, other)
+    )
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
     for conditioned, rows_of in zip(members, other, strict=True):

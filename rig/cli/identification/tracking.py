@@ -100,8 +100,8 @@ class Tracking:
         self._shows.append(show)
 
     def __enter__(self) -> Self:
-        self._folder = ExitStack()  # the folder is accessible to this user only
-        endpoint = f"ipc://{self._folder.enter_context(scratch_folder())}/track"
+        self._scratch = ExitStack()  # the folder is accessible to this user only
+        endpoint = f"ipc://{self._scratch.enter_context(scratch_folder())}/track"
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
         self._socket.set(zmq.SNDHWM, WAITING)
@@ -131,7 +131,7 @@ class Tracking:
                 self._process.kill()
                 self._process.join()
             self._process.close()
-            self._folder.close()
+            self._scratch.close()
 
     @property
     def alive(self) -> bool:

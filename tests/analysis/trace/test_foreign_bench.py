@@ -283,7 +283,7 @@ def test_a_curve_is_not_judged_where_the_training_motions_never_were(rig: Rig) -
     assert result.verdict == "explained"
     assert [(e.name, e.free) for e in result.effects] == [("position_force", True)]
     assert any("lie beyond the range of the fitted curve" in note for note in result.notes)
-    assert result.after["torque_2"] > 2.0 * result.noise_floor["torque_2"]
+    assert result.after["torque_2"] < 1.3 * result.noise_floor["torque_2"]
 
 
 @pytest.mark.slow
