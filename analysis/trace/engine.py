@@ -279,7 +279,7 @@ def _traced(
     error = held_out.errors(rig, unseen.members, first, last, unseen.divided, curves)
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
-        detection_limits(train_data, prepared.candidates, winner, after)
+        detection_limits(hypotheses, prepared.candidates, winner, after)
         if verdict != UNEXPLAINED
         else []
     )

@@ -125,8 +125,9 @@ class TraceSettings:
     most_rivals: int = 4
     """Largest number of rivals in a result."""
     noted_shift: float = 0.01
-    """Relative change of a parameter from which it is noted: by an effect at its detection limit,
-    or by the fit to held-out rows (tuned: with good excitation no detection limit reaches it)."""
+    """Relative change of a parameter from which it matters: by an effect at its detection limit, by
+    the fit to held-out rows, or by a rival in place of a named effect (tuned: with good excitation
+    no detection limit reaches it)."""
     most_detection_limits: int = 3
     """Largest number of detection limits in the notes."""
     normal_quantile: float = 1.96

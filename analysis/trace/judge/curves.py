@@ -29,7 +29,7 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     lines = effect.branches(data.rig, used.shape) if isinstance(effect, Effect) else ()
     if not lines:
         return ()
-    names, covariance = _covariance(data, model)
+    names, covariance = noise_covariance(data, model)
     known = {**model.beta, **shape_values(data.rig, used)}
     out = []
     for line in lines:
@@ -127,7 +127,7 @@ def _between_knots(
     return np.asarray((x >= knots[0] - margin) & (x <= knots[-1] + margin))
 
 
-def _covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
+def noise_covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
     """Return names and covariance from noise (p, p) of a model's coefficients and shapes."""
     names, X = tangent(data, model)
     scale = np.linalg.norm(X, axis=0)

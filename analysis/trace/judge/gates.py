@@ -18,7 +18,7 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
-from analysis.trace.judge.curves import curves_of
+from analysis.trace.judge.curves import curves_of, noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.invariance import Difference, invariance
 from analysis.trace.judge.readings import loss_in_deviations, of_one_law
@@ -351,10 +351,9 @@ def _rivals(
         if key in hypothesis.keys or not others <= hypothesis.keys or len(fresh) != 1:
             continue
         (other,) = fresh
-        more = hypothesis.size[1] - winner.size[1]  # further free numbers, each with its price
         assert isinstance(other, Effect)
         if (
-            (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
+            not (_earns_its_numbers(winner, hypothesis) or _matters(train_data, winner, hypothesis))
             or of_one_law(judged_effect, other)
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
             or _disturbed_equations(hypotheses, hypothesis, alternative)
@@ -382,6 +381,31 @@ def _rivals(
         )
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: TRACE.most_rivals]
+
+
+def _earns_its_numbers(winner: Hypothesis, rival: Hypothesis) -> bool:
+    """Return whether each further free number of a rival removes `SEARCH.number_price`."""
+    more = rival.size[1] - winner.size[1]
+    return more <= 0 or rival.total <= winner.total - SEARCH.number_price * more
+
+
+def _matters(train_data: RegressionData, winner: Hypothesis, rival: Hypothesis) -> bool:
+    """Return whether a rival with a named form gives a baseline parameter another value.
+
+    It differs by `TRACE.noted_shift` and by `TRACE.standard_errors`: the intervals would be
+    wrong if the rival were true, however many numbers it has.
+    """
+    if any(isinstance(u.term, Effect) and u.term.free for u in rival.effects):
+        return False
+    names, covariance = noise_covariance(train_data, rival.fit)
+    for name in train_data.names:
+        if name in rival.fit.beta and name in winner.fit.beta:
+            value, k = winner.fit.beta[name], names.index(name)
+            shift = abs(rival.fit.beta[name] - value)
+            std = float(np.sqrt(max(covariance[k, k], 0.0)))
+            if shift > max(TRACE.noted_shift * abs(value), TRACE.standard_errors * std):
+                return True
+    return False
 
 
 def _composites_in_words(

@@ -28,7 +28,8 @@ from analysis.trace.next_experiment.discrimination import (
     smallest_effect,
 )
 from analysis.trace.result import DetectionLimit
-from analysis.trace.search.hypothesis import Hypothesis, parameter_values
+from analysis.trace.search.hypothesis import Hypothesis, law_of, parameter_values
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased, tangent
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
@@ -38,20 +39,25 @@ Array = NDArray[np.float64]
 
 
 def detection_limits(
-    train_data: RegressionData, effects: Sequence[Effect], winner: Hypothesis, model: Model
+    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis, model: Model
 ) -> list[DetectionLimit]:
     """Return the limits of effects that would change a parameter visibly, largest change first.
 
     `effects` are the candidates; each name is returned once, at the place where it changes most.
-    `winner` is the set found and `model` the model identified with it. Beside a free form no limit
-    is computed, since its curve absorbs any similar effect.
+    `winner` is the set found and `model` the model identified with it. Another name of a law that
+    acts in the set has the shape with which it was fitted in place of that name. Beside a free form
+    no limit is computed, since its curve absorbs any similar effect.
     """
+    train_data = hypotheses.train_data
     if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
         return []
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
     asked = [effect for effect in effects if (effect.name, effect.where) not in winner.keys]
+    fitted = _fitted_instead(hypotheses, winner)
     small = [
-        what for effect in asked if (what := smallest_effect(effect, train_data.rig)) is not None
+        what
+        for effect in asked
+        if (what := smallest_effect(effect, train_data.rig, fitted.get(effect, ()))) is not None
     ]
     if not small:
         return []
@@ -75,6 +81,21 @@ def detection_limits(
     for limit in sorted(found, key=lambda f: -f.shift):
         once.setdefault(limit.name, limit)
     return list(once.values())
+
+
+def _fitted_instead(
+    hypotheses: HypothesisSet, winner: Hypothesis
+) -> dict[Effect, tuple[float, ...]]:
+    """Return the fitted shapes of other names of a set's laws, each in place of the set's name."""
+    out: dict[Effect, tuple[float, ...]] = {}
+    for own in winner.effects:
+        others = winner.keys - {(own.term.name, own.term.where)}
+        for hypothesis in hypotheses.fitted.values():
+            fresh = [u for u in hypothesis.effects if (u.term.name, u.term.where) not in others]
+            if len(fresh) == 1 and others < hypothesis.keys and law_of(fresh[0]) == law_of(own):
+                assert isinstance(fresh[0].term, Effect)
+                out[fresh[0].term] = fresh[0].shape
+    return out
 
 
 def _largest_multiple(shown: Array, residual: Array) -> float:

@@ -67,16 +67,17 @@ class Explanation:
         )
 
 
-def smallest_effect(effect: Effect, rig: Rig) -> Explanation | None:
+def smallest_effect(effect: Effect, rig: Rig, shape: tuple[float, ...] = ()) -> Explanation | None:
     """Return an effect at its smallest size of interest, None where it has none or cannot show.
 
+    `shape` replaces the usual values of the shapes that do not state its size.
     With poor excitation an effect of this size may leave no residual: the verdict `clean` does not
     exclude it then.
     """
     own = effect.least_shapes()
     if effect.absorbed(rig) or not (own or effect.least):
         return None
-    usual = effect.shape_of(rig, ())
+    usual = effect.shape_of(rig, shape)
     names = [c.parameter for c in effect.coefficients(rig)]
     used = Used(effect, (*own, *usual[len(own) :]))
     return Explanation((used,), dict(zip(names, effect.least, strict=False)))
