@@ -392,8 +392,8 @@ def _earns_its_numbers(winner: Hypothesis, rival: Hypothesis) -> bool:
 def _matters(train_data: RegressionData, winner: Hypothesis, rival: Hypothesis) -> bool:
     """Return whether a rival with a named form gives a baseline parameter another value.
 
-    It differs by `TRACE.noted_shift` and by `TRACE.standard_errors`: the intervals would be
-    wrong if the rival were true, however many numbers it has.
+    It differs by `TRACE.noted_shift` and lies outside the rival's 95 % interval: the intervals
+    would be wrong if the rival were true, however many numbers it has.
     """
     if any(isinstance(u.term, Effect) and u.term.free for u in rival.effects):
         return False
@@ -403,7 +403,7 @@ def _matters(train_data: RegressionData, winner: Hypothesis, rival: Hypothesis) 
             value, k = winner.fit.beta[name], names.index(name)
             shift = abs(rival.fit.beta[name] - value)
             std = float(np.sqrt(max(covariance[k, k], 0.0)))
-            if shift > max(TRACE.noted_shift * abs(value), TRACE.standard_errors * std):
+            if shift > max(TRACE.noted_shift * abs(value), TRACE.normal_quantile * std):
                 return True
     return False
 
