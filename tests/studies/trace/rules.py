@@ -104,7 +104,7 @@ def _same_records() -> Callable[..., Any]:
     """Return a `regression_data` that gives the training records where held-out ones are asked."""
     true, seen = regression_data.regression_data, {}
 
-    def fitted_again(rig: Any, terms: Any, members: Any, beta: Any = None) -> Any:
+    def fitted_again(rig: Any, terms: Any, members: Any, beta: Any = None, **_: Any) -> Any:
         if beta is None:
             seen["fitted"] = true(rig, terms, members)
         return seen["fitted"]
