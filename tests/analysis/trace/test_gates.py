@@ -331,6 +331,14 @@ def a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak(b: Benches
     assert again.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
 
 
+def a_spring_that_fits_like_an_inclination_is_its_rival(b: Benches) -> None:
+    """The spring has a number more, but the joint's weight is 24 % smaller with it."""
+    hidden = foreign_bench.Hidden(spring=10.0, spring_rest=-1.3)
+    runs = b.kept("sprung", lambda: foreign_bench.pair_of_runs(b.rig, hidden, noise=4.0))
+    result = b.traced(runs, "base_inclination", "joint_spring")
+    assert (result.verdict, result.tied) == ("confounded", [("joint_spring", "joint 2")])
+
+
 STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_names_nothing, ("p always 0", "no family")),
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
@@ -345,6 +353,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_noise_makes_as_large_is_not_significant, ("family-wise p", "p always 0")),
     (a_null_and_its_sensors_offset_are_confounded, ("twins",)),
     (a_gain_and_a_crosstalk_that_fit_alike_are_confounded, ("rivals",)),
+    (a_spring_that_fits_like_an_inclination_is_its_rival, ("rivals that matter",)),
     (what_a_linear_spring_leaves_of_a_cubic_one_is_not_nothing,
      ("form tolerance x 10",)),
     (a_cubic_spring_is_not_explained_by_a_linear_one, ("nothing is left",)),

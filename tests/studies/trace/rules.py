@@ -77,7 +77,7 @@ def _one_candidate(
     r = inference.sign_flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     size = np.maximum(np.diag(candidates.K), 1e-300)
-    first = int(np.argmax(size > SEARCH.least_projected_length**2 * candidates.raw))
+    first = int(np.argmax(size > candidates.least))
     gain: Array = (candidates.columns[:, first] @ r) ** 2 / size[first]
     return gain
 
@@ -132,6 +132,9 @@ RULES: Final = (
          ((gates, "invariance", lambda *_: []),)),
     Rule("family-wise p", "no significance test", (setting("p_limit", 1.0),)),
     Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
+    Rule("rivals that matter",
+         "a rival with further numbers must remove the price of each, whatever it means",
+         ((gates, "_matters", lambda *_: False),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
          ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
