@@ -352,8 +352,10 @@ def _rivals(
             continue
         (other,) = fresh
         assert isinstance(other, Effect)
+        earns = _earns_its_numbers(winner, hypothesis)
+        alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
         if (
-            not (_earns_its_numbers(winner, hypothesis) or _matters(train_data, winner, hypothesis))
+            not (earns or alike)
             or of_one_law(judged_effect, other)
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
             or _disturbed_equations(hypotheses, hypothesis, alternative)
@@ -366,9 +368,10 @@ def _rivals(
             continue
         ratio = held_out_test.ratio(rival_residual)
         tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
-            training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
-            or ratio < TRACE.decisive_ratio
+            alike or ratio < TRACE.decisive_ratio
         )
+        if not earns and not (tied and _matters(train_data, winner, hypothesis)):
+            continue
         out.append(
             Rival(
                 other.name,
