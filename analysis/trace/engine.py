@@ -50,12 +50,14 @@ from analysis.trace.notes import (
     evidence_notes,
     record_condition_notes,
     refitted_notes,
+    rival_notes,
     undetermined_notes,
     undetermined_weight_notes,
 )
 from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
     CLEAN,
+    CONFOUNDED,
     EXPLAINED,
     UNEXPLAINED,
     JudgedEffect,
@@ -289,6 +291,7 @@ def _traced(
         *unrepeated_notes(train_data),
         *finding.notes,
         *phase_notes(finding.named, records.lines),
+        *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
         *refitted_notes(winner.fit, last, after),
         *undetermined_weight_notes(winner, after),
         *record_condition_notes(train_data, winner),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Final
 
 from analysis.effects.base import Effect
@@ -11,6 +11,7 @@ from analysis.simulation.model import Model
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.judge.held_out import refitted_names
+from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
@@ -101,6 +102,22 @@ def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
         f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
         "do: the errors are given with their values; record training motions like the held-out ones"
     ]
+
+
+def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
+    """State for each effect the parameter that its tied rivals change most."""
+    out = []
+    for effect in named:
+        moved = [(abs(r.moved[1]), r) for r in effect.rivals if r.tied and r.moved]
+        for _, rival in sorted(moved, key=lambda pair: -pair[0])[:1]:
+            assert rival.moved is not None
+            parameter, change = rival.moved
+            size = f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
+            out.append(
+                f"with {rival.name} at {rival.location} in place of {effect.name}, {parameter} "
+                f"would be {size}: its interval holds only if {effect.name} is the cause"
+            )
+    return out
 
 
 def undetermined_weight_notes(winner: Hypothesis, after: Model) -> list[str]:

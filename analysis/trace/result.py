@@ -80,7 +80,8 @@ class Rival:
 
     `ratio` and `training_ratio` are the whitened residual rms of the set with the rival over that
     of the best set, held out and in training. `tied`: the records cannot separate the two. `at` is
-    the rival's place in the catalogue, with sensor or chamber.
+    the rival's place in the catalogue, with sensor or chamber. `moved` names the baseline parameter
+    that a tied rival changes most, with its relative change; None if it changes none noticeably.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Rival:
     training_ratio: float
     tied: bool
     at: str = ""
+    moved: tuple[str, float] | None = None
 
     @property
     def location(self) -> str:
@@ -364,6 +366,7 @@ def _effect(effect: JudgedEffect) -> dict[str, Any]:
                 "name": r.name, "where": r.where, "at": r.at or r.where,
                 "held_out_ratio": finite(r.ratio), "training_ratio": finite(r.training_ratio),
                 "tied": r.tied,
+                "moved": {"parameter": r.moved[0], "relative": r.moved[1]} if r.moved else None,
             }
             for r in effect.rivals
         ],

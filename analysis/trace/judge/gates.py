@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
@@ -370,7 +371,9 @@ def _rivals(
         tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
             alike or ratio < TRACE.decisive_ratio
         )
-        if not earns and not (tied and _matters(train_data, winner, hypothesis)):
+        moved = _moved_parameter(train_data, winner, hypothesis) if tied else None
+        # However many numbers it has: a free form has no parameters to compare.
+        if not earns and (moved is None or any(u.term.free for u in hypothesis.effects)):  # type: ignore[attr-defined]
             continue
         out.append(
             Rival(
@@ -380,6 +383,7 @@ def _rivals(
                 training_test.ratio(hypothesis.fit.residual),
                 tied,
                 other.where,
+                moved,
             )
         )
     out.sort(key=lambda r: (not r.tied, r.ratio))
@@ -392,23 +396,27 @@ def _earns_its_numbers(winner: Hypothesis, rival: Hypothesis) -> bool:
     return more <= 0 or rival.total <= winner.total - SEARCH.number_price * more
 
 
-def _matters(train_data: RegressionData, winner: Hypothesis, rival: Hypothesis) -> bool:
-    """Return whether a rival with a named form gives a baseline parameter another value.
+def _moved_parameter(
+    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis
+) -> tuple[str, float] | None:
+    """Return the baseline parameter that a rival changes most, and its relative change.
 
-    It differs by `TRACE.noted_shift` and lies outside the rival's 95 % interval: the intervals
-    would be wrong if the rival were true, however many numbers it has.
+    It changes by at least `TRACE.noted_shift` and lies outside the rival's 95 % interval: the
+    stated intervals would be wrong if the rival were true. None where no parameter does.
     """
-    if any(isinstance(u.term, Effect) and u.term.free for u in rival.effects):
-        return False
     names, covariance = noise_covariance(train_data, rival.fit)
-    for name in train_data.names:
-        if name in rival.fit.beta and name in winner.fit.beta:
-            value, k = winner.fit.beta[name], names.index(name)
-            shift = abs(rival.fit.beta[name] - value)
-            std = float(np.sqrt(max(covariance[k, k], 0.0)))
-            if shift > max(TRACE.noted_shift * abs(value), TRACE.normal_quantile * std):
-                return True
-    return False
+    most: tuple[str, float] | None = None
+    for c in (c for term in baseline_of(train_data.rig) for c in term.coefficients(train_data.rig)):
+        value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
+        if not value or not other or c.parameter not in names:
+            continue
+        k = names.index(c.parameter)
+        std = float(np.sqrt(max(covariance[k, k], 0.0)))
+        change = value / other - 1.0 if c.reciprocal else other / value - 1.0
+        large = abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0)
+        if large and abs(other - value) > TRACE.normal_quantile * std:
+            most = c.parameter, change
+    return most
 
 
 def _composites_in_words(

@@ -134,7 +134,7 @@ RULES: Final = (
     Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
     Rule("rivals that matter",
          "a rival with further numbers must remove the price of each, whatever it means",
-         ((gates, "_matters", lambda *_: False),)),
+         ((gates, "_moved_parameter", lambda *_: None),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
          ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
