@@ -333,7 +333,8 @@ def _rivals(
     """Return the rivals of an effect: fitted sets with another effect in its place.
 
     Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
-    held-out records have shown that it is too simple.
+    held-out records have shown that it is too simple; a richer one is a rival where it earns its
+    numbers and changes a parameter of the baseline.
     """
     judged_effect, key = used.term, (used.term.name, used.term.where)
     others, train_data = winner.keys - {key}, hypotheses.train_data
@@ -353,11 +354,12 @@ def _rivals(
             continue
         (other,) = fresh
         assert isinstance(other, Effect)
+        same_law = of_one_law(judged_effect, other)
         earns = _earns_its_numbers(winner, hypothesis)
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
         if (
             not (earns or alike)
-            or of_one_law(judged_effect, other)
+            or (same_law and not (earns and hypothesis.size > winner.size))
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
             or _disturbed_equations(hypotheses, hypothesis, alternative)
         ):
@@ -373,7 +375,8 @@ def _rivals(
         )
         moved = _moved_parameter(train_data, winner, hypothesis) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
-        if not earns and (moved is None or any(u.term.free for u in hypothesis.effects)):  # type: ignore[attr-defined]
+        free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
+        if (same_law and moved is None) or (not earns and (moved is None or free)):
             continue
         out.append(
             Rival(
@@ -415,7 +418,7 @@ def _moved_parameter(
         change = value / other - 1.0 if c.reciprocal else other / value - 1.0
         large = abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0)
         if large and abs(other - value) > TRACE.normal_quantile * std:
-            most = c.parameter, change
+            most = c.parameter, float(change)
     return most
 
 
