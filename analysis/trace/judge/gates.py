@@ -373,7 +373,8 @@ def _rivals(
         tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
             alike or ratio < TRACE.decisive_ratio
         )
-        moved = _moved_parameter(train_data, winner, hypothesis) if tied else None
+        own = judged_effect.family if same_law else ""
+        moved = _moved_parameter(train_data, winner, hypothesis, own) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
         free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
         if (same_law and moved is None) or (not earns and (moved is None or free)):
@@ -400,16 +401,20 @@ def _earns_its_numbers(winner: Hypothesis, rival: Hypothesis) -> bool:
 
 
 def _moved_parameter(
-    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis
+    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str
 ) -> tuple[str, float] | None:
     """Return the baseline parameter that a rival changes most, and its relative change.
 
     It changes by at least `TRACE.noted_shift` and lies outside the rival's 95 % interval: the
-    stated intervals would be wrong if the rival were true. None where no parameter does.
+    stated intervals would be wrong if the rival were true. None where no parameter does. Those of
+    the baseline's term of the same `law` are left out (viscous friction beside dry `friction`,
+    whose forms differ by a slope too); '' leaves out none.
     """
     names, covariance = noise_covariance(train_data, rival.fit)
     most: tuple[str, float] | None = None
-    for c in (c for term in baseline_of(train_data.rig) for c in term.coefficients(train_data.rig)):
+    rig = train_data.rig
+    others = [term for term in baseline_of(rig) if not law or not term.name.endswith(law)]
+    for c in (c for term in others for c in term.coefficients(rig)):
         value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
         if not value or not other or c.parameter not in names:
             continue
