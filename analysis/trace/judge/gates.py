@@ -333,8 +333,8 @@ def _rivals(
     """Return the rivals of an effect: fitted sets with another effect in its place.
 
     Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
-    held-out records have shown that it is too simple; a richer one is a rival where it earns its
-    numbers and changes a parameter of the baseline.
+    held-out records have shown that it is too simple; a richer one is a rival where it changes a
+    parameter of another law.
     """
     judged_effect, key = used.term, (used.term.name, used.term.where)
     others, train_data = winner.keys - {key}, hypotheses.train_data
@@ -359,7 +359,7 @@ def _rivals(
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
         if (
             not (earns or alike)
-            or (same_law and not (earns and hypothesis.size > winner.size))
+            or (same_law and hypothesis.size <= winner.size)
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
             or _disturbed_equations(hypotheses, hypothesis, alternative)
         ):
