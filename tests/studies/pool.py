@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from analysis.workers.cluster import DaskCluster
+from protocols.engine.states import ProtocolAborted
 from rig.model.parse import InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Workers = int | str  # processes of this machine, or tcp://HOST:PORT of a Dask scheduler
-NO_RESULT: Final = (InputError, RuntimeError)  # e.g. a simulated plant that leaves its limits
+# A simulated plant that leaves its limits, or a protocol that it cannot run.
+NO_RESULT: Final = (InputError, RuntimeError, ProtocolAborted)
 
 
 @dataclass(frozen=True)
