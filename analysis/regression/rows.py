@@ -68,6 +68,10 @@ class Rows:
     time: Array
     masked: int
 
+    def at(self, kept: Mask) -> Rows:
+        """Return the rows where a mask (m,) holds."""
+        return replace(self, matrix=self.matrix[kept], rhs=self.rhs[kept], time=self.time[kept])
+
 
 def matrix_of(rows: Rows, names: tuple[str, ...]) -> Array:
     """Return the columns (m, k) of parameters, 0 for those that the rows lack."""

@@ -230,8 +230,7 @@ def regression_data(
 
 
 def _rows_at(rows: Rows, time: Array) -> Rows:
-    kept = np.isin(rows.time, time)
-    return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
+    return rows.at(np.isin(rows.time, time))
 
 
 @dataclass(frozen=True)

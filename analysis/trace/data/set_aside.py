@@ -75,8 +75,7 @@ def set_aside(
 
 def judging_rows(rows: Rows) -> Rows:
     """Return a record's rows in the blocks that are set aside."""
-    kept = in_judging_block(rows.time)
-    return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
+    return rows.at(in_judging_block(rows.time))
 
 
 def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Run, ...]:

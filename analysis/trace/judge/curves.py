@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,27 +62,24 @@ def curves_that_limit(data: RegressionData, model: ExactFit) -> tuple[Used, ...]
 
 
 def rows_within(
-    rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, equation: str, rows: Rows
+    rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, rows: Rows
 ) -> Rows:
-    """Return a record's rows of an equation that lie within the outermost knots of all curves."""
-    inside = np.ones(len(rows.time), dtype=bool)
-    for used in curves:
-        inside &= _between_knots(rig, used, conditioned, equation, rows)
-    return replace(rows, matrix=rows.matrix[inside], rhs=rows.rhs[inside], time=rows.time[inside])
+    """Return a record's rows of an equation that lie between the outermost knots of all curves."""
+    return rows.at(_within_all(rig, curves, conditioned, rows))
 
 
 def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
     """Return a note for every equation of which judging rows lie beyond a model's free curves."""
     inside = _within_knots(data, model)
-    beyond = data.at(~inside).row_counts if not inside.all() else {}
+    kept = _rows_inside(data, inside)
     role = "they speak neither for nor against it, and are left out of the errors"
     if not _enough_within(data, inside):
         role = "too few remain without them, so that they judge the extrapolated curve"
     return [
-        f"{e}: {plain(100 * beyond[e] / rows, 2)} % of the judging rows lie beyond the range of "
-        f"the fitted curve: {role}; train with motions at least as large"
+        f"{e}: {plain(100 * (rows - kept[e]) / rows, 2)} % of the judging rows lie beyond the "
+        f"range of the fitted curve: {role}; train with motions at least as large"
         for e, rows in data.row_counts.items()
-        if e in beyond
+        if kept[e] < rows
     ]
 
 
@@ -93,29 +89,42 @@ def _free_curves(model: ExactFit) -> tuple[Used, ...]:
 
 def _within_knots(data: RegressionData, model: ExactFit) -> NDArray[np.bool_]:
     """Return which rows (M,) lie within the outermost knots of all free curves of a model."""
-    inside = np.ones(len(data.base), dtype=bool)
-    for used in _free_curves(model):
-        for segment in data.segments:
-            record, rows = data.source(segment)
-            inside[segment.where] &= _between_knots(data.rig, used, record, segment.equation, rows)
+    inside, curves = np.ones(len(data.base), dtype=bool), _free_curves(model)
+    for s in data.segments:
+        inside[s.where] = _within_all(data.rig, curves, *data.source(s))
     return inside
+
+
+def _rows_inside(data: RegressionData, inside: NDArray[np.bool_]) -> Counter[str]:
+    """Return how many rows of each equation a mask (M,) keeps."""
+    kept: Counter[str] = Counter()
+    for s in data.segments:
+        kept[s.equation] += int(np.count_nonzero(inside[s.where]))
+    return kept
 
 
 def _enough_within(data: RegressionData, inside: NDArray[np.bool_]) -> bool:
     """Return whether each equation keeps at least `TRACE.least_rows` of its rows inside (M,)."""
-    kept: Counter[str] = Counter()
-    for s in data.segments:
-        kept[s.equation] += int(np.count_nonzero(inside[s.where]))
-    least = {e: min(rows, TRACE.least_rows) for e, rows in data.row_counts.items()}
-    return all(kept[e] >= count for e, count in least.items())
+    kept = _rows_inside(data, inside)
+    return all(kept[e] >= min(rows, TRACE.least_rows) for e, rows in data.row_counts.items())
+
+
+def _within_all(
+    rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, rows: Rows
+) -> NDArray[np.bool_]:
+    """Return which rows (m,) lie between the outermost knots of every curve."""
+    inside = np.ones(len(rows.time), dtype=bool)
+    for used in curves:
+        inside &= _between_knots(rig, used, conditioned, rows)
+    return inside
 
 
 def _between_knots(
-    rig: Rig, used: Used, conditioned: ConditionedRecord, equation: str, rows: Rows
+    rig: Rig, used: Used, conditioned: ConditionedRecord, rows: Rows
 ) -> NDArray[np.bool_]:
     """Return in which rows (m,) the variable of a curve lies between its outermost knots."""
     assert isinstance(used.term, Effect)
-    values = used.term.abscissa(rig, conditioned.signals).get(equation)
+    values = used.term.abscissa(rig, conditioned.signals).get(rows.equation)
     if values is None:
         return np.ones(len(rows.time), dtype=bool)
     named = zip(shapes_of(rig, used), used.shape, strict=True)

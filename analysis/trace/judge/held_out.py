@@ -143,7 +143,7 @@ def errors(
     floor = {(f.group, f.equation): f.noise for f in split}
     first, other = (
         [
-            {e: rows_within(rig, curves, c, e, rows) for e, rows in rows_of.items()}
+            {e: rows_within(rig, curves, c, rows) for e, rows in rows_of.items()}
             for c, rows_of in zip(members, built, strict=True)
         ]
         for built in (first, other)

@@ -43,8 +43,8 @@ def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
     data = regression_data(
         rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
     )
-    refined: tuple[Used, ...] = ()
     seen = evidence(data, data.mean_residual)
+    refined: tuple[Used, ...] = ()
     for used in wanted:
         assert isinstance(used.term, Effect)
         looks = shape_grid(used.term, rig, seen)
