@@ -108,15 +108,15 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
     """State for each effect the parameter that its tied rivals change most."""
     out = []
     for effect in named:
-        moved = [(abs(r.moved[1]), r) for r in effect.rivals if r.tied and r.moved]
-        for _, rival in sorted(moved, key=lambda pair: -pair[0])[:1]:
-            assert rival.moved is not None
-            parameter, change = rival.moved
-            size = f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
-            out.append(
-                f"with {rival.name} at {rival.location} in place of {effect.name}, {parameter} "
-                f"would be {size}: its interval holds only if {effect.name} is the cause"
-            )
+        moved = [(*r.moved, r) for r in effect.rivals if r.moved]
+        if not moved:
+            continue
+        parameter, change, rival = max(moved, key=lambda found: abs(found[1]))
+        size = f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
+        out.append(
+            f"with {rival.name} at {rival.location} in place of {effect.name}, {parameter} would "
+            f"be {size}: its interval holds only if {effect.name} is the cause"
+        )
     return out
 
 

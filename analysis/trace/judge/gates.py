@@ -336,8 +336,8 @@ def _rivals(
     held-out records have shown that it is too simple; a richer one is a rival where it changes a
     parameter of another law.
     """
-    judged_effect, key = used.term, (used.term.name, used.term.where)
-    others, train_data = winner.keys - {key}, hypotheses.train_data
+    judged_effect, train_data = used.term, hypotheses.train_data
+    others = winner.keys - {(judged_effect.name, judged_effect.where)}
     training_test = _TieTest(
         train_data,
         _removed_energy(winner, alternative),
@@ -346,19 +346,14 @@ def _rivals(
     )
     out = []
     assert isinstance(judged_effect, Effect)
-    for hypothesis in hypotheses.fitted.values():
-        fresh = [
-            u.term for u in hypothesis.effects if (u.term.name, u.term.where) not in winner.keys
-        ]
-        if key in hypothesis.keys or not others <= hypothesis.keys or len(fresh) != 1:
-            continue
-        (other,) = fresh
+    for hypothesis, fresh in hypotheses.replacements(winner, used):
+        other = fresh.term
         assert isinstance(other, Effect)
         same_law = of_one_law(judged_effect, other)
-        earns = _earns_its_numbers(winner, hypothesis)
+        justified = _numbers_justified(winner, hypothesis)
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
         if (
-            not (earns or alike)
+            not (justified or alike)
             or (same_law and hypothesis.size <= winner.size)
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
             or _disturbed_equations(hypotheses, hypothesis, alternative)
@@ -377,7 +372,7 @@ def _rivals(
         moved = _moved_parameter(train_data, winner, hypothesis, own) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
         free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
-        if (same_law and moved is None) or (not earns and (moved is None or free)):
+        if (same_law and moved is None) or (not justified and (moved is None or free)):
             continue
         out.append(
             Rival(
@@ -394,7 +389,7 @@ def _rivals(
     return out[: TRACE.most_rivals]
 
 
-def _earns_its_numbers(winner: Hypothesis, rival: Hypothesis) -> bool:
+def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
     """Return whether each further free number of a rival removes `SEARCH.number_price`."""
     more = rival.size[1] - winner.size[1]
     return more <= 0 or rival.total <= winner.total - SEARCH.number_price * more

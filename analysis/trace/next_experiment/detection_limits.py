@@ -89,12 +89,10 @@ def _fitted_instead(
     """Return the fitted shapes of other names of a set's laws, each in place of the set's name."""
     out: dict[Effect, tuple[float, ...]] = {}
     for own in winner.effects:
-        others = winner.keys - {(own.term.name, own.term.where)}
-        for hypothesis in hypotheses.fitted.values():
-            fresh = [u for u in hypothesis.effects if (u.term.name, u.term.where) not in others]
-            if len(fresh) == 1 and others < hypothesis.keys and law_of(fresh[0]) == law_of(own):
-                assert isinstance(fresh[0].term, Effect)
-                out[fresh[0].term] = fresh[0].shape
+        for _, other in hypotheses.replacements(winner, own):
+            if law_of(other) == law_of(own):
+                assert isinstance(other.term, Effect)
+                out[other.term] = other.shape
     return out
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -133,6 +133,17 @@ class HypothesisSet:
             if self.refined(effects).total > known.total:
                 self.fitted[known.keys] = known
         return self.fitted[known.keys]
+
+    def replacements(self, winner: Hypothesis, used: Used) -> Iterator[tuple[Hypothesis, Used]]:
+        """Yield the fitted sets with one other effect in the place of `used`, and that effect."""
+        key = used.term.name, used.term.where
+        others = winner.keys - {key}
+        for hypothesis in self.fitted.values():
+            fresh = [
+                u for u in hypothesis.effects if (u.term.name, u.term.where) not in winner.keys
+            ]
+            if key not in hypothesis.keys and others <= hypothesis.keys and len(fresh) == 1:
+                yield hypothesis, fresh[0]
 
     def log_energy_ratio(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
         """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
