@@ -278,7 +278,9 @@ def _traced(
         for fit in (hypotheses.empty.fit, winner.fit)
     )
     curves = curves_that_limit(unseen.judging, winner.fit)
-    error = held_out.errors(rig, unseen.members, first, last, unseen.divided, curves)
+    error = held_out.errors(
+        rig, unseen.members, first, last, unseen.divided, curves, train_data.floors
+    )
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
         detection_limits(hypotheses, prepared.candidates, winner, after)

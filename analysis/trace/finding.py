@@ -132,11 +132,11 @@ def trace_rows(
     train_data = _training_rows(rig, terms, conditioned(records.train), cache)
     terms, beta = train_data.terms, train_data.beta
     members = conditioned(records.holdout)
-    data = regression_data(rig, terms, members, beta)
+    data = regression_data(rig, terms, members, beta, others=train_data.floors)
     if not records.judge:
         return TraceRows(train_data, set_aside(data, members, records.holdout))
     members = conditioned(records.judge)
-    judging = regression_data(rig, terms, members, beta)
+    judging = regression_data(rig, terms, members, beta, others=train_data.floors)
     return TraceRows(train_data, UnseenRows(data, judging, tuple(members), records.holdout))
 
 

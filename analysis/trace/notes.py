@@ -8,7 +8,7 @@ from typing import Final
 from analysis.effects.base import Effect
 from analysis.effects.free_forces import PositionForce
 from analysis.simulation.model import Model
-from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
+from analysis.trace.data.noise_floor import NEIGHBOURS, OTHER_STEPS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.judge.held_out import refitted_names
 from analysis.trace.result import JudgedEffect
@@ -31,11 +31,19 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
             "the rig file's stated sensor noise; noise above that value would be taken "
             "for model error, so the evidence for every name is weaker"
         )
-    elif sources != {REPEATS}:
+    elif not sources <= {REPEATS, OTHER_STEPS}:
         where = PERIODS if PERIODS in sources else NEIGHBOURS
         out.append(f"one repeat per step: the noise floor comes from {where} within the record")
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
+    scaled = [
+        f.group[1] for d in (train_data, holdout_data) for f in d.floors if f.source == OTHER_STEPS
+    ]
+    if scaled:
+        out.append(
+            f"one repeat of {' '.join(sorted(set(scaled)))}: the noise floor is the rig file's "
+            "stated sensor noise times the ratio that repeats of other steps show"
+        )
     return [
         *out,
         *_masked_step_notes(train_data),

@@ -6,8 +6,9 @@ A record that is the only repeat of its step is cut into its periods, which serv
 there are no periods either, but the motion comes back to states x where it was before,
  noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
 (a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
-rig's stated sensor noise, put through the same rows, is used. It lacks every noise that the rig
-file does not state, and a note says so.
+rig's stated sensor noise, put through the same rows, is used, times the ratio of measured to stated
+noise in steps that are repeated. Without any such step it lacks every noise that the rig file does
+not state, and a note says so.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
@@ -34,6 +35,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
+OTHER_STEPS = "repeats of other steps"
 Group = tuple[int, str]
 NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
 
@@ -76,8 +78,13 @@ def floors(
     members: Sequence[ConditionedRecord],
     rows: Sequence[Mapping[str, Rows]],
     beta: Mapping[str, float],
+    others: Sequence[Floor] = (),
 ) -> list[Floor]:
-    """Return the split of every equation of every group of records under a model."""
+    """Return the split of every equation of every group of records under a model.
+
+    `others` are floors of other records of the machine: groups without repeats take the ratio of
+    measured to stated noise from those and from the groups that have repeats.
+    """
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
         groups.setdefault(conditioned.group, []).append(index)
@@ -103,9 +110,42 @@ def floors(
                 near = noise_by_neighbours(members[indices[0]], parts[0], residual[0])
                 if near is not None:
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
-            repeatable_rms = float(np.sqrt(max(0.0, total**2 - noise**2)))
-            out.append(Floor(group, equation, noise, repeatable_rms, total, 1, source, sensors))
-    return out
+            out.append(_unrepeated(group, equation, noise, total, source, sensors))
+    scale = _measured_over_stated([*out, *others])
+    return [_scaled(floor, scale) for floor in out]
+
+
+def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:
+    """Return by equation the rms ratio of noise measured in repeats or periods to stated noise.
+
+    Each group counts by the degrees of freedom of its repeats.
+    """
+    ratios: dict[str, list[float]] = {}
+    weights: dict[str, list[int]] = {}
+    for floor in split:
+        if floor.source in (REPEATS, PERIODS) and floor.stated > NO_ROWS:
+            ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
+            weights.setdefault(floor.equation, []).append(floor.count - 1)
+    return {
+        e: float(np.sqrt(np.average(np.square(measured), weights=weights[e])))
+        for e, measured in ratios.items()
+    }
+
+
+def _scaled(floor: Floor, scale: Mapping[str, float]) -> Floor:
+    """Return a floor by stated noise times the ratio of its equation, others unchanged."""
+    if floor.source != STATED or floor.equation not in scale:
+        return floor
+    noise = floor.stated * scale[floor.equation]
+    return _unrepeated(floor.group, floor.equation, noise, floor.total, OTHER_STEPS, floor.stated)
+
+
+def _unrepeated(
+    group: Group, equation: str, noise: float, total: float, source: str, stated: float
+) -> Floor:
+    """Return the floor of a group without repeats: all above its noise counts as repeatable."""
+    repeatable = float(np.sqrt(max(0.0, total**2 - noise**2)))
+    return Floor(group, equation, noise, repeatable, total, 1, source, stated)
 
 
 def noise_by_neighbours(

@@ -18,7 +18,7 @@ from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
-from analysis.trace.data.noise_floor import Group, floors
+from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import judging_rows
 from analysis.trace.data.temperature_nuisance import within_plausible_slope
@@ -116,14 +116,15 @@ def errors(
     after: ExactFit,
     divided: Collection[Group] = (),
     curves: Sequence[Used] = (),
+    others: Sequence[Floor] = (),
 ) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
     `members` are the records, each repeat by itself; of those in `divided` groups only the judging
     rows count, and only rows within the outermost knots of `curves`. The noise floor is that of the
     residual under the model `after`. A record without repeats has a floor by its periods or
-    neighbouring states, for which all its rows are used. Sines that are taken out of the rows are
-    part of what the model `before` leaves.
+    neighbouring states, for which all its rows are used, or by `others` (`noise_floor.floors`).
+    Sines that are taken out of the rows are part of what the model `before` leaves.
     """
     bare = [replace(c, filtering=replace(c.filtering, lines=())) for c in members]
     whole = [model_rows(rig, after.terms, conditioned) for conditioned in members]
@@ -139,7 +140,7 @@ def errors(
         rows if repeats[c.group] > 1 else every
         for c, rows, every in zip(members, other, whole, strict=True)
     ]
-    split = floors(rig, after.terms, members, compared, after.beta)
+    split = floors(rig, after.terms, members, compared, after.beta, others)
     floor = {(f.group, f.equation): f.noise for f in split}
     first, other = (
         [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,15 @@ from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.noise_floor import NEIGHBOURS, REPEATS, STATED, Floor, floors, stated_noise
+from analysis.trace.data.noise_floor import (
+    NEIGHBOURS,
+    OTHER_STEPS,
+    REPEATS,
+    STATED,
+    Floor,
+    floors,
+    stated_noise,
+)
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.data.unrepeated import dominant_frequency, unrepeated_notes
 from analysis.trace.settings import DATA
@@ -96,6 +105,26 @@ def test_a_motion_that_comes_back_shows_noise_that_the_rig_file_does_not_state()
     assert (once.source, thrice.source, known.source) == (STATED, NEIGHBOURS, REPEATS)
     assert once.noise < 0.3 * known.noise
     assert thrice.noise == pytest.approx(known.noise, rel=0.35)
+
+
+def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> None:
+    """In the same records, and in held-out ones that have no repeats at all."""
+    repeated, once = to_and_fro(1, 4), to_and_fro(1)
+    other = replace(once, records=tuple(replace(r, step="other") for r in once.records))
+    rig, known = repeated.rig, floor_of(repeated)
+    terms = (*map(Used, baseline_of(rig)), Used(CoulombFriction("joint 1"), (1e-5, 0.0, 0.0)))
+
+    def floors_of(*runs: Run, others: Sequence[Floor] = ()) -> dict[str, Floor]:
+        data = regression_data(rig, terms, conditioned_records(rig, runs), others=others)
+        return {f.group[1]: f for f in data.floors}
+
+    together = floors_of(repeated, other)
+    apart = floors_of(other, others=[known])
+    for floor in (together["other"], apart["other"]):
+        assert floor.source == OTHER_STEPS
+        assert floor.noise == pytest.approx(known.noise, rel=0.1)
+    assert together["moves"].source == REPEATS
+    assert floors_of(other)["other"].source == STATED
 
 
 def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(rig: Rig) -> None:
