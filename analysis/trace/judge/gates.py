@@ -428,35 +428,18 @@ def _composites_in_words(
 ) -> str:  # fmt: skip
     """Name two effects that together leave as little as one ('' if none do).
 
-    A simpler name of its law is tried with a confounder of another mechanism: for levels of
-    friction by direction one level and an offset torque, which differ by the lever arm only. They
-    make no rival, since one effect is the simpler explanation.
+    For levels of friction by direction one level and an offset torque differ by the lever arm only.
+    They make no rival, since one effect is the simpler explanation.
     """
-    own, rig = used.term, hypotheses.train_data.rig
-    assert isinstance(own, Effect)
-    known = winner.keys | {(u.term.name, u.term.where) for u in hypotheses.base}
-    others = [u for u in winner.effects if u is not used]
-    for simple in (effect_of(name, own.where) for name in own.includes):
-        for other in hypotheses.effects:
-            if (
-                other.name not in own.confounders
-                or other.where != own.where
-                or other.mechanism == own.mechanism
-                or {(simple.name, own.where), (other.name, own.where)} & known
-                or len(others) + 2 > SEARCH.largest_set
-            ):
-                continue
-            pair = [Used(e, e.shape_of(rig, ())) for e in (simple, other)]
-            both = hypotheses.refined([*others, *pair])
-            if hypotheses.physical_problem(both):
-                continue
-            residual = held_out_residual(holdout_data, both.fit)
-            if held_out_test.ties(residual, TRACE.tie_ratio):
-                ratio = held_out_test.ratio(residual)
-                return (
-                    f"; {simple.name} and {other.name} together would leave {ratio:.2f} times the "
-                    "held-out rms"
-                )
+    for effects in hypotheses.composites(winner, used):
+        both = hypotheses.refined(effects)
+        if hypotheses.physical_problem(both):
+            continue
+        residual = held_out_residual(holdout_data, both.fit)
+        if held_out_test.ties(residual, TRACE.tie_ratio):
+            names = " and ".join(u.term.name for u in effects[-2:])
+            ratio = held_out_test.ratio(residual)
+            return f"; {names} together would leave {ratio:.2f} times the held-out rms"
     return ""
 
 

@@ -347,9 +347,22 @@ class HypothesisSet:
     def exchanged(self, now: Hypothesis) -> Hypothesis:
         """Return the set, or a better one with an effect exchanged for one that is easily confused.
 
-        An effect that was chosen before the last one was added may be wrong beside it.
+        An effect that was chosen before the last one was added may be wrong beside it, and one
+        effect may be chosen in place of two (`composites`).
         """
-        sets: list[tuple[Used, ...]] = []
+        seen = {now.keys}
+        while sets := self._confusable_sets(now):
+            pruned = self.prune(self.best([now, *map(self.refined, sets)]))
+            other = self.best([now, pruned])  # one that lost an effect again may be worse
+            if other.keys in seen:
+                break
+            now = other
+            seen.add(now.keys)
+        return now
+
+    def _confusable_sets(self, now: Hypothesis) -> list[tuple[Used, ...]]:
+        """Return the sets with one effect exchanged for another or for two."""
+        sets = [effects for used in now.effects for effects in self.composites(now, used)]
         for used in now.effects if len(now.effects) > 1 else ():
             others = tuple(u for u in now.effects if u is not used)
             for effect in self.effects:
@@ -360,10 +373,30 @@ class HypothesisSet:
                 if used.term.name in effect.includes and effect.where == used.term.where:
                     # Another effect may only have made up for what the simpler law lacks.
                     sets += [(*(u for u in others if u is not one), fresh) for one in others]
-        if not sets:
-            return now
-        other = self.prune(self.best([now, *map(self.refined, sets)]))
-        return now if other.keys == now.keys else self.exchanged(other)
+        return sets
+
+    def composites(self, now: Hypothesis, used: Used) -> list[tuple[Used, ...]]:
+        """Return the sets with a simpler name of an effect's law and a confounder in its place.
+
+        The confounder has another mechanism and is at the effect's joint. Friction of one level
+        with the offset of a pressure is nearly friction of two levels, but for the flows.
+        """
+        own, rig = used.term, self.train_data.rig
+        assert isinstance(own, Effect)
+        known = now.keys | {(u.term.name, u.term.where) for u in self.base}
+        others = tuple(u for u in now.effects if u is not used)
+        if len(others) + 2 > SEARCH.largest_set:
+            return []
+        simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
+        confounders = [
+            e for e in self.effects
+            if e.name in own.confounders and _joint(e) == _joint(own)
+            and e.mechanism != own.mechanism and (e.name, e.where) not in known
+        ]  # fmt: skip
+        return [
+            (*others, *(Used(e, e.shape_of(rig, ())) for e in (simple, other)))
+            for simple in simpler for other in confounders
+        ]  # fmt: skip
 
     def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect that removes most from `equations`, None where none does.
