@@ -91,6 +91,16 @@ def loss_in_deviations(restricted: Array, richer: Array) -> float:
     return float(restricted @ change) / size if size > 0 else 0.0
 
 
+def loses_by_restriction(restricted: Array, richer: Array) -> bool:
+    """Return whether a restricted model loses more than noise to the richer one, and leaves more.
+
+    Both residuals (M,) are those of `loss_in_deviations`. Where an unknown cause changes the rows
+    along d, the loss alone is large for either model: the richer one must have the smaller energy.
+    """
+    lost = loss_in_deviations(restricted, richer) > TRACE.standard_errors
+    return lost and float(richer @ richer) < float(restricted @ restricted)
+
+
 def of_one_law(effect: Effect, other: Effect) -> bool:
     """Return whether one of two effects at the same place includes the other as a special case."""
     near = effect.name in other.includes or other.name in effect.includes
@@ -105,8 +115,8 @@ def _needs_richer(
 
     In training `other` must remove: with the same number of effects more than noise for each
     number, and `_form_error_energy`; with one more effect what a further effect must. In held-out
-    records `hypothesis`, whose residual there is `held` (M,), must lose more than
-    `TRACE.standard_errors`. The training rows must determine an effect that is added
+    records `hypothesis`, whose residual there is `held` (M,), must leave more than `other` and lose
+    more than `TRACE.standard_errors`. The training rows must determine an effect that is added
     (`_is_determined`). One that replaces another removes `TRACE.richer_name_share` of what
     `hypothesis` leaves, or has intervals that exclude the simpler one (`Effect.distinct`): two
     levels of friction remove little where a change of W makes most of their difference.
@@ -121,8 +131,7 @@ def _needs_richer(
     removed = hypothesis.fit.energy - other.fit.energy
     if removed <= least:
         return False
-    lost = loss_in_deviations(held, held_out_residual(holdout_data, other.fit))
-    if lost <= TRACE.standard_errors:
+    if not loses_by_restriction(held, held_out_residual(holdout_data, other.fit)):
         return False
     fresh = [u for u in other.effects if (u.term.name, u.term.where) not in hypothesis.keys]
     if added:

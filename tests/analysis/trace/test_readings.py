@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.judge import readings
+from analysis.trace.settings import TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
@@ -97,3 +99,18 @@ def test_one_level_with_the_offset_of_a_pressure_is_not_taken_for_levels_by_dire
         ("coulomb_friction", "joint 2"),
         ("sensor_offset", "joint 2 cap"),
     }
+
+
+@pytest.mark.parametrize(
+    ("truth", "needed"), [(0.0, False), (0.4, False), (0.6, True), (1.0, True)]
+)
+def test_a_richer_name_must_leave_less_in_held_out_records(truth: float, needed: bool) -> None:
+    """The richer model subtracts a curve; the held-out rows hold a share of it."""
+    rng = np.random.default_rng(3)
+    curve = np.sin(np.linspace(0.0, 40.0, 4000))
+    rows = rng.standard_normal(len(curve)) + truth * curve
+    richer = rows - curve
+    if 0.0 < truth < 1.0:
+        assert readings.loss_in_deviations(rows, richer) > TRACE.standard_errors
+        assert readings.loss_in_deviations(richer, rows) > TRACE.standard_errors
+    assert readings.loses_by_restriction(rows, richer) is needed
