@@ -78,7 +78,7 @@ def propose(
     rng = np.random.default_rng(EXPERIMENT.seed)
     tried = list(ex.excitations(rig_with_estimates(train_data), train_data.records, rng, families))
     if not tried:
-        return _experiment_in_words(winner, questions) if verdict == CONFOUNDED else None
+        return _experiment_in_words(effects, questions) if verdict == CONFOUNDED else None
     measured = noise_ratios(train_data)
     views = [measurement_view(train_data, candidate, measured) for candidate in tried]
     kind = SHOW if verdict == CLEAN else TELL
@@ -283,9 +283,14 @@ def _proposal(
 
 
 def _names(answers: Sequence[PredictedAnswer]) -> list[dict[str, str]]:
-    """Return names and places of all effects in the questions, each once."""
-    keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
-    names = dict.fromkeys((k["name"], k["where"]) for k in keys)
+    """Return names and places of the effects that only one side of a question has, each once."""
+    names: dict[tuple[str, str], None] = {}
+    for answer in answers:
+        one, other = (
+            [(k["name"], k["where"]) for k in h.keys]
+            for h in (answer.question.one, answer.question.other)
+        )
+        names |= dict.fromkeys(k for k in (*one, *other) if (k in one) != (k in other))
     return [{"name": name, "where": where} for name, where in names]
 
 
@@ -302,10 +307,11 @@ def _protocols(
 
 
 def _experiment_in_words(
-    winner: Hypothesis, asked: Sequence[PredictedAnswer]
+    effects: Sequence[JudgedEffect], asked: Sequence[PredictedAnswer]
 ) -> Mapping[str, Any] | None:
     """Describe an experiment in words, for rigs without nominal values and so without a twin."""
-    texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
+    tied = [e.name for e in effects if any(r.tied for r in e.rivals)]
+    texts = [getattr(known()[name], "separated_by", "") for name in tied]
     return {
         "kind": TELL,
         "separates": _names(asked),

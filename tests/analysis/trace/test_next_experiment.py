@@ -12,6 +12,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.next_experiment import proposal
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
     Explanation,
@@ -150,3 +151,16 @@ def test_every_effect_that_can_show_has_a_size_worth_knowing() -> None:
     assert "payload" in {e.name for e in without}
     assert all(e.absorbed(rig) for e in without)
     assert largest_rms(train_data, np.zeros(train_data.base.shape[0])) == 0.0
+
+
+def test_only_effects_that_one_answer_lacks_are_separated() -> None:
+    """A metering curve that both answers hold is no part of the question."""
+    rig = load_rig("shinshu-2dof")
+    at = {(e.name, e.where): Used(e, e.shape_of(rig, ())) for e in catalogue(rig)}
+    shared = at["internal_leakage", "joint 1"]
+    lag, delay = at["sensor_lag", "joint 1 rod"], at["channel_delay", "joint 1 rod"]
+    question = OpenQuestion(Explanation((shared, lag)), Explanation((shared, delay)))
+    assert proposal._names([proposal.PredictedAnswer(question, 0.0)]) == [
+        {"name": "sensor_lag", "where": "joint 1 rod"},
+        {"name": "channel_delay", "where": "joint 1 rod"},
+    ]
