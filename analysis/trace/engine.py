@@ -51,8 +51,8 @@ from analysis.trace.notes import (
     record_condition_notes,
     refitted_notes,
     rival_notes,
+    shared_parameter_notes,
     undetermined_notes,
-    undetermined_weight_notes,
 )
 from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
@@ -295,7 +295,7 @@ def _traced(
         *phase_notes(finding.named, records.lines),
         *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
         *refitted_notes(winner.fit, last, after),
-        *undetermined_weight_notes(winner, after),
+        *shared_parameter_notes(winner, after),
         *record_condition_notes(train_data, winner),
         *undetermined_notes(after, undetermined),
         *kept,

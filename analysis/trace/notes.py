@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from typing import Final
 
 from analysis.effects.base import Effect
-from analysis.effects.free_forces import PositionForce
+from analysis.effects.free_forces import FrictionCurve, PositionForce
 from analysis.simulation.model import Model
 from analysis.trace.data.noise_floor import NEIGHBOURS, OTHER_STEPS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
@@ -128,12 +128,19 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
     return out
 
 
-def undetermined_weight_notes(winner: Hypothesis, after: Model) -> list[str]:
-    """Name the weight parameters that a free force over position makes undetermined in one pose."""
-    joints = [u.term.joint + 1 for u in winner.effects if isinstance(u.term, PositionForce)]
-    return [
-        f"W{joint} is no measured weight: in one pose of the other joints gravity is a force over "
-        f"position too, and position_force at joint {joint} shares it"
-        for joint in joints
-        if f"W{joint}" in after.parameters
-    ]
+def shared_parameter_notes(winner: Hypothesis, after: Model) -> list[str]:
+    """Name the baseline parameters that free curves of the same joint share, with the reason."""
+    out = []
+    for effect in (u.term for u in winner.effects):
+        if isinstance(effect, PositionForce):
+            name, what = f"W{effect.joint + 1}", "weight"
+            why = "in one pose of the other joints gravity is a force over position too"
+        elif isinstance(effect, FrictionCurve) and not after.rig.electric:
+            name, what = f"Fv{effect.joint + 1}", "viscous friction"
+            why = "where the lever arm hardly changes it is a slope of friction over speed too"
+        else:
+            continue
+        if name in after.parameters:
+            shared = f"{effect.name} at {effect.where} shares it"
+            out.append(f"{name} is no measured {what}: {why}, and {shared}")
+    return out

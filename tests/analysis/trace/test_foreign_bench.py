@@ -233,6 +233,7 @@ def test_dry_friction_that_grows_along_the_stroke_is_a_curve_that_grows(rig: Rig
     there = 80.0 * np.sign(line.x) + slope * line.x
     assert line.y[fast] == pytest.approx(there[fast], rel=0.04)
     assert any("times that at mid-stroke" in note for note in result.notes)
+    assert any(note.startswith("Fv2 is no measured viscous friction") for note in result.notes)
     assert result.after["torque_2"] < 1.2 * result.noise_floor["torque_2"]
     assert result.model_after.values["W2"] == pytest.approx(TRUTH["W2"], rel=0.01)
 
