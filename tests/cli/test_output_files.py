@@ -134,6 +134,12 @@ def test_a_full_device_behind_standard_output_is_named(lab: Path) -> None:
     assert done.stderr == "bramah: No space left on device (standard output: /dev/full)\n"
 
 
+def test_results_for_a_closed_standard_output_are_no_error(lab: Path) -> None:
+    line = ["sh", "-c", 'exec "$@" >&-', "sh", *words("schema")]
+    done = subprocess.run(line, cwd=lab, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_file_name_that_is_not_utf_8_is_a_name(lab: Path) -> None:
     new = os.fsdecode(b"new/\xff")
     line = words("identify", RUN, "--report", f"{new}.html", "--model", f"{new}.json")

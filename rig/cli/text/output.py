@@ -86,7 +86,7 @@ def write_json(path: Path | None, data: Any) -> None:
         return
     text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
     if str(path) == "-":
-        sys.stdout.write(text)
+        print(text, end="")  # to nowhere where standard output is closed
         return
     from rig.runs.files import write_text
 
