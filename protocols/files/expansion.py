@@ -261,17 +261,27 @@ def _renamed(data: Any, ending: str) -> Any:
 
 
 def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
-    """Return the steps, with a number appended to repeated names of an included file."""
-    taken = {s.data.get("name") for s in steps if not s.included and isinstance(s.data, dict)}
+    """Return the steps, with a number appended to repeated names of an included file.
+
+    Nested steps take the number of the step that they are in.
+    """
+    taken = {name for s in steps if not s.included for name in _names(s.data)}
     unique = []
     for step in steps:
-        data = step.data
-        if step.included and isinstance(data, dict) and data.get("name") is not None:
-            number, ending = 1, ""
-            while data["name"] + ending in taken:
-                number += 1
-                ending = f"_{number}"
-            data = _renamed(data, ending) if ending else data
-            taken.add(data["name"])
-        unique.append(replace(step, data=data))
+        names = _names(step.data) if step.included else []
+        number, ending = 1, ""
+        while any(name + ending in taken for name in names):
+            number += 1
+            ending = f"_{number}"
+        taken.update(name + ending for name in names)
+        unique.append(replace(step, data=_renamed(step.data, ending)) if ending else step)
     return unique
+
+
+def _names(data: Any) -> list[str]:
+    """Return the name of a step and those of the steps nested in it."""
+    if not isinstance(data, dict):
+        return []
+    own = [data["name"]] if isinstance(data.get("name"), str) else []
+    nested = data["steps"] if isinstance(data.get("steps"), list) else []
+    return own + [name for step in nested for name in _names(step)]

@@ -123,6 +123,17 @@ def test_an_include_brings_the_steps_of_another_file(tmp_path: Path) -> None:
     assert [s.name for s in made.excitations] == ["sine", "sine_2"]
 
 
+def test_steps_nested_in_a_file_that_is_included_twice_have_names_of_their_own(
+    tmp_path: Path,
+) -> None:
+    nested = "".join(f"    {line}\n" for line in SINE.replace("$amplitude", "0.1 V").splitlines())
+    inner = HEAD + "steps:\n  - repeat_until: b.rsd < 0.5 %\n    at_most: 2\n    steps:\n" + nested
+    (tmp_path / "inner.yaml").write_text(inner, encoding="utf-8")
+    outer = tmp_path / "outer.yaml"
+    outer.write_text(HEAD + "steps:\n" + 2 * "  - include: inner.yaml\n", encoding="utf-8")
+    assert [s.name for s in load(outer).excitations] == ["sine", "sine_2"]
+
+
 def test_a_circle_of_includes_is_refused_with_its_chain(tmp_path: Path) -> None:
     for name, other in (("a", "b"), ("b", "c"), ("c", "a")):
         text = f"{HEAD}steps:\n  - include: {other}.yaml\n"
