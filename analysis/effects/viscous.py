@@ -24,9 +24,10 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 DRIVING: Final = 0.1  # of the larger slope that the other may be below zero: its uncertainty
-# Of the mean slope: beside dry friction, whose form has an error of its own in each direction,
-# slopes with a smaller difference count as equal.
-DIFFERENCE: Final = 0.1
+# Of the mean slope: slopes with a smaller difference count as equal. Dry friction beside them has a
+# form error of its own in each direction.
+DIFFERENCE: Final = 0.01
+BESIDE_DRY: Final = 0.1
 DRY: Final = ("Fc", "Fs", "F_ext_", "F_ret_", "k_friction_")  # its numbers, without the joint's
 
 
@@ -95,14 +96,15 @@ class AsymmetricViscousFriction(Effect):
         return np.array([self.joint, own[0], own[1] if len(own) == 2 else -own[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a slope that drives the joint, and near-equal slopes beside dry friction."""
+        """Reject a slope that drives the joint, and slopes that count as equal."""
         slopes = self.slopes(rig, values)
         for way, slope in zip(("extending", "retracting"), slopes, strict=True):
             if slope < -DRIVING * max(slopes):
                 return f"a slope of {slope:.3g} N s/m {way} would drive the joint"
         beside_dry = any(f"{name}{self.joint + 1}" in values for name in DRY)
-        if beside_dry and abs(slopes[0] - slopes[1]) < DIFFERENCE * 0.5 * sum(slopes):
-            return "the slopes of the two directions differ by less than a tenth"
+        least = BESIDE_DRY if beside_dry else DIFFERENCE
+        if abs(slopes[0] - slopes[1]) < least * 0.5 * sum(slopes):
+            return f"the slopes of the two directions differ by less than {100 * least:.0f} %"
         return ""
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:

@@ -310,7 +310,8 @@ REFUSED = [
     ("asymmetric_friction", "joint 1", {"F_ext_1": 80.0, "F_ret_1": 79.0}, (4e-5,)),
     ("pressure_dependent_friction", "joint 1", {"k_friction_1": -1e-5}, (4e-5,)),
     ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": -3000.0}, ()),
-    ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": 39.0, "Fc2": 9.0}, ()),
+    ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": 39.0}, ()),
+    ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": 9.0, "Fc2": 9.0}, ()),
     ("periodic_disturbance", "joint 2", {"T_sin_2": 1e4, "T_cos_2": 0.0}, (7.0,)),
     ("periodic_disturbance", "joint 2", {"T_sin_2": 1.0, "T_cos_2": 0.0}, (60.0,)),
     (
