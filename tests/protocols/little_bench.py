@@ -76,6 +76,13 @@ class LittleBench:
     ) -> None:
         self.rig = rig
         self.cylinders = list(cylinders)
+        self.names = rig.recorded
+        self.width = len(self.names)
+        self.step = 1.0 / rig.sample_rate
+        self.places = [
+            [self.names.index(ch.channel(kind, j)) for kind in (ch.PISTON, ch.SPOOL, ch.COMMAND)]
+            for j in range(1, len(self.cylinders) + 1)
+        ]
         self.info = DeviceInfo(
             "little", len(cylinders), len(rig.channels), rig.sample_rate, BLOCK, True
         )
@@ -144,44 +151,47 @@ class LittleBench:
     def exchange(self, more: bool = False) -> SampleBlock:
         while True:
             first = self.tick
-            data = np.array([self._sample() for _ in range(BLOCK)])
+            noise = 1e-5 * self.rng.standard_normal((BLOCK, len(self.cylinders)))
+            data = np.array([self._sample(row) for row in noise.tolist()])
             self.rows.append(data)
             self.blocks += 1
             self._check(data)
             if self.blocks in self.lose:
                 continue
-            saturated = np.zeros((BLOCK, len(self.rig.channels)), dtype=bool)
+            saturated = np.zeros((BLOCK, self.info.channels), dtype=bool)
             return SampleBlock(self.blocks, first, data, saturated, 0, False)
 
-    def _sample(self) -> Array:
+    def _sample(self, noise: list[float]) -> list[float]:
         if self.tick in self.happenings:
             self.happenings.pop(self.tick)()
-        dt = 1.0 / self.rig.sample_rate
-        row = dict.fromkeys(self.rig.recorded, 3e6 + 500.0 * (self.tick % 7))  # a live sensor
+        row = [3e6 + 500.0 * (self.tick % 7)] * self.width  # a live sensor
+        since = self.tick - self.start
         speeds = [c.speed for c in self.cylinders]
-        for j, (c, law) in enumerate(zip(self.cylinders, self.laws, strict=True)):
-            wave = self.waves[j][(self.tick - self.start) % len(self.waves[j])]
-            others = sum(speeds) - speeds[j]
-            s = c.piston + c.give * others / 0.1 + 1e-5 * self.rng.standard_normal()
-            v = law.gain * wave + law.bias + law.position_gain * (law.setpoint - s)
+        both = sum(speeds)
+        for j, c in enumerate(self.cylinders):
+            law, wave = self.laws[j], self.waves[j]
+            s = c.piston + c.give * (both - speeds[j]) / 0.1 + noise[j]
+            v = law.gain * wave.item(since % len(wave)) if law.gain else 0.0
+            v = v + law.bias + law.position_gain * (law.setpoint - s)
             v = min(max(v, -law.limit), law.limit)
             u = v + c.offset
             wish = (c.extend if u > 0 else c.retract) * u + c.load
-            c.speed += dt / c.lag * (wish - c.speed)
-            c.piston += dt * c.speed
+            c.speed += self.step / c.lag * (wish - c.speed)
+            c.piston += self.step * c.speed
             if abs(c.piston) > c.stop:
-                c.piston, c.speed = float(np.clip(c.piston, -c.stop, c.stop)), 0.0
-            row[ch.channel(ch.PISTON, j + 1)] = s
-            row[ch.channel(ch.SPOOL, j + 1)] = 0.1 * u
-            row[ch.channel(ch.COMMAND, j + 1)] = v
+                c.piston, c.speed = max(-c.stop, min(c.piston, c.stop)), 0.0
+            piston, spool, command = self.places[j]
+            row[piston], row[spool], row[command] = s, 0.1 * u, v
         self.tick += 1
-        return np.array([row[name] for name in self.rig.recorded])
+        return row
 
     def _check(self, data: Array) -> None:
         for j, role in enumerate(self.roles):
-            piston = data[:, self.rig.recorded.index(ch.channel(ch.PISTON, j + 1))]
+            if not role.excited:
+                continue
+            piston = data[:, self.places[j][0]]
             low, high = self.rig.joints[j].limits.piston
-            if role.excited and (piston.min() < low or piston.max() > high):
+            if piston.min() < low or piston.max() > high:
                 self.laws = [OutputLaw()] * len(self.laws)
                 raise Clipped(
                     f"joint {j + 1} at {1e3 * piston.min():.1f}..{1e3 * piston.max():.1f}"
@@ -189,7 +199,7 @@ class LittleBench:
 
     def channel(self, name: str, start: int = 0, ticks: int | None = None) -> Array:
         """Everything that was ever measured of a channel, from the first tick on."""
-        data = np.concatenate(self.rows)[:, self.rig.recorded.index(name)]
+        data = np.concatenate(self.rows)[:, self.names.index(name)]
         return data[start : None if ticks is None else start + ticks]
 
     @property
