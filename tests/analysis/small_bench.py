@@ -79,6 +79,19 @@ def _piston(q, joint):
 
 
 @njit(cache=True)
+def _pistons(angles, joint):
+    return np.array([_piston(q, joint)[0] for q in angles])
+
+
+@njit(cache=True)
+def _spools(times, joint, pistons, waves, biases, centring):
+    out = np.zeros(len(times))
+    for k in range(len(times)):
+        out[k] = _spool(times[k], joint, pistons[k], waves, biases, centring)
+    return out
+
+
+@njit(cache=True)
 def _chamber_rates(p, joint, s, v, u, pressure_in, gains):
     cap_area, rod_area, dead = 7.0e-4, 5.4e-4, 7.9e-5 if joint == 0 else 6.3e-5
     up, down = max(pressure_in - p[0], 0.0), max(p[0], 0.0)
@@ -176,8 +189,12 @@ def simulate(
     truth: dict[str, float] = TRUTH,
     bias: tuple[float, float] = (0.0, 0.0),
     centring: float = 0.15,
+    only: tuple[str, ...] = (),
 ) -> dict[str, Array]:
-    """Return noise-free channels after the transient, each sampled at its own skewed instant."""
+    """Return noise-free channels after the transient, each sampled at its own skewed instant.
+
+    Of several channels `only` some may be wanted.
+    """
     waves = np.array(
         [
             (joint, 2 * math.pi * line / e.period, e.amplitude, phase)
@@ -188,16 +205,20 @@ def simulate(
     locked = np.array([i + 1 in step.locked for i in (0, 1)])
     par = np.array([truth[name] for name in NAMES])
     n = round(seconds * rig.sample_rate)
-    kinds = len(rig.channels)
+    places = [k for k, name in enumerate(rig.channels) if not only or name in only]
     tick = np.arange(n) / rig.sample_rate + settle_seconds
-    times = (tick[:, None] + rig.sensors.skew * np.arange(kinds)).ravel()
+    times = (tick[:, None] + rig.sensors.skew * np.array(places)).ravel()
     args = (par, locked, waves, np.array(bias), centring)
-    grid = np.concatenate(([0.0], times))
+    # The integrator's first step depends on the first instant asked for: always that of a tick.
+    grid = np.concatenate(([0.0, tick[0]], times))
     y = odeint(_rates, settle(step, excitation, truth), grid, args, rtol=1e-8, atol=1e-8,
-               hmax=0.002, mxstep=200000)[1:]  # fmt: skip
-    y = y.reshape(n, kinds, 8)
-    t = times.reshape(n, kinds)
-    return {name: _sense(name, y[:, k], t[:, k], args) for k, name in enumerate(rig.channels)}
+               hmax=0.002, mxstep=200000)[2:]  # fmt: skip
+    y = y.reshape(n, len(places), 8)
+    t = times.reshape(n, len(places))
+    return {
+        rig.channels[place]: _sense(rig.channels[place], y[:, k], t[:, k], args)
+        for k, place in enumerate(places)
+    }
 
 
 def _sense(name: str, y: Array, t: Array, args: tuple[object, ...]) -> Array:
@@ -206,13 +227,13 @@ def _sense(name: str, y: Array, t: Array, args: tuple[object, ...]) -> Array:
     kind, joint = name.rsplit("_", 1)[0], int(name[-1]) - 1
     if kind in ("cap_pressure", "rod_pressure"):
         return y[:, (4 if kind == "cap_pressure" else 5) + 2 * joint]
-    piston = np.array([_piston(q, joint)[0] for q in y[:, joint]])
+    piston = _pistons(y[:, joint], joint)
     if kind == "piston":
         return piston
     if args[1][joint]:  # type: ignore[index]
         return np.zeros(len(t))
     waves, biases, centring = args[2:]
-    return np.array([_spool(a, joint, b, waves, biases, centring) for a, b in zip(t, piston)])  # noqa: B905
+    return np.asarray(_spools(t, joint, piston, waves, biases, centring))
 
 
 def centred(
@@ -226,8 +247,11 @@ def centred(
 ) -> dict[str, Array]:
     """Simulate with the bias that brings the mean stroke to the middle."""
     bias = np.zeros(2)
+    pistons = tuple(f"piston_{joint + 1}" for joint in wave)
     for _ in range(2):
-        clean = simulate(rig, step, wave, bias=tuple(bias), centring=centring, truth=truth)
+        clean = simulate(
+            rig, step, wave, bias=tuple(bias), centring=centring, truth=truth, only=pistons
+        )
         for joint in wave:
             bias[joint] -= centring * clean[f"piston_{joint + 1}"].mean()
     return simulate(

@@ -57,6 +57,19 @@ def _linkage(q):
 
 
 @njit(cache=True)
+def _pistons(angles):
+    return np.array([_linkage(q)[0] for q in angles])
+
+
+@njit(cache=True)
+def _commands(times, pistons, wave, bias, centring):
+    out = np.zeros(len(times))
+    for k in range(len(times)):
+        out[k] = _command(times[k], pistons[k], wave, bias, centring)
+    return out
+
+
+@njit(cache=True)
 def _edges(x, e):
     """Openings of the edges that serve a positive and a negative spool."""
     x -= e[NULL]
@@ -180,14 +193,15 @@ def channels(rig: Rig, wrong: Wrong, wave: Array, seconds: float = 8.0) -> dict[
     """Return noise-free channels after the transient, centred by a bias found on a first go."""
     bias = 0.0
     for _ in range(3):
-        clean = _simulated(rig, RIGHT if _ == 0 else wrong, wave, bias, 4.0)
+        clean = _simulated(rig, RIGHT if _ == 0 else wrong, wave, bias, 4.0, ("piston",))
         bias -= 0.3 * float(clean["piston_2"].mean())
     return _simulated(rig, wrong, wave, bias, seconds)
 
 
 def _simulated(
-    rig: Rig, wrong: Wrong, wave: Array, bias: float, seconds: float
-) -> dict[str, Array]:
+    rig: Rig, wrong: Wrong, wave: Array, bias: float, seconds: float,
+    kinds: tuple[str, ...] = CHANNELS,
+) -> dict[str, Array]:  # fmt: skip
     centring, settle = 0.3, 4.0
     q1 = angle(0.0, 0)
     par = np.array([TRUTH[name] for name in NAMES_1])
@@ -198,25 +212,26 @@ def _simulated(
     for kind in CHANNELS:
         late = wrong.delay.get(kind, 0.0) - rig.sensors.skew * rig.channels.index(f"{kind}_2")
         instants[kind] = tick - late
-    times, back = np.unique(np.concatenate(list(instants.values())), return_inverse=True)
+    # The integrator's first step depends on the first instant asked for.
+    first = min(times[0] for times in instants.values())
+    times, back = np.unique(np.concatenate([instants[k] for k in kinds]), return_inverse=True)
     q2 = angle(0.0, 1)
     G = _linkage(q2)[1]
     hold = TRUTH["W2"] * 9.8 * math.sin(q1 + q2) / G
     start = [q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0, 0.0]
-    y = odeint(_rates, start, np.concatenate(([0.0], times)), args, rtol=1e-8, atol=1e-9,
-               hmax=0.002, mxstep=200000)[1:]  # fmt: skip
-    y = y[back].reshape(len(CHANNELS), n, 6)
+    y = odeint(_rates, start, np.concatenate(([0.0, first], times)), args, rtol=1e-8, atol=1e-9,
+               hmax=0.002, mxstep=200000)[2:]  # fmt: skip
+    y = y[back].reshape(len(kinds), n, 6)
     supply = wrong.gain.get("supply_pressure", 1.0) * 7e6 + wrong.offset.get("supply_pressure", 0)
     out = {
         "spool_1": np.zeros(n), "piston_1": np.zeros(n),
         "cap_pressure_1": np.full(n, 3.5e6), "rod_pressure_1": np.full(n, 3.5e6),
         "supply_pressure": np.full(n, supply), "oil_temperature": np.full(n, 40.0),
     }  # fmt: skip
-    for k, kind in enumerate(CHANNELS):
-        piston = np.array([_linkage(q)[0] for q in y[k][:, 0]])
+    for k, kind in enumerate(kinds):
+        piston = _pistons(y[k][:, 0])
         if kind == "spool":
-            x = np.array([_command(t, s, wave, bias, centring) for t, s in
-                          zip(instants[kind], piston, strict=True)])  # fmt: skip
+            x = _commands(instants[kind], piston, wave, bias, centring)
         else:
             x = piston if kind == "piston" else y[k][:, 2 if kind == "cap_pressure" else 3]
         out[f"{kind}_2"] = wrong.gain.get(kind, 1.0) * x + wrong.offset.get(kind, 0.0)
