@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -182,9 +183,18 @@ def _period(wave):
     return out
 
 
+@lru_cache(maxsize=4)
+def _drive(wave: bytes) -> Array:
+    """The excitation of a period, made once for all plants that it moves."""
+    return np.asarray(_period(np.frombuffer(wave).reshape(-1, 3)))
+
+
 @njit(cache=True)
-def _command(t, s, wave, bias):
-    return bias - CENTRING * s + _excited(t, wave)
+def _commands(times, pistons, wave, bias):
+    out = np.zeros(len(times))
+    for k in range(len(times)):
+        out[k] = bias - CENTRING * pistons[k] + _excited(times[k], wave)
+    return out
 
 
 @njit(cache=True)
@@ -230,44 +240,54 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
 
 
 @njit(cache=True)
-def _integrated(start, steps, q1, par, hidden, drive, bias):
+def _integrated(start, steps, q1, par, hidden, drive, bias, coarse):
     """States (steps + 1, 5): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa].
 
-    `drive` [V] is a period of the excitation at every half step.
+    `drive` [V] is a period of the excitation at every half of STEP; steps are `coarse` of those.
     """
+    dt = coarse * STEP
     y, z, out = start.copy(), start.copy(), np.zeros((steps + 1, 5))
     out[0] = y
     a, b, c, d = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5)
     after = bias + drive[0]
     held = after - CENTRING * _linkage(y[0])[0]
     for k in range(steps):
-        t = k * STEP
-        before, middle = after, bias + drive[(2 * k + 1) % len(drive)]
-        after = bias + drive[(2 * k + 2) % len(drive)]
+        t = k * dt
+        before, middle = after, bias + drive[coarse * (2 * k + 1) % len(drive)]
+        after = bias + drive[coarse * (2 * k + 2) % len(drive)]
         _rates(y, t, q1, par, hidden, before, held, a)
         for i in range(5):
-            z[i] = y[i] + 0.5 * STEP * a[i]
-        _rates(z, t + 0.5 * STEP, q1, par, hidden, middle, held, b)
+            z[i] = y[i] + 0.5 * dt * a[i]
+        _rates(z, t + 0.5 * dt, q1, par, hidden, middle, held, b)
         for i in range(5):
-            z[i] = y[i] + 0.5 * STEP * b[i]
-        _rates(z, t + 0.5 * STEP, q1, par, hidden, middle, held, c)
+            z[i] = y[i] + 0.5 * dt * b[i]
+        _rates(z, t + 0.5 * dt, q1, par, hidden, middle, held, c)
         for i in range(5):
-            z[i] = y[i] + STEP * c[i]
-        _rates(z, t + STEP, q1, par, hidden, after, held, d)
+            z[i] = y[i] + dt * c[i]
+        _rates(z, t + dt, q1, par, hidden, after, held, d)
         for i in range(5):
-            y[i] += STEP / 6.0 * (a[i] + 2.0 * b[i] + 2.0 * c[i] + d[i])
+            y[i] += dt / 6.0 * (a[i] + 2.0 * b[i] + 2.0 * c[i] + d[i])
         held = _opening(after - CENTRING * _linkage(y[0])[0], held, hidden)[1]
         out[k + 1] = y
     return out
 
 
-def _states(hidden: Hidden, drive: Array, bias: float, seconds: float) -> Array:
+def _states(hidden: Hidden, drive: Array, bias: float, seconds: float, coarse: int = 1) -> Array:
     q1, q2 = angle(0.0, 0), angle(0.0, 1)
     par = np.array([TRUTH[name] for name in NAMES_1])
     hold = TRUTH["W2"] * 9.8 * math.sin(q1 + q2) / _linkage(q2)[1]
     start = np.array([q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0])
-    steps = round((SETTLE + seconds) / STEP)
-    return np.asarray(_integrated(start, steps, q1, par, hidden.array, drive, bias))
+    steps = round((SETTLE + seconds) / (coarse * STEP))
+    return np.asarray(_integrated(start, steps, q1, par, hidden.array, drive, bias, coarse))
+
+
+def _centred(hidden: Hidden, drive: Array) -> float:
+    """Return the bias [V] that brings the mean stroke to the middle; for that, coarse steps do."""
+    bias = 0.0
+    for _ in range(2):
+        y = _states(hidden, drive, bias, PERIOD, coarse=2)
+        bias -= CENTRING * float(_pistons(y[len(y) // 2 :, 0]).mean())
+    return bias
 
 
 def _pistons(q: Array) -> Array:
@@ -305,9 +325,8 @@ def channels(
     sensors: Sensors = Sensors(),
 ) -> dict[str, Array]:
     """Return noise-free channels, each at its own instants; the mean stroke is at the middle."""
-    bias, drive = 0.0, _period(wave)
-    for _ in range(2):
-        bias -= CENTRING * float(_pistons(_states(hidden, drive, bias, 4.0)[100_000:, 0]).mean())
+    drive = _drive(wave.tobytes())
+    bias = _centred(hidden, drive)
     y = _states(hidden, drive, bias, seconds)
     time = STEP * np.arange(len(y))
     n = round(seconds * rig.sample_rate)
@@ -321,11 +340,10 @@ def channels(
         at = tick + rig.sensors.skew * rig.channels.index(f"{kind}_2")
         at = np.minimum(at, time[-1]) - (sensors.late if kind in sensors.kinds else 0.0)
         q, _, cap, rod = (np.interp(at, time, y[:, k]) for k in range(4))
-        spool = [_command(t, s, wave, bias) for t, s in zip(at, _pistons(q), strict=True)]
-        out[f"{kind}_2"] = {
-            "spool": np.array(spool), "piston": _pistons(q),
-            "cap_pressure": cap, "rod_pressure": rod,
-        }[kind]  # fmt: skip
+        if kind == "spool":
+            out["spool_2"] = _commands(at, _pistons(q), wave, bias)
+            continue
+        out[f"{kind}_2"] = {"piston": _pistons(q), "cap_pressure": cap, "rod_pressure": rod}[kind]
         if kind in sensors.kinds and sensors.lag > 0.0:
             fine = {"piston": _pistons(y[:, 0]), "cap_pressure": y[:, 2], "rod_pressure": y[:, 3]}
             out[f"{kind}_2"] = np.interp(at, time, sensors.behind(fine[kind]))
