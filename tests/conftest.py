@@ -19,8 +19,11 @@ from rig.bench.latch import STATE_VARIABLE
 from rig.runs.files import CACHE_VARIABLE
 from tests.warm_up import compile_all
 
+TESTS = Path(__file__).parent
+# Folders whose tests wait for processes; the last files of the last one are short.
+WAITING = ("tui", "cli", "drivers", "queue", "services")
 # Equations compiled by one test serve the next, and those of the next day.
-CACHE = Path(__file__).parents[1] / ".equations_cache"
+CACHE = TESTS.parent / ".equations_cache"
 
 # A shell that starts the tests in the background has SIGINT ignored; programs that they start and
 # stop by Ctrl-C would inherit that.
@@ -35,6 +38,23 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile for all workers before the first starts."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         compile_all(CACHE)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Let workers mix files that wait for other processes with those that compute, to the end.
+
+    A worker takes the next file when it has done one.
+    """
+    if not hasattr(config, "workerinput"):
+        return
+    files = dict.fromkeys(item.path for item in items)
+    folder = {path: path.relative_to(TESTS).parts[0] for path in files}
+    computing = [path for path in files if folder[path] not in WAITING]
+    waiting = [path for name in WAITING for path in files if folder[path] == name]
+    place = {
+        path: (k + 0.5) / len(kind) for kind in (computing, waiting) for k, path in enumerate(kind)
+    }
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.hookimpl(wrapper=True)
