@@ -1,5 +1,7 @@
 """The command as a user has it, and a simulated bench beside it, each a process of its own.
 
+They are forked from a process that has done their imports (`tests.forked`).
+
 What ends by itself and needs no process runs in this one too (`bramah_here`), without the half
 second of imports that each process begins with.
 """
@@ -21,6 +23,7 @@ from drivers import wire_at
 from drivers.modbus_tcp import ModbusTcpDriver
 from rig.cli.main import run
 from rig.runs.rigs import load_rig
+from tests.forked import Forked
 
 START = "from rig.cli.main import run; run()"
 ROOT = Path(__file__).parents[2]
@@ -54,9 +57,13 @@ def words(*arguments: object) -> list[str]:
 
 def bramah(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run `bramah` to its end."""
-    return subprocess.run(
-        words(*arguments), capture_output=True, text=True, timeout=LONG, cwd=cwd, check=False
-    )
+    return _ended(Forked(arguments, cwd))
+
+
+def _ended(process: Forked) -> subprocess.CompletedProcess[str]:
+    with process:
+        said, told = process.communicate(timeout=LONG)
+    return subprocess.CompletedProcess(process.args, process.wait(), said, told)
 
 
 def bramah_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -89,22 +96,13 @@ def _as_a_process_begins() -> Iterator[None]:
 
 def study(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Run `python -m tests.studies` to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", "tests.studies", *map(str, arguments)],
-        capture_output=True, text=True, timeout=LONG, cwd=ROOT, check=False,
-    )  # fmt: skip
+    return _ended(Forked(arguments, ROOT, "tests.studies"))
 
 
 @contextmanager
-def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+def started(*arguments: object) -> Iterator[Forked]:
     """Run `bramah` in the background, killed at the end if it has not ended."""
-    with subprocess.Popen(
-        words(*arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
+    with Forked(arguments) as process:
         try:
             yield process
         finally:
@@ -113,21 +111,17 @@ def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def simulated(
-    *more: object, rig: str | Path = "shinshu-2dof"
-) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def simulated(*more: object, rig: str | Path = "shinshu-2dof") -> Iterator[tuple[str, Forked]]:
     """A simulated bench on a free port: (endpoint, process)."""
     line = ["sim", "--rig", rig, "--port", 0, "--parent", os.getpid(), *more]
     with started(*line) as process:
-        assert process.stdout is not None
         yield process.stdout.readline().strip(), process
         process.send_signal(signal.SIGTERM)
         process.wait(LONG)
 
 
-def wait_for(what: str, process: subprocess.Popen[str], seen: Sequence[str] = ()) -> list[str]:
+def wait_for(what: str, process: Forked, seen: Sequence[str] = ()) -> list[str]:
     """Read the process's progress until a line contains `what`; returns all lines so far."""
-    assert process.stderr is not None
     lines = list(seen)
     deadline = time.monotonic() + LONG
     while not any(what in line for line in lines):

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 from drivers.base import OFF, OutputLaw
 from drivers.registry import make_driver
 from rig.model.parts import Wire
 from tests.drivers.wires import ROOT
+from tests.forked import Forked
 from tests.hil_sim.integrator import seed_rig
 
 PATIENCE = 20.0  # [s] the driver's timeout: a loaded machine may take long
 
 
-def driving_host(kind: str, key: str, place: str, watchdog: float) -> subprocess.Popen[str]:
+def driving_host(kind: str, key: str, place: str, watchdog: float) -> Forked:
     """Start the host on a wire whose setting `key` is `place`; return it once it drives."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.drivers.driving_host", kind, key, place, str(watchdog)],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
+    words = (kind, key, place, watchdog)
+    process = Forked(words, ROOT, "tests.drivers.driving_host", told=True)
     assert process.stdout.readline() == "driving\n"
     return process
 

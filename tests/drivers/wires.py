@@ -7,19 +7,19 @@ import pty
 import select
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from tests.forked import Forked
+
 ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
-def device_process(mode: str = "virtual") -> Iterator[tuple[subprocess.Popen[str], int]]:
+def device_process(mode: str = "virtual") -> Iterator[tuple[Forked, int]]:
     """The integrator's bench as a process; gives (process, port) and ends it afterwards."""
     with device_at(mode, "modbus-tcp") as (process, endpoint):
         assert endpoint.startswith("modbus-tcp://127.0.0.1:"), endpoint
@@ -27,12 +27,11 @@ def device_process(mode: str = "virtual") -> Iterator[tuple[subprocess.Popen[str
 
 
 @contextmanager
-def device_at(mode: str, wire: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def device_at(mode: str, wire: str) -> Iterator[tuple[Forked, str]]:
     """The integrator's bench as a process on a wire; gives (process, endpoint)."""
-    command = [sys.executable, "-m", "tests.hil_sim.integrator", mode, str(os.getpid()), wire]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+    words = (mode, os.getpid(), wire)
+    with Forked(words, ROOT, "tests.hil_sim.integrator", told=True) as process:
         try:
-            assert process.stdout is not None
             yield process, process.stdout.readline().strip()
         finally:
             process.terminate()

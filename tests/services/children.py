@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from rig.runs.rigs import load_rig
+from tests.forked import Forked
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
 
 
-def start(run: Path, mode: str, number: int, **kwargs) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        [sys.executable, str(HERE / "child.py"), str(run), mode, str(number)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **kwargs,
-    )
+def start(run: Path, mode: str, number: int) -> Forked:
+    return Forked([run, mode, number], module="tests.services.child")
 
 
 def finish(run: Path, mode: str, number: int) -> tuple[int, str]:

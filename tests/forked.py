@@ -1,0 +1,237 @@
+"""Programs as processes of their own, forked from one that has imported what they need.
+
+A fresh process takes one to two seconds of the processor to import what a bench or a run needs,
+which is most of what a short test takes. A forked one has its own session, standard streams,
+working folder, environment and signals like one started anew; it is killed and waited for like one.
+What a start itself does is tested with real starts: `tests/cli/test_startup.py`.
+
+    python -m tests.forked FD     serves the requests that come over a socket
+"""
+
+from __future__ import annotations
+
+import array
+import atexit
+import gc
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from runpy import run_module
+from typing import Any, Final, TextIO
+
+ROOT: Final = Path(__file__).parents[1]
+LENGTH: Final = 8  # bytes of a request's length, of a number of a process and of an exit code
+STREAMS: Final = 3  # standard output, standard error, status
+COMMAND: Final = "rig.cli.main"
+IMPORTED: Final = (
+    "rig.cli.verbs.run", "rig.cli.verbs.sim", "rig.cli.execution.protocol_run", "rig.bench.session",
+    "hil_sim.device.server",
+)  # fmt: skip
+
+
+class Forked:
+    """A forked process of `bramah` or of a module, as `subprocess.Popen` has one.
+
+    Its output is text in pipes; `told` leaves its errors where this process has its own.
+    """
+
+    def __init__(
+        self,
+        words: Sequence[object],
+        cwd: Path | None = None,
+        module: str = COMMAND,
+        *,
+        told: bool = False,
+    ) -> None:
+        self.args = [str(word) for word in words]
+        self.returncode: int | None = None
+        self._status, status = socket.socketpair()
+        ends = [os.pipe(), os.pipe()]
+        request = {
+            "module": module, "words": self.args, "cwd": str(cwd or Path.cwd()),
+            "environment": {**os.environ},
+        }  # fmt: skip
+        outputs = [ends[0][1], 2 if told else ends[1][1]]
+        _ask(request, [*outputs, status.fileno()])
+        status.close()
+        for _, write in ends:
+            os.close(write)
+        self.stdout, self.stderr = (os.fdopen(read, encoding="utf-8") for read, _ in ends)
+        self.pid = int(self._status.recv(LENGTH))
+
+    def __enter__(self) -> Forked:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stdout.close()
+        self.stderr.close()
+        self.wait()
+
+    def poll(self) -> int | None:
+        """Return the exit code, None while it runs."""
+        with suppress(subprocess.TimeoutExpired):
+            self.wait(0.0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the end; minus the signal that killed it is the code."""
+        if self.returncode is None:
+            self._status.settimeout(timeout)
+            try:
+                self.returncode = int(self._status.recv(LENGTH))
+            except (TimeoutError, BlockingIOError):
+                raise subprocess.TimeoutExpired(self.args, timeout or 0.0) from None
+            self._status.close()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, unless it has ended."""
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Return what it still writes on either stream until it ends."""
+        said: dict[int, str] = {}
+        end = None if timeout is None else time.monotonic() + timeout
+
+        def read(place: int, stream: TextIO) -> None:
+            said[place] = "" if stream.closed else stream.read()
+
+        readers = [
+            threading.Thread(target=read, args=(k, stream), daemon=True)
+            for k, stream in enumerate((self.stdout, self.stderr))
+        ]
+        for reader in readers:
+            reader.start()
+        for reader in readers:
+            reader.join(None if end is None else max(end - time.monotonic(), 0.0))
+            if reader.is_alive():
+                raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        self.wait(None if end is None else max(end - time.monotonic(), 0.1))
+        self.stdout.close()
+        self.stderr.close()
+        return said[0], said[1]
+
+
+@cache
+def _server() -> socket.socket:
+    """Return the socket of the process to fork from; that one ends with this one."""
+    ours, its = socket.socketpair()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.forked", str(its.fileno())],
+        cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[its.fileno()],
+        start_new_session=True,
+    )  # fmt: skip
+    its.close()
+
+    def end() -> None:
+        ours.close()
+        process.wait(10.0)
+
+    atexit.register(end)
+    return ours
+
+
+def _ask(request: dict[str, Any], streams: list[int]) -> None:
+    raw = json.dumps(request).encode()
+    passed = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", streams))]
+    _server().sendmsg([len(raw).to_bytes(LENGTH, "big")], passed)
+    _server().sendall(raw)
+
+
+# In the process that is forked.
+
+
+def imported() -> None:
+    """Import what most commands need, and load the compiled bench."""
+    sys.modules["aiohttp"] = None  # type: ignore[assignment]  # as the verb `sim` does
+    for module in IMPORTED:
+        import_module(module)
+    del sys.modules["aiohttp"]
+    from hil_sim.plant.plant import Plant
+    from hil_sim.scenario.file import Scenario
+    from rig.runs.rigs import load_rig
+
+    Plant(load_rig("shinshu-2dof"), Scenario(), 0)
+    assert threading.active_count() == 1
+
+
+def forked_at_requests(link: socket.socket) -> str:
+    """Fork at every request; returns in the new process, with the name of its module."""
+    while True:
+        head, streams, _, _ = socket.recv_fds(link, LENGTH, STREAMS)
+        if not head:
+            sys.exit()
+        length, raw = int.from_bytes(head, "big"), b""
+        while len(raw) < length:
+            raw += link.recv(length - len(raw))
+        if os.fork() == 0:
+            request = json.loads(raw)
+            if (child := os.fork()) == 0:
+                _begin(request, streams, link)
+                return str(request["module"])
+            _tell_the_end(child, streams)
+        for stream in streams:
+            os.close(stream)
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+
+
+def _begin(request: dict[str, Any], streams: list[int], link: socket.socket) -> None:
+    os.setsid()
+    link.close()
+    for place, stream in enumerate(streams[:2], start=1):
+        os.dup2(stream, place)
+    for stream in streams:
+        os.close(stream)
+    sys.stdout = sys.__stdout__ = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, "utf-8", "backslashreplace", closefd=False)
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    os.chdir(request["cwd"])
+    sys.argv = ["-c", *request["words"]]
+    gc.enable()
+
+
+def _tell_the_end(child: int, streams: list[int]) -> None:
+    """Tell number and exit code of a process, and end."""
+    *outputs, status = streams
+    for stream in (0, 1, 2, *outputs):
+        os.close(stream)
+    with suppress(OSError):
+        os.write(status, b"%08d" % child)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    with suppress(OSError):
+        os.write(status, b"%08d" % code)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    gc.disable()
+    imported()
+    gc.freeze()
+    program = forked_at_requests(socket.socket(fileno=int(sys.argv[1])))
+    if program == COMMAND:
+        import_module(COMMAND).run()
+    else:
+        run_module(program, run_name="__main__")
