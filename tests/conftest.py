@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, settings
 
 from rig.bench.latch import STATE_VARIABLE
 from rig.runs.files import CACHE_VARIABLE
+from tests import forked
 from tests.warm_up import compile_all
 
 TESTS = Path(__file__).parent
@@ -35,9 +36,10 @@ settings.load_profile("patient")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile for all workers before the first starts."""
+    """Compile for all workers before the first starts, and import what their processes need."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         compile_all(CACHE)
+        forked.begin()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

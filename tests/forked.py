@@ -5,25 +5,26 @@ which is most of what a short test takes. A forked one has its own session, stan
 working folder, environment and signals like one started anew; it is killed and waited for like one.
 What a start itself does is tested with real starts: `tests/cli/test_startup.py`.
 
-    python -m tests.forked FD     serves the requests that come over a socket
+    python -m tests.forked NUMBER     serves the requests that come over an inherited socket
 """
 
 from __future__ import annotations
 
-import array
 import atexit
 import gc
 import json
 import os
+import select
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
 from importlib import import_module
 from pathlib import Path
 from runpy import run_module
@@ -31,6 +32,7 @@ from typing import Any, Final, TextIO
 
 ROOT: Final = Path(__file__).parents[1]
 LENGTH: Final = 8  # bytes of a request's length, of a number of a process and of an exit code
+ADDRESS: Final = "BRAMAH_TESTS_FORK"  # environment variable: where the process to fork from listens
 STREAMS: Final = 3  # standard output, standard error, status
 COMMAND: Final = "rig.cli.main"
 IMPORTED: Final = (
@@ -132,30 +134,37 @@ class Forked:
         return said[0], said[1]
 
 
-@cache
-def _server() -> socket.socket:
-    """Return the socket of the process to fork from; that one ends with this one."""
-    ours, its = socket.socketpair()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.forked", str(its.fileno())],
-        cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[its.fileno()],
-        start_new_session=True,
-    )  # fmt: skip
-    its.close()
+def begin() -> None:
+    """Start the process to fork from, for this one and those that it starts; it ends with it."""
+    folder = tempfile.mkdtemp(prefix="bramah-tests-")
+    place = str(Path(folder, "forks"))
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(place)
+        listener.listen(64)
+        number = listener.fileno()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.forked", str(number)],
+            cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[number],
+            start_new_session=True,
+        )  # fmt: skip
+    os.environ[ADDRESS] = place
 
     def end() -> None:
-        ours.close()
-        process.wait(10.0)
+        os.environ.pop(ADDRESS, None)
+        shutil.rmtree(folder, ignore_errors=True)
+        process.communicate(timeout=10.0)
 
     atexit.register(end)
-    return ours
 
 
 def _ask(request: dict[str, Any], streams: list[int]) -> None:
+    if ADDRESS not in os.environ:
+        begin()
     raw = json.dumps(request).encode()
-    passed = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", streams))]
-    _server().sendmsg([len(raw).to_bytes(LENGTH, "big")], passed)
-    _server().sendall(raw)
+    with socket.socket(socket.AF_UNIX) as link:
+        link.connect(os.environ[ADDRESS])
+        socket.send_fds(link, [len(raw).to_bytes(LENGTH, "big")], streams)
+        link.sendall(raw)
 
 
 # In the process that is forked.
@@ -175,19 +184,26 @@ def imported() -> None:
     assert threading.active_count() == 1
 
 
-def forked_at_requests(link: socket.socket) -> str:
-    """Fork at every request; returns in the new process, with the name of its module."""
+def forked_at_requests(listener: socket.socket) -> str:
+    """Fork at every request until standard input ends.
+
+    Returns in the new process alone, with the name of its module.
+    """
     while True:
-        head, streams, _, _ = socket.recv_fds(link, LENGTH, STREAMS)
-        if not head:
+        ready, _, _ = select.select([0, listener], [], [])
+        if 0 in ready:
             sys.exit()
-        length, raw = int.from_bytes(head, "big"), b""
-        while len(raw) < length:
-            raw += link.recv(length - len(raw))
+        link, _ = listener.accept()
+        with link:
+            head, streams, _, _ = socket.recv_fds(link, LENGTH, STREAMS)
+            length, raw = int.from_bytes(head, "big"), b""
+            while len(raw) < length:
+                raw += link.recv(length - len(raw))
         if os.fork() == 0:
-            request = json.loads(raw)
+            listener.close()
             if (child := os.fork()) == 0:
-                _begin(request, streams, link)
+                request = json.loads(raw)
+                _as_started_anew(request, streams)
                 return str(request["module"])
             _tell_the_end(child, streams)
         for stream in streams:
@@ -197,12 +213,12 @@ def forked_at_requests(link: socket.socket) -> str:
                 pass
 
 
-def _begin(request: dict[str, Any], streams: list[int], link: socket.socket) -> None:
+def _as_started_anew(request: dict[str, Any], streams: list[int]) -> None:
     os.setsid()
-    link.close()
-    for place, stream in enumerate(streams[:2], start=1):
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    for place, stream in enumerate((nothing, *streams[:2])):
         os.dup2(stream, place)
-    for stream in streams:
+    for stream in (nothing, *streams):
         os.close(stream)
     sys.stdout = sys.__stdout__ = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, "utf-8", "backslashreplace", closefd=False)

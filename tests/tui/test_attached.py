@@ -23,6 +23,7 @@ from textual.pilot import Pilot
 from rig.tui.app import Monitor
 from rig.tui.following.link import LinkStage
 from rig.tui.words import notices
+from tests.forked import Forked
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # of a test with a process that ought to have acted long ago [s]
@@ -37,19 +38,18 @@ def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def start(sockets: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    started: list[subprocess.Popen[bytes]] = []
+def start(sockets: Path) -> Iterator[Callable[..., Forked]]:
+    started: list[Forked] = []
 
-    def begin(*arguments: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "tests.tui.fake_run", "--total", "600", *arguments]
-        environment = {**os.environ, "XDG_RUNTIME_DIR": str(sockets)}
-        started.append(subprocess.Popen(command, cwd=ROOT, env=environment))
+    def begin(*arguments: str) -> Forked:
+        words = ("--total", 600, *arguments)
+        started.append(Forked(words, ROOT, "tests.tui.fake_run", told=True))
         return started[-1]
 
     yield begin
     for process in started:
-        process.kill()
-        process.wait()
+        with process:
+            process.kill()
 
 
 async def until(pilot: Pilot[int], so: Callable[[], bool]) -> None:
@@ -66,7 +66,7 @@ def told(app: Monitor) -> str:
 
 @pytest.mark.timeout(PATIENCE)
 async def test_the_screen_waits_joins_the_run_that_appears_and_stops_it(
-    start: Callable[..., subprocess.Popen[bytes]],
+    start: Callable[..., Forked],
 ) -> None:
     app = Monitor("shinshu-2dof")
     async with app.run_test(size=(80, 24)) as pilot:
@@ -84,7 +84,7 @@ async def test_the_screen_waits_joins_the_run_that_appears_and_stops_it(
 
 @pytest.mark.timeout(PATIENCE)
 async def test_a_screen_that_leaves_does_not_disturb_the_run(
-    start: Callable[..., subprocess.Popen[bytes]],
+    start: Callable[..., Forked],
 ) -> None:
     process = start()
 
@@ -102,7 +102,7 @@ async def test_a_screen_that_leaves_does_not_disturb_the_run(
 
 @pytest.mark.timeout(PATIENCE)
 async def test_a_run_that_does_not_answer_is_reported_and_one_that_dies_is_gone(
-    start: Callable[..., subprocess.Popen[bytes]],
+    start: Callable[..., Forked],
 ) -> None:
     process = start("--deaf", "0", "--rig", "press")
     app = Monitor("press")
@@ -173,7 +173,7 @@ def terminal(sockets: Path) -> Iterator[Callable[..., Terminal]]:
 
 @pytest.mark.timeout(2 * PATIENCE)
 def test_a_terminal_of_16_colours_resized_to_nothing_and_back_goes_on(
-    start: Callable[..., subprocess.Popen[bytes]], terminal: Callable[..., Terminal]
+    start: Callable[..., Forked], terminal: Callable[..., Terminal]
 ) -> None:
     run = start()
     screen = terminal()
@@ -196,7 +196,7 @@ def test_a_terminal_of_16_colours_resized_to_nothing_and_back_goes_on(
 
 @pytest.mark.timeout(2 * PATIENCE)
 def test_without_colours_and_beside_the_sockets_of_a_dead_run_it_still_speaks(
-    sockets: Path, start: Callable[..., subprocess.Popen[bytes]], terminal: Callable[..., Terminal]
+    sockets: Path, start: Callable[..., Forked], terminal: Callable[..., Terminal]
 ) -> None:
     dead = start("--rig", "dead")
     while not list(sockets.glob("bramah/dead-*.pub")):

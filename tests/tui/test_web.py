@@ -26,6 +26,7 @@ from rig.tui.web.access import NAMES, host_name, refusal
 from rig.tui.web.attached_screen import CLOSED
 from rig.tui.web.page_driver import PageDriver
 from tests.cli.bench import LONG, SHORT, bramah, simulated, started, wait_for
+from tests.forked import Forked
 from tests.tui.test_attached import sockets, start
 from tests.tui.web_page import OpenPage, WebServer, page_of, web_server
 
@@ -183,7 +184,7 @@ def test_it_listens_on_loopback_alone(lasting_server: WebServer) -> None:
 
 @pytest.mark.timeout(2 * PATIENCE)
 async def test_pages_come_and_go_and_every_screen_ends_with_its_page(
-    server: WebServer, client: aiohttp.ClientSession, start: Callable[..., subprocess.Popen[bytes]]
+    server: WebServer, client: aiohttp.ClientSession, start: Callable[..., Forked]
 ) -> None:
     run = start()
     async with page_of(client, server) as page, page_of(client, server) as other:
@@ -256,7 +257,7 @@ async def test_the_fifth_page_is_refused_in_a_sentence(
 
 @pytest.mark.timeout(2 * PATIENCE)
 async def test_a_killed_server_takes_its_screen_along_and_the_run_goes_on(
-    server: WebServer, client: aiohttp.ClientSession, start: Callable[..., subprocess.Popen[bytes]]
+    server: WebServer, client: aiohttp.ClientSession, start: Callable[..., Forked]
 ) -> None:
     run = start()
     async with page_of(client, server) as page:
