@@ -21,6 +21,7 @@ from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
 from tests.services.fake_driver import FakeDriver, samples
+from tests.variants import kept
 
 RIG = load_rig("shinshu-2dof")
 BLOCKS = 6000  # enough that most stand in the database and the newest in its log
@@ -109,9 +110,7 @@ def test_the_run_undamaged_is_whole(run: Path) -> None:
     assert assert_only_what_was_measured(run) == BLOCKS * 10
 
 
-@pytest.mark.parametrize(
-    "seed", [*range(16), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(16, 52))]
-)
+@pytest.mark.parametrize("seed", kept(range(52), range(1, 7)))
 def test_whatever_is_damaged_is_said_kept_and_read_as_far_as_it_goes(run: Path, seed: int) -> None:
     path = run / "journal.sqlite"
     what = damage(path, seed)
