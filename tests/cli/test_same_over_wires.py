@@ -48,7 +48,7 @@ def by_tcp(experiment: Experiment) -> WireResult:
 @pytest.mark.parametrize(
     "wire",
     [
-        pytest.param(wire, marks=[pytest.mark.slow] * (wire in ("modbus-rtu", "can", "can-slcan")))
+        pytest.param(wire, marks=[pytest.mark.slow] * (wire != "serial"))
         for wire in WIRES
         if wire != TCP
     ],
