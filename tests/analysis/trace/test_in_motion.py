@@ -35,6 +35,7 @@ def test_friction_of_two_joints_that_stick_is_found_where_both_move() -> None:
         assert any(n.startswith(note) for n in found.notes)
 
 
+@pytest.mark.slow
 def test_a_tilt_is_found_beside_friction_whose_rests_hid_it() -> None:
     """On all rows two levels of friction and a force over the position of joint 1 seem to fit."""
     sticks = {"ahead": 80.0, "astern": 80.0, "dry_form": plant.KARNOPP, "width": 5e-4}

@@ -39,6 +39,7 @@ def test_one_level_in_the_same_noise_stays_coulomb_friction(rig: Rig) -> None:
     assert [u.term.name for u in settled.effects] == ["coulomb_friction"]
 
 
+@pytest.mark.slow
 def test_levels_are_found_where_a_change_of_gravity_makes_most_of_their_difference() -> None:
     """Levels of 21 and 72 N remove only 12 % of what one level leaves: W1 takes their mean."""
     case = case_of(72044, kind="pair")
