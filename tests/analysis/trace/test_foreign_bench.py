@@ -16,6 +16,7 @@ import pytest
 from analysis.effects.mechanics import BaseInclination, JointSpring
 from analysis.identify.identify import identify
 from analysis.simulation.model import load_model, save_model
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
 from rig.model.rig import Rig
@@ -33,11 +34,24 @@ from tests.analysis.trace.foreign_bench import (
 )
 
 LEAK = 2e-12  # [m^3/(s Pa)]
+FORCES = (
+    "coulomb_friction", "stribeck_friction", "asymmetric_friction", "asymmetric_viscous_friction",
+    "pressure_dependent_friction", "base_inclination", "joint_spring", "torque_offset",
+    "periodic_disturbance",
+)  # fmt: skip
+FLOWS = (
+    "internal_leakage", "external_leakage", "underlap_leakage", "valve_deadband", "spool_offset",
+    "spool_lag", "supply_sag", "tank_pressure", "entrained_air", "dead_volume", "sensor_gain",
+)  # fmt: skip
 
 
-def traced(rig: Rig, hidden: Hidden, free_forms: bool = True, **measured: Any) -> Trace:
+def traced(
+    rig: Rig, hidden: Hidden, *names: str, free_forms: bool = True, **measured: Any
+) -> Trace:
+    """Trace a bench with the named candidates, or with the whole catalogue."""
     train, held_out = pair_of_runs(rig, hidden, **measured)
-    return trace([train], [held_out], look_ahead=False, free_forms=free_forms)
+    candidates = catalogue(rig, names) if names else None
+    return trace([train], [held_out], candidates, look_ahead=False, free_forms=free_forms)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +80,8 @@ def test_dry_friction_of_one_level_is_coulomb_friction_whatever_its_transition(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.06)
 
 
-@pytest.mark.parametrize("width", [1e-3, pytest.param(5e-3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1e-3, 5e-3])
 def test_dry_friction_of_two_levels_is_asymmetric_friction(rig: Rig, width: float) -> None:
     result = traced(rig, Hidden(100.0, 60.0, width))
     assert result.verdict == "explained"
@@ -84,6 +99,7 @@ def test_a_joint_that_sticks_has_dry_friction_of_one_level_and_no_breakaway(rig:
     assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_joint_that_sticks_now_and_then_is_fitted_in_motion(rig: Rig) -> None:
     """All rows explain it too, with 1.6 noise floors and viscous friction 1.3 % off."""
     result = traced(rig, Hidden(30.0, 30.0, 1e-3, KARNOPP))
@@ -97,7 +113,7 @@ def test_a_joint_that_sticks_now_and_then_is_fitted_in_motion(rig: Rig) -> None:
 
 def test_levels_by_direction_of_a_joint_that_sticks_are_found_in_motion(rig: Rig) -> None:
     """In all rows one level of 53 N seems to explain them."""
-    result = traced(rig, Hidden(60.0, 40.0, 5e-4, KARNOPP))
+    result = traced(rig, Hidden(60.0, 40.0, 5e-4, KARNOPP), *FORCES)
     assert result.verdict == "explained"
     assert [e.name for e in result.effects] == ["asymmetric_friction"]
     found = result.effects[0].parameters
@@ -148,6 +164,7 @@ def test_a_leak_is_explained_however_well_it_is_measured(
     )
 
 
+@pytest.mark.slow
 def test_what_vetoes_no_leak_is_clean_without_one(rig: Rig) -> None:
     assert traced(rig, Hidden(2.0, 2.0)).verdict == "clean"
 
@@ -220,7 +237,7 @@ def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
 
 def test_dry_friction_that_grows_along_the_stroke_is_a_curve_that_grows(rig: Rig) -> None:
     """The level of 80 N grows by 1 % a millimetre, where Coulomb's law has one level."""
-    result = traced(rig, Hidden(80.0, 80.0, tighter=10.0))
+    result = traced(rig, Hidden(80.0, 80.0, tighter=10.0), *FORCES)
     assert result.verdict == "explained"
     (curve,) = result.effects
     assert (curve.name, curve.where, curve.free) == ("friction_curve", "joint 2", True)
@@ -240,13 +257,14 @@ def test_dry_friction_that_grows_along_the_stroke_is_a_curve_that_grows(rig: Rig
 
 def test_a_preloaded_spring_rests_where_the_joint_does_not_come(rig: Rig) -> None:
     """The joint reaches from -1.83 to -0.96 rad."""
-    result = traced(rig, Hidden(spring=30.0, spring_rest=-0.7), free_forms=False)
+    result = traced(rig, Hidden(spring=30.0, spring_rest=-0.7), *FORCES, free_forms=False)
     assert [e.name for e in result.effects] == ["joint_spring"]
     found = result.effects[0].parameters
     assert found["k_spring_2"].value == pytest.approx(30.0, rel=0.02)
     assert found["rest_2"].value == pytest.approx(-0.7, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_spring_with_one_number_more_is_a_rival_where_it_leaves_clearly_less(rig: Rig) -> None:
     """In that noise both a tilted base and the spring leave no more than the band."""
     hidden = Hidden(spring=5.0, spring_rest=-0.3)
@@ -308,7 +326,7 @@ def test_edges_with_half_their_gain_about_the_null_are_no_dead_band(rig: Rig) ->
 
 
 def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -> None:
-    result = traced(rig, Hidden(leak_root=5e-9))
+    result = traced(rig, Hidden(leak_root=5e-9), *FLOWS)
     assert result.verdict == "explained"
     (leak,) = result.effects
     assert (leak.name, leak.where) == ("internal_leakage", "joint 2")
@@ -322,7 +340,7 @@ def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -
 
 
 def test_a_worn_bore_leaks_most_where_it_is_worn(rig: Rig) -> None:
-    result = traced(rig, Hidden(leak=1e-12, worn=3.0))
+    result = traced(rig, Hidden(leak=1e-12, worn=3.0), *FLOWS)
     assert result.verdict == "explained"
     (leak,) = result.effects
     assert (leak.name, leak.where) == ("leakage_along_stroke", "joint 2")
@@ -375,7 +393,8 @@ def rig_angle(rig: Rig) -> float:
     return float(rig.joints[0].geometry(0.0)[0])
 
 
-@pytest.mark.parametrize("drop", [1e6, pytest.param(2e6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("drop", [1e6, 2e6])
 def test_a_supply_that_sags_in_proportion_to_the_flow_is_named(rig: Rig, drop: float) -> None:
     """Laminar share and drop lie on a ridge: what counts is the drop at the flows that were."""
     result = traced(rig, Hidden(sag=drop))
