@@ -25,6 +25,12 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
 
+BOTH = (
+    "coulomb_friction", "stribeck_friction", "asymmetric_friction", "torque_offset", "joint_spring",
+    "valve_deadband", "spool_offset", "spool_lag", "underlap_leakage", "internal_leakage",
+    "sensor_gain", "sensor_offset",
+)  # fmt: skip
+
 
 def traced(rig: Rig, **wrong: float) -> Trace:
     train, held_out = pair_of_runs(rig, **wrong)
@@ -135,8 +141,11 @@ def test_the_result_has_the_contracts_keys(leaking: Trace) -> None:
     assert set(data["error"]["after"]) == {"torque_2", "flow_cap_2", "flow_rod_2"}
 
 
-def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig) -> None:
-    result = traced(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
+@pytest.mark.parametrize("names", [BOTH, pytest.param((), marks=pytest.mark.slow)])
+def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig, names: tuple[str, ...]) -> None:
+    train, held_out = pair_of_runs(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
+    candidates = catalogue(rig, names) if names else None
+    result = trace([train], [held_out], candidates, look_ahead=False)
     assert result.verdict == "explained"
     assert {(e.name, e.where) for e in result.effects} == {
         ("coulomb_friction", "joint 2"), ("valve_deadband", "joint 2"),
