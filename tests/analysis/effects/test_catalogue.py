@@ -198,7 +198,7 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
         memory = np.zeros(len(signals.t))
         if e.remembers(shape):
             memory = hidden_state(e, rig, signals, shape)
-        for k in range(40, 400, 17):
+        for k in range(40, 400, 45):
             x, bench = observed(signals, k)
             z, dz = np.full(e.hidden(rig), memory[k]), np.zeros(e.hidden(rig))
             out, M = np.zeros((base.OUT_ROWS, 2)), np.zeros((2, 2))
