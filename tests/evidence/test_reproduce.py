@@ -64,16 +64,26 @@ def taken(
 
 
 @pytest.fixture(scope="module")
-def done() -> Reproduction:
+def steps() -> Run:
+    return taken(bench.shinshu(), {step.name: step for step in bench.STEPS}, repeats=2, seed=1)
+
+
+@pytest.fixture(scope="module")
+def both() -> Run:
+    return taken(bench.shinshu(), {"both_1hz": BOTH}, repeats=2, seed=3)
+
+
+@pytest.fixture(scope="module")
+def done(steps: Run, both: Run) -> Reproduction:
     """The whole analysis on another program's bench, two repeats, searches of forty candidates."""
     rig = bench.shinshu()
     three = {step.name: step for step in bench.STEPS}
     judged = {cell.step: three.get(cell.step.split("_")[0], BOTH) for cell in TABLE_IV}
     loaded = {**TRUTH, **{name: TRUTH[name] + more for name, more in LOADED.items()}}
     runs = Runs(
-        taken(rig, three, repeats=2, seed=1),
+        steps,
         taken(rig, judged, repeats=1, seed=2),
-        taken(rig, {"both_1hz": BOTH}, repeats=2, seed=3),
+        both,
         taken(rig, three, repeats=2, seed=4, truth=loaded),
         TRUTH,
     )
@@ -157,11 +167,11 @@ def test_a_simulated_bench_takes_a_scenario_file(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def run_folder(done: Reproduction, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(steps: Run, both: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same records as a run folder, by way of CSV files and a manifest."""
     folder = tmp_path_factory.mktemp("imported")
     lines = ["rig: shinshu-2dof", "sample_rate: 1 kHz", "records:"]
-    for record in (*done.runs.steps.records, *done.runs.both.records):
+    for record in (*steps.records, *both.records):
         names = list(record.channels)
         data = np.column_stack([record.channels[name] for name in names])
         file = folder / f"{record.name}.csv"
