@@ -31,7 +31,7 @@ WIRES: dict[str, Callable[[], Subject]] = {
 }
 
 
-FURTHER = ("modbus-rtu", "canopen-408", "can-slcan")
+FURTHER = ("modbus-rtu", "serial", "can, in its adapter", "canopen-408", "can-slcan")
 
 
 @pytest.mark.parametrize(
