@@ -25,6 +25,7 @@ from rig.model.records import Run
 from rig.runs.exchange.fixtures import write_run
 from tests.analysis.pool_work import about, broken, gone, noise, square
 from tests.analysis.test_accumulate import assert_same
+from tests.cli.bench import bramah_here
 from tests.studies.pool import Kept, performed
 
 END_SECONDS = 20.0
@@ -159,10 +160,7 @@ def test_the_command_line_works_on_a_cluster(
     scheduler: str, tmp_path: Path, multisine_run: Run
 ) -> None:
     folder = write_run(tmp_path / "monday", multisine_run)
-    line = [sys.executable, "-c", "from rig.cli.main import run; run()", "identify", str(folder)]
-    done = subprocess.run(
-        [*line, "--cluster", scheduler], capture_output=True, text=True, timeout=100, check=False
-    )
+    done = bramah_here("identify", folder, "--cluster", scheduler)
     assert done.returncode == 0, done.stderr
     assert "C_mm_2" in done.stdout
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import re
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,6 +29,7 @@ from analysis.terms.specialise import NotSpecialisable
 from rig.model.rig import Rig
 from rig.runs.files import CACHE_VARIABLE
 from rig.runs.rigs import load_rig
+from tests.forked import ROOT, Forked
 from tests.variants import kept
 
 RIGS = ("boom-1dof", "shinshu-2dof", "digger-3dof", "electric-2dof")
@@ -374,16 +373,9 @@ def test_a_cache_that_cannot_be_written_costs_time_and_no_more(
 
 
 def test_two_processes_that_compile_at_once_leave_one_whole_folder(cache: Path) -> None:
-    code = (
-        "import numpy as np; from tests.analysis.test_fused import run_small; "
-        "print(run_small()[1].tobytes().hex())"
-    )
-    children = [
-        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=os.environ)
-        for _ in range(2)
-    ]
+    children = [Forked((), ROOT, __name__, told=True) for _ in range(2)]
     found = [child.communicate(timeout=120)[0].strip() for child in children]
-    assert found[0] == found[1] != b""
+    assert found[0] == found[1] != ""
     assert len([*(cache / "rates").iterdir()]) == 1
     forget()
     assert compiled_sources.stored(_small_source()) is not None
@@ -393,3 +385,7 @@ def _small_source() -> str:
     rig = load_rig("boom-1dof")
     model = model_of(rig, [*map(Used, baseline_of(rig))], rig.nominal)
     return Evaluated(rig, model).source
+
+
+if __name__ == "__main__":
+    sys.stdout.write(run_small()[1].tobytes().hex())

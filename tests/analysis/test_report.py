@@ -199,10 +199,10 @@ def test_the_page_stands_alone(html: str, page: Page) -> None:
 
 
 def test_the_same_arguments_give_the_same_bytes_and_leave_matplotlib_alone(
-    multisine_run: Run, found: Identification
+    brief: Run, found: Identification
 ) -> None:
     before = dict(mpl.rcParams)
-    one, two = (render_report(runs=[multisine_run], identification=found) for _ in range(2))
+    one, two = (render_report(runs=[brief], identification=found) for _ in range(2))
     assert one == two
     assert dict(mpl.rcParams) == before
 
@@ -221,7 +221,7 @@ def test_hostile_names_stay_text(multisine_run: Run, found: Identification) -> N
             r, name=HOSTILE + r.name, step=HOSTILE + r.step,
             attributes={"lock_1": HOSTILE, "lost_samples": HOSTILE},
         )
-        for r in multisine_run.records
+        for r in multisine_run.records[::4]
     )  # fmt: skip
     run = replace(multisine_run, rig=rig, records=records, source=HOSTILE)
     model = replace(found.model, rig=rig)
