@@ -191,6 +191,9 @@ def forked_at_requests(listener: socket.socket) -> str:
     """
     while True:
         ready, _, _ = select.select([0, listener], [], [])
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
         if 0 in ready:
             sys.exit()
         link, _ = listener.accept()
@@ -208,9 +211,6 @@ def forked_at_requests(listener: socket.socket) -> str:
             _tell_the_end(child, streams)
         for stream in streams:
             os.close(stream)
-        with suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
 
 
 def _as_started_anew(request: dict[str, Any], streams: list[int]) -> None:

@@ -109,7 +109,10 @@ def _chamber_rates(p, joint, s, v, u, pressure_in, gains):
 
 
 @njit(cache=True)
-def _rates(y, t, par, locked, waves, biases, centring):
+def _rates(y, t, packed):
+    """Rates of the state; all that is constant comes in one array, which is quick to pass."""
+    par, locked, biases, centring = packed[:16], packed[16:18] > 0.0, packed[18:20], packed[20]
+    waves = packed[21:].reshape(-1, 4)
     q1, q2, w1, w2 = y[0], y[1], y[2], y[3]
     M1, M2, R12, F1, F2, W1, W2 = par[0], par[1], par[2], par[3], par[4], par[5], par[6]
     s1, G1 = _piston(q1, 0)
@@ -211,7 +214,8 @@ def simulate(
     args = (par, locked, waves, np.array(bias), centring)
     # The integrator's first step depends on the first instant asked for: always that of a tick.
     grid = np.concatenate(([0.0, tick[0]], times))
-    y = odeint(_rates, settle(step, excitation, truth), grid, args, rtol=1e-8, atol=1e-8,
+    packed = np.concatenate((par, locked, bias, [centring], waves.ravel()))
+    y = odeint(_rates, settle(step, excitation, truth), grid, (packed,), rtol=1e-8, atol=1e-8,
                hmax=0.002, mxstep=200000)[2:]  # fmt: skip
     y = y.reshape(n, len(places), 8)
     t = times.reshape(n, len(places))

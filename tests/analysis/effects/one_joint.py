@@ -38,6 +38,7 @@ NAMES = (
 ) = range(len(NAMES))  # fmt: skip
 SHAPES = {"presliding": 40e-6, "v_stribeck": 0.03, "rest": -1.35}
 NAMES_1 = ("M2", "Fv2", "W2", "b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2")
+END = 11 + len(NAMES)  # of what is wrong, in what is passed to the integrator
 CHANNELS = ("spool", "piston", "cap_pressure", "rod_pressure")
 
 
@@ -121,7 +122,10 @@ def _friction(v, cap, rod, deflection, e):
 
 
 @njit(cache=True)
-def _rates(y, t, q1, par, e, wave, bias, centring):
+def _rates(y, t, packed):
+    """Rates of the state; all that is constant comes in one array, which is quick to pass."""
+    q1, bias, centring, par, e = packed[0], packed[1], packed[2], packed[3:11], packed[11:END]
+    wave = packed[END:].reshape(-1, 3)
     q, w, cap, rod = y[0], y[1], y[2], y[3]
     s, G = _linkage(q)
     v = G * w
@@ -205,7 +209,7 @@ def _simulated(
     centring, settle = 0.3, 4.0
     q1 = angle(0.0, 0)
     par = np.array([TRUTH[name] for name in NAMES_1])
-    args = (q1, par, wrong.array(), wave, bias, centring)
+    packed = np.concatenate(([q1, bias, centring], par, wrong.array(), wave.ravel()))
     n = round(seconds * rig.sample_rate)
     tick = np.arange(n) / rig.sample_rate + settle
     instants = {}
@@ -219,7 +223,8 @@ def _simulated(
     G = _linkage(q2)[1]
     hold = TRUTH["W2"] * 9.8 * math.sin(q1 + q2) / G
     start = [q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0, 0.0]
-    y = odeint(_rates, start, np.concatenate(([0.0, first], times)), args, rtol=1e-8, atol=1e-9,
+    grid = np.concatenate(([0.0, first], times))
+    y = odeint(_rates, start, grid, (packed,), rtol=1e-8, atol=1e-9,
                hmax=0.002, mxstep=200000)[2:]  # fmt: skip
     y = y[back].reshape(len(kinds), n, 6)
     supply = wrong.gain.get("supply_pressure", 1.0) * 7e6 + wrong.offset.get("supply_pressure", 0)
