@@ -26,9 +26,8 @@ from rig.model.rig import Rig
 from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
 
 BOTH = (
-    "coulomb_friction", "stribeck_friction", "asymmetric_friction", "torque_offset", "joint_spring",
-    "valve_deadband", "spool_offset", "spool_lag", "underlap_leakage", "internal_leakage",
-    "sensor_gain", "sensor_offset",
+    "coulomb_friction", "stribeck_friction", "torque_offset", "valve_deadband", "spool_offset",
+    "internal_leakage",
 )  # fmt: skip
 
 
