@@ -190,7 +190,7 @@ def forked_at_requests(listener: socket.socket) -> str:
     Returns in the new process alone, with the name of its module.
     """
     while True:
-        ready, _, _ = select.select([0, listener], [], [])
+        ready, _, _ = select.select([0, listener.fileno()], [], [])
         with suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
@@ -220,8 +220,8 @@ def _as_started_anew(request: dict[str, Any], streams: list[int]) -> None:
         os.dup2(stream, place)
     for stream in (nothing, *streams):
         os.close(stream)
-    sys.stdout = sys.__stdout__ = os.fdopen(1, "w", encoding="utf-8", closefd=False)
-    sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, "utf-8", "backslashreplace", closefd=False)
+    sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = os.fdopen(2, "w", 1, "utf-8", "backslashreplace", closefd=False)
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(request["cwd"])
