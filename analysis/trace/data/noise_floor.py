@@ -118,12 +118,14 @@ def floors(
 def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:
     """Return by equation the rms ratio of noise measured in repeats or periods to stated noise.
 
-    Each group counts by the degrees of freedom of its repeats.
+    Each group counts by the degrees of freedom of its repeats. Above `DATA.unrepeated_ratio` it is
+    no noise of the sensors, but a cause that does not follow the excitation.
     """
     ratios: dict[str, list[float]] = {}
     weights: dict[str, list[int]] = {}
     for floor in split:
-        if floor.source in (REPEATS, PERIODS) and floor.stated > NO_ROWS:
+        most = DATA.unrepeated_ratio * floor.stated
+        if floor.source in (REPEATS, PERIODS) and floor.stated > NO_ROWS and floor.noise <= most:
             ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
             weights.setdefault(floor.equation, []).append(floor.count - 1)
     return {
