@@ -331,6 +331,25 @@ def a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak(b: Benches
     assert again.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
 
 
+def friction_beside_a_pressure_offset_is_not_taken_for_two_levels(b: Benches) -> None:
+    """In the torque both are the same; the flows show the offset."""
+
+    def offset(run: Run) -> Run:
+        name = "cap_pressure_2"
+        changed = [{**r.channels, name: r.channels[name] + 5e4} for r in run.records]
+        records = zip(run.records, changed, strict=True)
+        return replace(run, records=tuple(replace(r, channels=c) for r, c in records))
+
+    def made() -> tuple[Run, Run]:
+        train, held_out = foreign_bench.pair_of_runs(b.rig, foreign_bench.Hidden(88.0, 88.0))
+        return offset(train), offset(held_out)
+
+    names = ("coulomb_friction", "asymmetric_friction", "sensor_offset")
+    s = b.searched(b.kept("offset", made), *names)
+    again = s.hypotheses.exchanged(s.set_of("asymmetric_friction"))
+    assert again.keys == {("coulomb_friction", "joint 2"), ("sensor_offset", "joint 2 cap")}
+
+
 def a_spring_that_fits_like_an_inclination_is_its_rival(b: Benches) -> None:
     """The spring has a number more, but the joint's weight is 24 % smaller with it."""
     hidden = foreign_bench.Hidden(spring=10.0, spring_rest=-1.3)
@@ -346,6 +365,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
     (a_leak_is_named_alone_and_for_certain, ()),
     (a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak, ("look-alikes",)),
+    (friction_beside_a_pressure_offset_is_not_taken_for_two_levels, ("two for one",)),
     (a_leak_gone_on_the_held_out_day_is_refused, ("removes on held-out",)),
     (what_training_alone_shows_is_not_explained, ("fit records judge",)),
     (a_training_record_cannot_judge, ("same records pass",)),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,14 +9,11 @@ from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.judge import readings
 from analysis.trace.settings import TRACE
-from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
 from tests.analysis.trace.gate_cases import searched
 from tests.studies.foreign.bench import runs_of
 from tests.studies.foreign.cases import case_of
-
-CAP = "cap_pressure_2"
 
 
 def test_two_levels_that_energy_takes_for_one_are_asymmetric_friction(rig: Rig) -> None:
@@ -79,27 +74,6 @@ def test_one_level_with_an_offset_torque_is_said_to_fit_as_well_as_levels_by_dir
     (gate,) = (g for g in effect.gates if g.name == "no rival")
     assert gate.ok
     assert "coulomb_friction and torque_offset together would leave" in gate.detail
-
-
-def test_one_level_with_the_offset_of_a_pressure_is_not_taken_for_levels_by_direction(
-    rig: Rig,
-) -> None:
-    """In the torque both are the same; the flows show the offset."""
-
-    def offset(run: Run) -> Run:
-        records = []
-        for taken in run.records:
-            channels = {**taken.channels, CAP: taken.channels[CAP] + 5e4}
-            records.append(replace(taken, channels=channels))
-        return replace(run, records=tuple(records))
-
-    runs = pair_of_runs(rig, Hidden(88.0, 88.0))
-    names = ("coulomb_friction", "asymmetric_friction", "sensor_offset")
-    s = searched(rig, *map(offset, runs), *names)
-    assert {(u.term.name, u.term.where) for u in s.winner.effects} == {
-        ("coulomb_friction", "joint 2"),
-        ("sensor_offset", "joint 2 cap"),
-    }
 
 
 @pytest.mark.parametrize(

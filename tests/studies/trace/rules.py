@@ -150,6 +150,8 @@ RULES: Final = (
          ((HypothesisSet, "_pairs", lambda *_: []),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
+    Rule("two for one", "no effect is exchanged for two that leave less",
+         ((HypothesisSet, "composites", lambda *_: []),)),
     Rule("simpler name", "an effect that equals a simpler one is refused, and that one not tried",
          ((HypothesisSet, "_simpler_sets", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form only",
