@@ -62,9 +62,9 @@ class TraceSettings:
     states what remains (contract)."""
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
-    rest_share: float = 0.035
+    rest_share: float = 0.02
     """Share of a record's samples at rest, above which a joint rests beyond reversals: a Gaussian
-    speed has 0.016 (tuned: joints that stick had 0.042 to 0.12, others at most 0.024)."""
+    speed has 0.016 (tuned: joints that stick had 0.023 to 0.12, without friction at most 0.016)."""
     visible_deviations: float = 8.0
     """Energy above noise of an equation over the standard deviation of the noise's own energy, from
     which a further effect is searched for in it (tuned)."""
