@@ -36,13 +36,12 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
         out.append(f"one repeat per step: the noise floor comes from {where} within the record")
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
-    scaled = [
-        f.group[1] for d in (train_data, holdout_data) for f in d.floors if f.source == OTHER_STEPS
-    ]
+    every = (*train_data.floors, *holdout_data.floors)
+    scaled = sorted({f.group[1] for f in every if f.source == OTHER_STEPS})
     if scaled:
         out.append(
-            f"one repeat of {' '.join(sorted(set(scaled)))}: the noise floor is the rig file's "
-            "stated sensor noise times the ratio that repeats of other steps show"
+            f"one repeat of {' '.join(scaled)}: the noise floor is the rig file's stated sensor "
+            "noise times the ratio that repeats of other steps show"
         )
     return [
         *out,

@@ -390,8 +390,8 @@ class HypothesisSet:
         simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
         confounders = [
             e for e in self.effects
-            if e.name in own.confounders and _joint(e) == _joint(own)
-            and e.mechanism != own.mechanism and (e.name, e.where) not in known
+            if _is_confounder(e, own) and e.mechanism != own.mechanism
+            and (e.name, e.where) not in known
         ]  # fmt: skip
         return [
             (*others, *(Used(e, e.shape_of(rig, ())) for e in (simple, other)))
@@ -458,8 +458,12 @@ def _is_confusable(effect: Effect, used: Used) -> bool:
     own = used.term
     assert isinstance(own, Effect)
     same = effect.mechanism == own.mechanism and effect.where == own.where
-    confused = effect.name in own.confounders and _joint(effect) == _joint(own)
-    return (same or confused) and not effect.free
+    return (same or _is_confounder(effect, own)) and not effect.free
+
+
+def _is_confounder(effect: Effect, own: Effect) -> bool:
+    """Return whether an effect is a confounder of another one, at its joint."""
+    return effect.name in own.confounders and _joint(effect) == _joint(own)
 
 
 def _joint(effect: Effect) -> list[str]:

@@ -93,9 +93,18 @@ def to_and_fro(turns: int, repeats: int = 1, times: float = 10.0) -> Run:
     return Run(rig, tuple(records))
 
 
+def floors_of(*runs: Run, others: Sequence[Floor] = ()) -> dict[str, Floor]:
+    """Return the floors of a carriage's torque by step."""
+    rig = runs[0].rig
+    terms = (*map(Used, baseline_of(rig)), Used(CoulombFriction("joint 1"), (1e-5, 0.0, 0.0)))
+    data = regression_data(rig, terms, conditioned_records(rig, runs), others=others)
+    by_step = {f.group[1]: f for f in data.floors}
+    assert len(by_step) == len(data.floors)
+    return by_step
+
+
 def floor_of(run: Run) -> Floor:
-    terms = (*map(Used, baseline_of(run.rig)), Used(CoulombFriction("joint 1"), (1e-5, 0.0, 0.0)))
-    (floor,) = regression_data(run.rig, terms, conditioned_records(run.rig, [run])).floors
+    (floor,) = floors_of(run).values()
     return floor
 
 
@@ -111,13 +120,7 @@ def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> No
     """In the same records, and in held-out ones that have no repeats at all."""
     repeated, once = to_and_fro(1, 4, times=3.0), to_and_fro(1, times=3.0)
     other = replace(once, records=tuple(replace(r, step="other") for r in once.records))
-    rig, known = repeated.rig, floor_of(repeated)
-    terms = (*map(Used, baseline_of(rig)), Used(CoulombFriction("joint 1"), (1e-5, 0.0, 0.0)))
-
-    def floors_of(*runs: Run, others: Sequence[Floor] = ()) -> dict[str, Floor]:
-        data = regression_data(rig, terms, conditioned_records(rig, runs), others=others)
-        return {f.group[1]: f for f in data.floors}
-
+    known = floor_of(repeated)
     together = floors_of(repeated, other)
     apart = floors_of(other, others=[known])
     for floor in (together["other"], apart["other"]):
