@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
+from drivers.base import OFF, DeviceBusy, DeviceError, DeviceLost, OutputLaw
 from drivers.serial_stream import SerialSettings, SerialStreamDriver
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -66,7 +66,14 @@ def line(port: str) -> Iterator[BadLine]:
 
 def over(line: BadLine) -> SerialStreamDriver:
     driver = host(line.port, timeout=TIMEOUT)
-    driver.connect()
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            driver.connect()
+            break
+        except DeviceBusy:  # the device has not noticed yet that the line of the test before ended
+            assert time.monotonic() < end
+            time.sleep(0.05)
     driver._link.be_patient(1.0)
     driver.reset()
     return driver
