@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
+from analysis.regression.noise import sensor_variance
 from analysis.regression.rows import Filtering, Rows, right_sides
 from analysis.signals.conditioning import Mask, Signals
 from analysis.signals.convolution import same_convolved
@@ -29,7 +30,6 @@ from analysis.signals.filters import FirSmoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.parts import AnySensor
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -46,13 +46,6 @@ class Input:
     order: int
     field: str
     joint: int | None
-
-
-def sensor_variance(sensor: AnySensor) -> float:
-    """Return the variance of one sample [SI^2]: stated noise and the converter's rounding."""
-    low, high = sensor.range
-    rounding = (high - low) / ((1 << sensor.bits) - 1)
-    return float(sensor.noise**2 + rounding**2 / 12.0)
 
 
 def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:

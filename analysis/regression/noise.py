@@ -22,19 +22,27 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows, in_common, record_rows
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
+from rig.model.parts import AnySensor
 from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 
+def sensor_variance(sensor: AnySensor) -> float:
+    """Return the variance of one sample [SI^2]: stated noise and the converter's rounding."""
+    low, high = sensor.range
+    rounding = (high - low) / ((1 << sensor.bits) - 1)
+    return float(sensor.noise**2 + rounding**2 / 12.0)
+
+
 def disturbed(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
-    """Return the record with the rig's stated sensor noise added once more."""
+    """Return the record with the sensors' noise of the rig file added once more."""
     channels = dict(record.channels)
     for name in rig.channels:
         if name in channels:
             sensor = rig.sensors.of(ch.kind_of(name)[0])
-            noise = sensor.noise * rng.standard_normal(record.samples)
+            noise = np.sqrt(sensor_variance(sensor)) * rng.standard_normal(record.samples)
             channels[name] = channels[name] + noise
     return replace(record, channels=channels)
 

@@ -29,6 +29,7 @@ from analysis.trace.data.unrepeated import dominant_frequency, unrepeated_notes
 from analysis.trace.settings import DATA
 from rig.model.records import Run
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input, encode_input
 from rig.runs.rigs import load_rig
 from tests.analysis.carriage import Carriage, moves, record
 
@@ -130,6 +131,22 @@ def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> No
     assert floors_of(other)["other"].source == STATED
     loud = floor_of(to_and_fro(1, 4))  # so loud that it is no noise of the sensors
     assert floors_of(other, others=[loud])["other"].source == STATED
+
+
+def test_the_rounding_of_a_coarse_converter_is_part_of_the_stated_noise() -> None:
+    """One code of a drive's 10 bits is 6.5 times its noise; one record alone shows no noise."""
+    rig = load_rig("emps")
+    drive = rig.sensors.drive.model_copy(update={"bits": 10})
+    sensors = rig.sensors.model_copy(update={"drive": drive})
+    coarse = rig.model_copy(update={"sensors": sensors})
+    rounded = []
+    for x in to_and_fro(1, 4, times=0.0).records:
+        codes = encode_input(x.channels["drive_1"], *drive.range, drive.bits)
+        volts = decode_input(codes, *drive.range, drive.bits)
+        rounded.append(replace(x, channels={**x.channels, "drive_1": volts}))
+    known, once = (floor_of(Run(coarse, tuple(rounded[:n]))) for n in (4, 1))
+    assert (known.source, once.source) == (REPEATS, STATED)
+    assert once.noise == pytest.approx(known.noise, rel=0.25)
 
 
 def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(rig: Rig) -> None:
