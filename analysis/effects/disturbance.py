@@ -83,10 +83,15 @@ class PeriodicDisturbance(Effect):
         step = float(np.median(np.diff(parts[0][0])))
         length = max(float(time[-1] - time[0]) for time, _ in parts)
         high = min(FREQUENCY[1], BAND / step)
-        f = np.arange(max(FREQUENCY[0], 2.0 / length), high, 1.0 / (FINE * length))
+        wide = math.ceil(FINE * length / step)
+        f = np.fft.rfftfreq(wide, step)
         total = np.zeros(len(f), dtype=complex)
         for time, left in parts:
-            total += np.exp(-2j * np.pi * f[:, None] * time) @ left
+            even = np.zeros(wide)  # rows that are left out are zero
+            even[np.rint((time - time[0]) / step).astype(int)] = left
+            total += np.exp(-2j * np.pi * f * time[0]) * np.fft.rfft(even)
+        inside = (f >= max(FREQUENCY[0], 2.0 / length)) & (f < high)
+        f, total = f[inside], total[inside]
         power = np.abs(total)
         inner = (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
         at = 1 + np.flatnonzero(inner)
