@@ -263,7 +263,8 @@ def test_bad_input_is_one_line_that_names_it(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_wire_that_no_driver_serves_is_named_with_its_rig(tmp_path: Path) -> None:
+def test_a_wire_that_no_driver_serves_is_named_with_file_and_line(tmp_path: Path) -> None:
+    """Before anything is proved or reached, whatever is asked of the bench."""
     text, _ = rig_text(RIG)
     for right, wrong in (
         ("kind: modbus-tcp", "kind: modbus-tpc"),
@@ -272,13 +273,12 @@ def test_a_wire_that_no_driver_serves_is_named_with_its_rig(tmp_path: Path) -> N
     ):
         path = tmp_path / "bench.yaml"
         path.write_text(text.replace(right, wrong))
-        done = bramah_here("probe", "--rig", path)
-        assert done.returncode == 2
-        assert f"rig '{RIG}': wire: {wrong.split(':')[0]}: " in done.stderr
-        assert wrong.split()[1] in done.stderr
-        checked = bramah_here("check", "validate", "--rig", path)
-        assert checked.returncode == 2
-        assert f"bench.yaml:52: wire: {wrong.split(':')[0]}: " in checked.stderr
+        for verb in (("probe",), ("check", "validate"), ("run", "validate", "--out", "runs")):
+            done = bramah_here(*verb, "--rig", path, cwd=tmp_path)
+            assert done.returncode == 2
+            assert f"bench.yaml:52: wire: {wrong.split(':')[0]}: " in done.stderr
+            assert wrong.split()[1] in done.stderr
+            assert done.stderr.count("\n") == 1, done.stderr
 
 
 def test_nobody_at_the_other_end_is_exit_code_4(tmp_path: Path) -> None:

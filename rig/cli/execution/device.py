@@ -20,17 +20,29 @@ def reached_at(rig: Rig, endpoint: str | None) -> Rig:
     return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
 
 
+def bench_at(name: str, endpoint: str | None) -> Rig:
+    """Return a rig that can be driven, with the wire of `endpoint` if given.
+
+    Raises InputError, with file and line, for a wire of the rig file without driver or with wrong
+    settings.
+    """
+    from rig.runs.rigs import load_bench
+
+    bench = load_bench(name)
+    if endpoint is None:
+        _require_wire(name, bench)
+    return reached_at(bench, endpoint)
+
+
 def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
     """Return a rig, with the wire of `endpoint` if given, and its unconnected driver."""
     from drivers import make_driver
-    from rig.runs.rigs import load_bench
 
-    described = reached_at(load_bench(rig), endpoint)
+    described = bench_at(rig, endpoint)
     return described, make_driver(described.wire, described)
 
 
-def require_wire(name: str, rig: Rig) -> None:
-    """Raise InputError with file and line for a wire without driver, or with wrong settings."""
+def _require_wire(name: str, rig: Rig) -> None:
     from drivers.registry import driver_class
     from rig.model.parse import InputError, load_yaml
     from rig.runs.rigs import rig_text

@@ -20,7 +20,7 @@ from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.execution.attended import TrackedEstimates, terminal_lines
-from rig.cli.execution.device import device_of, reached_at
+from rig.cli.execution.device import bench_at, device_of
 from rig.cli.proof.proofs import proved
 from rig.cli.proof.space import require_space
 from rig.cli.proof.twin_choice import twin_source
@@ -31,7 +31,6 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs import runstate
 from rig.runs.recorder import Recorder
-from rig.runs.rigs import load_bench
 from rig.runs.store import refuse_occupied
 
 if TYPE_CHECKING:
@@ -60,9 +59,9 @@ class ProtocolJob:
     nominal: bool = False
 
 
-def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
-    bench = load_bench(rig)
-    return bench, resolve(library.load(protocol, overrides.parameters), bench, overrides)
+def _plan(job: ProtocolJob) -> tuple[Rig, Plan]:
+    bench, how = bench_at(job.rig, job.endpoint), job.overrides
+    return bench, resolve(library.load(job.protocol, how.parameters), bench, how)
 
 
 class _PhaseReport:
@@ -122,8 +121,7 @@ def _tracking(
 
 def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol and return its run folder; raises the error that ended it, outputs at zero."""
-    rig, plan = _plan(job.protocol, job.rig, job.overrides)
-    rig = reached_at(rig, job.endpoint)
+    rig, plan = _plan(job)
     refuse_occupied(job.out)
     desk_machine = StateMachine()
     desk_machine.to(EngineState.CHECKING, plan.protocol.name)

@@ -42,15 +42,13 @@ def check(
     """
     from protocols.files import library
     from protocols.files.plan import resolve
-    from rig.cli.execution.device import require_wire
+    from rig.cli.execution.device import bench_at
     from rig.cli.proof.proofs import proved
     from rig.cli.proof.twin_choice import twin_source
     from rig.cli.text.sheets import check_text
-    from rig.runs.rigs import load_bench
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
-    bench = load_bench(rig)
-    require_wire(rig, bench)
+    bench = bench_at(rig, None)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
     source = twin_source(bench, model, nominal)
     proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)

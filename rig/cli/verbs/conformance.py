@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.execution.device import reached_at
+from rig.cli.execution.device import bench_at
 from rig.cli.options import EndpointOption, JsonOption, RigOption
 from rig.cli.text.output import progress, table, write_json
 
@@ -30,9 +30,8 @@ def conformance(
     from drivers.conformance import CheckVerdict, live_subject, run
     from rig.cli.errors import WorkError
     from rig.model.parse import InputError
-    from rig.runs.rigs import load_bench
 
-    described = reached_at(load_bench(rig), endpoint)
+    described = bench_at(rig, endpoint)
     if described.wire.kind != driver:
         raise InputError(
             f"{driver}: the wire of rig {described.name!r} is {described.wire.kind}; "
