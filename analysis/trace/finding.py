@@ -22,6 +22,7 @@ from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
+from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
 from analysis.trace.judge.unlocked import Line
 from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.notes import WHY_MASKED
@@ -319,7 +320,9 @@ def _apply_gates(
         effects, winner, left = _extended_set(hypotheses, effects, winner, left, holdout_data, rng)
     if all_refused or any(r.veto for r in left):
         verdict = UNEXPLAINED
-        effects = (*map(gates.tied_in_held_out, effects), *refused)
+        above = {r.equation for r in left if r.veto}
+        effects = judged_beside_unknown_cause(hypotheses, winner, effects, above)
+        effects = (*effects, *refused)
     elif not winner.effects:  # too little remains for any effect to be needed
         verdict = CLEAN
     else:

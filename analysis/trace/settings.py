@@ -23,6 +23,10 @@ class TraceSettings:
     least_removed: float = 0.5
     """Least share of the held-out energy above noise that an effect removes in the equations where
     it acts: a cause removes most of it."""
+    least_removed_beside: float = 0.75
+    """Least share of the repeatable energy that an effect removes in its own equations where
+    another cause stays unknown: a wrong effect imitates half of it (a dead volume a cross-talk of
+    0.7, on a plant written apart from the study's)."""
     p_limit: float = 0.01
     """Largest family-wise p over all candidates and shapes (convention)."""
     tie_ratio: float = 1.10

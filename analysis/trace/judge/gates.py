@@ -9,7 +9,6 @@ other effect.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,21 +42,6 @@ REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL = (
 def passes_gates(effect: JudgedEffect) -> bool:
     """Return whether an effect passes every gate but that of rivals, which makes it confounded."""
     return all(gate.ok for gate in effect.gates if gate.name != NO_RIVAL)
-
-
-def tied_in_held_out(effect: JudgedEffect) -> JudgedEffect:
-    """Return an effect with every rival tied that held-out records alone do not separate from it.
-
-    This holds for an `unexplained` result: what a fit of training records with an unknown cause in
-    them leaves is no evidence.
-    """
-    rivals = [replace(r, tied=r.tied or r.ratio < TRACE.tie_ratio) for r in effect.rivals]
-    rivals.sort(key=lambda r: not r.tied)
-    if not any(r.tied for r in rivals):
-        return effect
-    kept = [gate for gate in effect.gates if gate.name != NO_RIVAL]
-    gate = Gate(NO_RIVAL, False, _rivals_in_words(rivals))
-    return replace(effect, rivals=tuple(rivals), gates=(*kept, gate))
 
 
 def refused_effects(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
@@ -122,7 +106,7 @@ def judge_effects(
             Gate(
                 NO_RIVAL,
                 not (tied or twins),
-                _rivals_in_words([*twins, *rivals])
+                rivals_in_words([*twins, *rivals])
                 + _composites_in_words(hypotheses, winner, used, holdout_data, tie_test),
             ),
         )
@@ -502,7 +486,8 @@ def _differences_in_words(differing: Sequence[Difference]) -> str:
     )
 
 
-def _rivals_in_words(rivals: Sequence[Rival]) -> str:
+def rivals_in_words(rivals: Sequence[Rival]) -> str:
+    """Say which rivals fit as well, or else how near the closest comes."""
     if not rivals:
         return "no other set fits nearly as well"
     nearest = rivals[0]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from analysis.simulation.synthetic import multisine, synthetic_run
+from analysis.trace import engine
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.judge import gates, inference
@@ -360,6 +364,39 @@ def a_spring_that_fits_like_an_inclination_is_its_rival(b: Benches) -> None:
     assert any(said in note for note in result.notes)
 
 
+def wrong_volumes_at_one_joint_name_nothing_at_the_other(b: Benches) -> None:
+    """Volumes in the rig file that one bulk modulus cannot make up for bend it for both joints."""
+    for joint, cap, rod in ((1, 0.2, 3.0), (2, 0.2, 0.2)):
+        other = f"joint {3 - joint}"
+        volumes = [e for e in catalogue(b.rig, ("dead_volume",)) if e.where.startswith(other)]
+        train, held_out = b.kept(
+            f"volumes {joint}", partial(with_other_volumes, b.rig, joint, cap, rod)
+        )
+        result = engine.trace([train], [held_out], volumes, look_ahead=False, free_forms=False)
+        assert (result.verdict, result.effects) == ("unexplained", ())
+
+
+def with_other_volumes(rig: Rig, joint: int, cap: float, rod: float) -> tuple[Run, Run]:
+    """Return runs of a machine with `cap` and `rod` times the stated pipe volumes at a joint."""
+    joints = list(rig.joints)
+    cylinder = joints[joint - 1].cylinder
+    held = {
+        "cap_pipe_volume": cap * cylinder.cap_pipe_volume,
+        "rod_pipe_volume": rod * cylinder.rod_pipe_volume,
+    }
+    true = {"cylinder": cylinder.model_copy(update=held)}
+    joints[joint - 1] = joints[joint - 1].model_copy(update=true)
+    machine = rig.model_copy(update={"joints": tuple(joints)})
+
+    def recorded(seed: int, rms: float, repeats: int) -> Run:
+        wave = multisine(np.random.default_rng(50 + seed), rig.sample_rate, 4.0, 9.5)
+        rng = np.random.default_rng(seed)
+        run = synthetic_run(machine, rng, wave, rms=rms, repeats=repeats, seconds=6.0)
+        return replace(run, rig=rig)
+
+    return recorded(1, 0.025, 3), recorded(2, 0.018, 2)
+
+
 STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_names_nothing, ("p always 0", "no family")),
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
@@ -383,6 +420,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (a_quiet_friction_is_named_beside_a_loud_leak, ("further search",)),
     (twice_the_noise_on_the_held_out_day_is_not_clean, ("held-out band", "held-out floor x 2")),
     (what_the_judging_rows_alone_show_is_not_explained, ("judging rows unread",)),
+    (wrong_volumes_at_one_joint_name_nothing_at_the_other, ("unknown cause",)),
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (equal_levels_by_direction_are_one_level, ("simpler name",)),

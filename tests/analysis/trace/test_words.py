@@ -10,7 +10,8 @@ import numpy as np
 from analysis.simulation.model import Estimate, nominal_model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.judge.gates import NO_RIVAL, passes_gates, tied_in_held_out
+from analysis.trace.judge.gates import NO_RIVAL, passes_gates
+from analysis.trace.judge.unknown_cause import tied_in_held_out
 from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import sentence, tolerated_error_notes
