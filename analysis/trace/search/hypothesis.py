@@ -12,7 +12,7 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.refinement import ExactFit
-from analysis.trace.settings import SEARCH
+from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -73,6 +73,25 @@ def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) ->
             value = float(beta.get(c.parameter, np.nan))
             out[c.parameter] = 1.0 / value if c.reciprocal and value else value
     return out
+
+
+def negative_body(rig: Rig, fit: ExactFit, baseline: ExactFit) -> str:
+    """Return in words which inertia M or weight W of a fit is negative ('' if none is).
+
+    It must be so beyond the noise and by `SEARCH.negative_share` of its value in the `baseline`
+    fit, which must not be negative itself: a rig with a counterweight, or with angles counted the
+    other way, has negative weights in both fits or states them.
+    """
+    share = SEARCH.negative_share
+    for k, (name, value) in enumerate(fit.beta.items()):
+        before = baseline.beta.get(name, 0.0)
+        is_body = name[0] in "MW" and name[1:].isdigit() and rig.nominal.get(name, 0.0) >= 0.0
+        if is_body and value < -share * abs(before) and before > share * value:
+            scale = np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
+            inverse = np.linalg.pinv(fit.information / np.outer(scale, scale), hermitian=True)
+            if value < -TRACE.standard_errors * np.sqrt(inverse[k, k]) / scale[k]:
+                return f"{name} would be {value:.4g}, below zero"
+    return ""
 
 
 def energy_above_noise(

@@ -11,6 +11,7 @@ import copy
 import logging
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms import make
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import Variant, complexity, variants
+from analysis.trace.data.candidates import Variant, complexity, shape_grid, variants
 from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
@@ -31,6 +32,7 @@ from analysis.trace.search.hypothesis import (
     Key,
     energy_above_noise,
     law_of,
+    negative_body,
     noise_band,
     parameter_values,
     within_band,
@@ -40,6 +42,7 @@ from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
 Array = NDArray[np.float64]
+_BENCH: Final = "bench"
 log = logging.getLogger(__name__)
 
 
@@ -112,7 +115,7 @@ class HypothesisSet:
             if problem:
                 whose = f"of {used.term.name} at {place_in_words(used.term.where)}: "
                 return problem if used is first else whose + problem
-        return ""
+        return negative_body(rig, hypothesis.fit, self.empty.fit)
 
     def refined(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the exact fit of a set of effects, computed once for its names and places."""
@@ -368,7 +371,7 @@ class HypothesisSet:
             for effect in self.effects:
                 if (effect.name, effect.where) in now.keys or not _is_confusable(effect, used):
                     continue
-                fresh = Used(effect, effect.shape_of(self.train_data.rig, ()))
+                fresh = self._started(effect, others)
                 sets.append((*others, fresh))
                 if used.term.name in effect.includes and effect.where == used.term.where:
                     # Another effect may only have made up for what the simpler law lacks.
@@ -397,6 +400,20 @@ class HypothesisSet:
             (*others, *(Used(e, e.shape_of(rig, ())) for e in (simple, other)))
             for simple in simpler for other in confounders
         ]  # fmt: skip
+
+    def _started(self, effect: Effect, others: Sequence[Used]) -> Used:
+        """Return an effect at the point of its grid that leaves least beside others.
+
+        From another point, the search of a shape of either sign may end at the wrong bound.
+        """
+        data, rig = self.train_data, self.train_data.rig
+        signed = any(s.neutral is not None and s.low < s.neutral for s in effect.shapes(rig))
+        if not signed:
+            return Used(effect, effect.shape_of(rig, ()))
+        return min(
+            (Used(effect, point) for point in shape_grid(effect, rig)),
+            key=lambda used: fit_coefficients(data, (*self.base, *others, used)).energy,
+        )
 
     def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect that removes most from `equations`, None where none does.
@@ -453,7 +470,8 @@ class HypothesisSet:
 def _is_confusable(effect: Effect, used: Used) -> bool:
     """Return whether a candidate is easily confused with an effect of the set.
 
-    It is another name of its mechanism at the same place, or one of its confounders at its joint.
+    It is another name of its mechanism at the same place, or one of its confounders at its joint or
+    of the bench.
     """
     own = used.term
     assert isinstance(own, Effect)
@@ -462,13 +480,15 @@ def _is_confusable(effect: Effect, used: Used) -> bool:
 
 
 def _is_confounder(effect: Effect, own: Effect) -> bool:
-    """Return whether an effect is a confounder of another one, at its joint."""
-    return effect.name in own.confounders and _joint(effect) == _joint(own)
+    """Return whether an effect is a confounder of another one, at its joint or of the bench."""
+    joints = {_joint(effect), _joint(own)} - {_BENCH}
+    return effect.name in own.confounders and len(joints) <= 1
 
 
-def _joint(effect: Effect) -> list[str]:
-    """Return the words of an effect's place that name its joint, or the bench."""
-    return effect.where.split()[:2]
+def _joint(effect: Effect) -> str:
+    """Return the part of an effect's place that names its joint, or the bench."""
+    place = effect.where
+    return _BENCH if place.startswith(_BENCH) else " ".join(place.split()[:2])
 
 
 def effect_of(name: str, where: str) -> Effect:

@@ -1,0 +1,43 @@
+"""Sets of effects: which are impossible, and which are tried in place of others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from analysis.trace.search.hypothesis import negative_body
+from analysis.trace.search.refinement import ExactFit
+from rig.model.rig import Rig
+from tests.analysis.trace.gate_cases import LEAK, searched
+from tests.analysis.trace.hidden import pair_of_runs
+
+
+def fit_of(error: float = 1.0, **values: float) -> ExactFit:
+    """Return a fit with these coefficients, each with the same standard error."""
+    information = np.eye(len(values)) / error**2
+    return ExactFit((), values, np.zeros(0), information)
+
+
+def test_a_joint_that_weighs_less_than_nothing_is_impossible(rig: Rig) -> None:
+    """A spring can pull as hard as a joint's weight, which then seems to push."""
+    unstated = rig.model_copy(update={"nominal": {}})
+    baseline = fit_of(M1=50.0, W1=-5.0)
+    wrong = fit_of(M1=50.0, W1=-243.0)
+    assert negative_body(unstated, wrong, baseline) == "W1 would be -243, below zero"
+    assert negative_body(unstated, fit_of(error=100.0, M1=50.0, W1=-243.0), baseline) == ""
+    assert negative_body(unstated, fit_of(M1=50.0, W1=12.0, R12=-3.0), baseline) == ""
+    # A counterweight: the baseline shows it, or the rig file states it.
+    assert negative_body(unstated, wrong, fit_of(M1=50.0, W1=-150.0)) == ""
+    stated = rig.model_copy(update={"nominal": {"W1": -200.0}})
+    assert negative_body(stated, wrong, baseline) == ""
+
+
+@pytest.mark.parametrize("inclination", [-0.3, 0.3])
+def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclination: float) -> None:
+    """The one is of the bench and the other of a joint; from the wrong sign none is found."""
+    names = ("joint_spring", "base_inclination", "internal_leakage")
+    s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, inclination=inclination), *names)
+    again = s.hypotheses.exchanged(s.set_of("joint_spring", "internal_leakage"))
+    found = {u.term.name: u.shape for u in again.effects}
+    assert set(found) == {"base_inclination", "internal_leakage"}
+    assert found["base_inclination"][0] == pytest.approx(inclination, rel=0.02)
