@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -263,42 +263,45 @@ def signals_of(data: RegressionData) -> list[Signals]:
 
 
 def variant_columns(
-    data: RegressionData, chosen: Sequence[Variant], progress: Callable[[float], None] | None = None
-) -> list[VariantColumns]:
+    data: RegressionData, chosen: Sequence[Variant],
+    progress: Callable[[float], None] | None = None, equations: Collection[str] = (),
+) -> list[VariantColumns]:  # fmt: skip
     """Return the columns of every variant that acts in the data, in the variants' order.
 
-    `progress` is called after each with the share of the variants done.
+    `progress` is called after each with the share of the variants done. With `equations`, columns
+    are computed in their rows only and are zero elsewhere.
     """
+    asked = equations or {s.equation for s in data.segments}
+    families = {family_of(e) for e in asked}
+    records = [
+        replace(c, families=tuple(f for f in c.families if f in families)) for c in data.records
+    ]
+    segments = [s for s in data.segments if s.equation in asked]
     seen = signals_of(data)
     columns = []
     for variant in chosen:
-        columns.append(_columns_of_variant(data, variant, seen))
+        columns.append(_columns_of_variant(data, records, segments, variant, seen))
         if progress is not None:
             progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]
 
 
 def _columns_of_variant(
-    data: RegressionData, variant: Variant, seen: Sequence[Signals]
-) -> VariantColumns | None:
+    data: RegressionData, records: Sequence[ConditionedRecord], segments: Sequence[Segment],
+    variant: Variant, seen: Sequence[Signals],
+) -> VariantColumns | None:  # fmt: skip
+    """Return a variant's columns in some segments of the rows, None where it does not act there."""
     columns: dict[str, Array] = {}
     touched = set()
     M = data.base.shape[0]
-    for index, conditioned in enumerate(data.records):
+    for index, conditioned in enumerate(records):
         if is_hidden_by_lock(variant.effect, conditioned):
             continue
-        rows = data.rows[index]
         candidate = candidate_columns(
-            data.rig,
-            data.terms,
-            conditioned,
-            seen[index],
-            rows,
-            data.beta,
-            variant.used,
-            data.cache,
-        )
-        for segment in data.segments:
+            data.rig, data.terms, conditioned, seen[index], data.rows[index], data.beta,
+            variant.used, data.cache,
+        )  # fmt: skip
+        for segment in segments:
             if segment.group == conditioned.group and segment.equation in candidate:
                 touched.add(segment.equation)
                 for name, column in candidate[segment.equation].items():

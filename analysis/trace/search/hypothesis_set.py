@@ -328,7 +328,7 @@ class HypothesisSet:
             for v in self._variants(data, now.fit.residual)
             if v.key not in taken and (law_of(v.used) not in laws if v.effect.free else not free)
         ]
-        columns = variant_columns(data, tried)
+        columns = variant_columns(data, tried, equations=equations)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
