@@ -183,7 +183,7 @@ def a_gain_and_a_crosstalk_that_fit_alike_are_confounded(b: Benches) -> None:
 def _hardened(b: Benches) -> tuple[Run, Run]:
     def made() -> tuple[Run, Run]:
         train, held_out = b.runs()
-        return hardening(train, 4e6), hardening(held_out, 4e6)
+        return hardening(train, 5e5), hardening(held_out, 5e5)
 
     return b.kept("hardened", made)
 
