@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost
+from drivers.law_checks import possible_wave
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
 from rig.model.wire.codes import encode_output
@@ -89,21 +90,13 @@ def wave_codes(
     Raises DeviceError for a joint that does not exist, more samples than `capacity`, or a voltage
     outside the converter's range.
     """
-    if not 0 <= joint < len(rig.joints):
-        raise DeviceError(f"no joint {joint + 1} on a rig of {len(rig.joints)}")
-    volts = np.asarray(wave, dtype=np.float64).ravel()
-    if not 1 <= len(volts) <= capacity:
+    volts = possible_wave(joint, wave, rig)
+    if len(volts) > capacity:
         raise DeviceError(
             f"waveform of joint {joint + 1} has {len(volts)} samples; "
             f"the device takes 1 to {capacity}"
         )
     limit = rig.joints[joint].valve.command_range
-    wrong = np.flatnonzero(~(np.abs(volts) <= limit))
-    if len(wrong):
-        raise DeviceError(
-            f"waveform of joint {joint + 1}: sample {wrong[0]} is {volts[wrong[0]]:g} V, "
-            f"outside the converter's range of +-{limit:g} V"
-        )
     return encode_output(volts, limit, reg.WAVE_BITS).astype(np.int16)
 
 

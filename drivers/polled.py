@@ -34,6 +34,7 @@ from drivers.base import (
     SampleBlock,
     WireSettings,
 )
+from drivers.law_checks import possible_laws, possible_wave
 from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -119,7 +120,6 @@ class PolledDriver:
         low, high = np.array([sensor.range for sensor in sensors], dtype=np.float64).T
         rounding = DRIVER.rounding * (high - low)
         self._low, self._high = low + rounding, high - rounding
-        self._ranges = [joint.valve.command_range for joint in rig.joints]
         self._positions = [
             rig.channels.index(ch.channel(rig.position_kind, i + 1)) for i in range(len(rig.joints))
         ]
@@ -234,34 +234,14 @@ class PolledDriver:
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
         self._require_open()
-        if not 0 <= joint < len(self._ranges):
-            raise DeviceError(f"no joint {joint + 1} on a rig of {len(self._ranges)}")
-        volts = np.array(wave, dtype=np.float64).ravel()
-        limit = self._ranges[joint]
-        if not len(volts):
-            raise DeviceError(f"waveform of joint {joint + 1} is empty")
-        wrong = np.flatnonzero(~(np.abs(volts) <= limit))
-        if len(wrong):
-            raise DeviceError(
-                f"waveform of joint {joint + 1}: sample {wrong[0]} is {volts[wrong[0]]:g} V, "
-                f"outside the output's range of +-{limit:g} V"
-            )
-        self._uploaded[joint] = volts
+        self._uploaded[joint] = possible_wave(joint, wave, self._rig)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
         self._require_open()
         if self._streaming:
             self._heed_silence()
-        if len(laws) != len(self._ranges):
-            raise DeviceError(f"{len(laws)} laws for a rig of {len(self._ranges)} joints")
-        for joint, (law, most) in enumerate(zip(laws, self._ranges, strict=True), start=1):
-            if not all(math.isfinite(number) for number in astuple(law)):
-                raise DeviceError(f"law of joint {joint} has a value that is not finite: {law}")
-            if not 0.0 <= law.limit <= most:
-                raise DeviceError(
-                    f"law of joint {joint} has the limit {law.limit:g} V, expected 0 to {most:g} V"
-                )
+        laws = possible_laws(laws, self._rig)
         if self._cause is not None and any(law.limit > 0.0 for law in laws):
             raise DeviceError(f"tripped: {self._cause}; find the cause, then reset it")
         tick = self._next_tick()
@@ -438,7 +418,7 @@ class PolledDriver:
 
     def _zero_laws(self) -> None:
         self._laws.zero()
-        self._volts = np.zeros(len(self._ranges))
+        self._volts = np.zeros(len(self._rig.joints))
 
     def _make_safe(self) -> None:
         """After a failed tick: drop all laws and try once to zero the outputs."""

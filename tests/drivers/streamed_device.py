@@ -155,8 +155,8 @@ class StreamedDevice:
         wave[37] = np.nan
         with pytest.raises(DeviceError, match="sample 37"):
             driver.upload(0, wave)
-        for size in (0, 131_073):
-            with pytest.raises(DeviceError, match="1 to 131072"):
+        for size, says in ((0, "is empty"), (131_073, "1 to 131072")):
+            with pytest.raises(DeviceError, match=says):
                 driver.upload(0, np.zeros(size))
         with pytest.raises(DeviceError, match="no joint 3"):
             driver.upload(2, np.zeros(3))
