@@ -59,7 +59,7 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
         "tied": _names(result.tied_at),
         "predicted": fm.significant(r.predicted),
         "achieved": fm.significant(r.achieved),
-        "loudest": fm.significant(r.loudest),
+        "baseline_ratio": fm.significant(r.baseline_ratio),
         "left": fm.significant(r.residual),
         "did": "The protocol as given." if r.experiment is None
         else f"{_capital(str(r.experiment['text']))}.",

@@ -192,14 +192,14 @@ def search_and_judge(
     the sign flips; `done` receives the share of the candidates' columns that is computed.
     """
     hypotheses, choosing = HypothesisSet(rows.train, candidates), rows.unseen.choosing
-    quiet = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
-    if quiet and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
+    in_noise = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
+    if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
     winner = hypotheses.run(done)
     found = judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
     named = any(map(gates.passes_gates, found.effects))
-    notes = remainder_notes(found.verdict, found.remainders, quiet, named)
-    if not quiet or found.verdict != UNEXPLAINED:
+    notes = remainder_notes(found.verdict, found.remainders, in_noise, named)
+    if not in_noise or found.verdict != UNEXPLAINED:
         return finding_of(rows, found, notes)
     notes = [*_held_out_only_notes(rows.train, found.remainders), *notes]
     if not found.winner.effects:  # refused ones were fitted to noise
@@ -236,7 +236,7 @@ def without_unnamed_effects(finding: Finding) -> Finding:
         return finding
     winner = hypotheses.refined(kept) if kept else hypotheses.empty
     left = remainders(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
-    notes = remainder_notes(finding.verdict, left, quiet=False, named=bool(kept))
+    notes = remainder_notes(finding.verdict, left, in_noise=False, named=bool(kept))
     return replace(finding, winner=winner, remainders=tuple(left), notes=tuple(notes))
 
 
@@ -294,13 +294,15 @@ def _refused_as_unphysical(
     return tuple(replace(f, rivals=()) for f in judged if not gates.passes_gates(f))
 
 
-def remainder_notes(verdict: str, left: Sequence[Remainder], quiet: bool, named: bool) -> list[str]:
+def remainder_notes(
+    verdict: str, left: Sequence[Remainder], in_noise: bool, named: bool
+) -> list[str]:
     """State what remains in each equation, where the verdict itself does not say it.
 
-    `quiet`: the training records held nothing above the noise; `named`: an effect is named.
+    `in_noise`: the training records hold nothing above the noise; `named`: an effect is named.
     """
     out = []
-    if verdict == UNEXPLAINED and (named or quiet):
+    if verdict == UNEXPLAINED and (named or in_noise):
         out += [f"{r.equation}: {r.words}" for r in left if r.veto]
     return [*out, *(f"{r.equation}: {r.words}" for r in left if not r.veto)]
 

@@ -98,12 +98,12 @@ def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothe
 
     Where all keep no more than form error, an effect must leave only noise.
     """
-    loud = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
-    if not loud:
+    above_form_error = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
+    if not above_form_error:
         return wide.completed_to_noise(hypothesis)
     if len(hypothesis.effects) >= SEARCH.largest_set:
         return hypothesis
-    return wide.extended_in(hypothesis, loud) or hypothesis
+    return wide.extended_in(hypothesis, above_form_error) or hypothesis
 
 
 def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:

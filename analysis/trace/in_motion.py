@@ -81,7 +81,9 @@ def searched_in_motion(
     is used if friction acts in each joint whose rows are weighted and it is better (`_is_better`),
     and the balances of other joints are looked at next.
     """
-    loud, joints = _loud_joints(finding, [e for e in candidates if e.family == "friction"])
+    above_noise, joints = _joints_to_weight(
+        finding, [e for e in candidates if e.family == "friction"]
+    )
     weighted = set(finding.rows.in_motion)
     if joints <= weighted:
         return finding
@@ -94,10 +96,10 @@ def searched_in_motion(
         return replace(found, notes=(*rest_phase_notes(rows.in_motion, "leave out"), *found.notes))
 
     found = searched(joints)
-    acting = joints_with_friction(found.winner, loud)
+    acting = joints_with_friction(found.winner, above_noise)
     if acting and acting != joints:  # an effect of several balances had spread friction to others
         found = searched(acting)
-    unmet = joints_with_friction(found.winner, loud) != acting
+    unmet = joints_with_friction(found.winner, above_noise) != acting
     if acting <= weighted or unmet or not _is_better(found, finding, acting):
         return finding
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
@@ -105,7 +107,7 @@ def searched_in_motion(
     return searched_in_motion(rig, terms, records, candidates, free, seed, found)
 
 
-def _loud_joints(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:
+def _joints_to_weight(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:
     """Return the equations that keep too much, and the joints (0-based) whose rests may cause it.
 
     These have friction in the set, or, where the residual is `unexplained`, may have it and rest.
@@ -113,14 +115,14 @@ def _loud_joints(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str]
     if finding.verdict == CLEAN:
         return set(), set()
     ratios = _held_out_ratios(finding.rows, finding.winner)
-    loud = {e for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
-    joints = joints_with_friction(finding.winner, loud)
+    above_noise = {e for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
+    joints = joints_with_friction(finding.winner, above_noise)
     if finding.verdict == UNEXPLAINED:
         against = {r.equation for r in finding.remainders if r.veto}
         may = {e.joint for e in friction if equation("torque", e.joint) in against}
         joints |= {joint for joint in may if _rests(finding.rows.train.records, joint)}
-        loud |= against
-    return loud, joints
+        above_noise |= against
+    return above_noise, joints
 
 
 def _rests(records: Sequence[ConditionedRecord], joint: int) -> bool:

@@ -36,7 +36,7 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Round:
-    """One turn: the `runs` taken in it, the `experiment` that led to it, and the trace after.
+    """One round: the `runs` taken in it, the `experiment` that led to it, and the trace after.
 
     `achieved` is the experiment's separation as measured, None where there is none to measure.
     """
@@ -49,11 +49,11 @@ class Round:
 
     @property
     def predicted(self) -> float | None:
-        """What the experiment had promised, in units of one record's noise."""
+        """The separation predicted for the experiment, in units of one record's noise."""
         return None if self.experiment is None else float(self.experiment["predicted"])
 
     @property
-    def loudest(self) -> float:
+    def baseline_ratio(self) -> float:
         """The largest ratio of the baseline's repeatable residual to its noise."""
         return max(f.ratio for f in self.result.floors)
 
@@ -80,11 +80,10 @@ def achieved(
         asked = [_visibility_question(q["one"], rig) for q in experiment["questions"]]
         return min(present_separation(q, rows) for q in asked)
     old = regression_data(rig, terms, conditioned_records(rig, before))
-    rounds = [
+    return min(
         _question_separation(old, both, terms, len(before), q["one"], q["other"])
         for q in experiment["questions"]
-    ]
-    return min(rounds)
+    )
 
 
 def _question_separation(

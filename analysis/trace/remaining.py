@@ -83,16 +83,16 @@ def clues_to(
         held_out.held_out_residual(holdout_data, winner.fit),
     )
     train_rows, holdout_rows = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
-    loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
-    total = sum(winner.excess_energy[e] for e in loud)
-    loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue_share * total]
-    moves = dependence.dependences(train_rows, residual, holdout_rows, held_residual, loud)
+    equations = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
+    total = sum(winner.excess_energy[e] for e in equations)
+    equations = [e for e in equations if winner.excess_energy[e] > TRACE.clue_share * total]
+    moves = dependence.dependences(train_rows, residual, holdout_rows, held_residual, equations)
     hum = frequency_clue(split, train_data, residual, holdout_data, held_residual)
-    candidates = [formula(train_rows, residual, holdout_rows, held_residual, e) for e in loud]
+    candidates = [formula(train_rows, residual, holdout_rows, held_residual, e) for e in equations]
     formulas = tuple(expression for expression in candidates if expression is not None)
     first = _formula_clue(formulas) if hum is None else [hum]
-    there = {d.variable for d in first}
-    return (*first, *(d for d in moves if d.variable not in there)), formulas
+    listed = {d.variable for d in first}
+    return (*first, *(d for d in moves if d.variable not in listed)), formulas
 
 
 def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:

@@ -75,8 +75,8 @@ def sentence(result: Trace) -> str:
 def _held_out_only(result: Trace) -> str:
     """Say that only held-out records keep more than noise, and in which equations most."""
     ratios = {e: result.after[e] / floor for e, floor in result.noise_floor.items() if floor > 0}
-    loud = sorted(ratios, key=lambda e: -ratios[e])[:2]
-    errors = " and ".join(f"{ratios[e]:.2g} in {e}" for e in loud)
+    largest = sorted(ratios, key=lambda e: -ratios[e])[:2]
+    errors = " and ".join(f"{ratios[e]:.2g} in {e}" for e in largest)
     return (
         "The training records are met to within the noise, the held-out ones are not: errors over "
         f"the noise floor of {errors}."
@@ -91,10 +91,10 @@ def _formula(result: Trace) -> str:
 
 def _symmetry(result: Trace) -> str:
     """Say what spectral lines show of the largest remaining residual ('' if none exceeds noise)."""
-    loud = max(result.lines, key=lambda lines: lines.above_noise_after, default=None)
-    if loud is None or loud.above_noise_after < 1.0:
+    largest = max(result.lines, key=lambda lines: lines.above_noise_after, default=None)
+    if largest is None or largest.above_noise_after < 1.0:
         return ""
-    return f"; its spectral lines in {loud.equation} show that it is {loud.meaning_after}"
+    return f"; its spectral lines in {largest.equation} show that it is {largest.meaning_after}"
 
 
 def _variables_in_words(effects: tuple[JudgedEffect, ...]) -> str:

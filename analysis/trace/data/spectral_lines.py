@@ -86,8 +86,8 @@ class SpectralLines:
         return meaning(self.shares_after, self.velocity_shares)
 
 
-def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
-    """Return the cause in words, from the shares by kind of line: residual's, velocity's `own`."""
+def meaning(shares: Mapping[str, float], of_velocity: Mapping[str, float]) -> str:
+    """Return the cause in words, from the shares by kind of line of residual and velocity."""
     if not any(shares.values()):
         return "not above the noise"
     moving = 1.0 - shares[CONSTANT]
@@ -99,7 +99,7 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
         (ODD, DATA.symmetric_share, "a symmetric nonlinearity"),
     ):
         share = shares[kind] / moving
-        if share > least and share > DATA.velocity_ratio * own[kind]:
+        if share > least and share > DATA.velocity_ratio * of_velocity[kind]:
             meanings.append((share, word))
     if not meanings:
         return "linear in the motion"
@@ -114,7 +114,7 @@ def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, .
 
     `after` (M,) is the averaged whitened residual of the final model.
     """
-    loud = {(f.group, f.equation): f.ratio for f in data.floors}
+    ratios = {(f.group, f.equation): f.ratio for f in data.floors}
     out = []
     for conditioned, rows in zip(data.records, data.rows, strict=True):
         record = conditioned.record
@@ -125,7 +125,7 @@ def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, .
                 residual = data.residual[: s.repeats, s.where] * s.noise
                 rest = after[s.where] * s.noise / np.sqrt(s.repeats)
                 both = np.vstack((residual, rest))
-                ratio = loud[s.group, s.equation]
+                ratio = ratios[s.group, s.equation]
                 of_segment = _segment_lines(s, conditioned, rows[s.equation], both, ratio)
                 if of_segment is not None:
                     out.append(of_segment)
@@ -133,7 +133,7 @@ def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, .
 
 
 def _segment_lines(
-    s: Segment, conditioned: ConditionedRecord, rows: Rows, residuals: Array, loud: float
+    s: Segment, conditioned: ConditionedRecord, rows: Rows, residuals: Array, above_noise: float
 ) -> SpectralLines | None:
     """Return the lines of residuals (repeats + 1, m) [SI]; the last one is of the final model."""
     record = conditioned.record
@@ -147,23 +147,23 @@ def _segment_lines(
     if not pairs or highest > K:
         return None
     joint = int(s.equation.rsplit("_", 1)[1]) - 1
-    speed = filtered({"v": conditioned.signals.sd[:, joint]}, conditioned, rows)["v"]
-    series = np.vstack((residuals, speed))
+    velocity = filtered({"v": conditioned.signals.sd[:, joint]}, conditioned, rows)["v"]
+    series = np.vstack((residuals, velocity))
     spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])
     single = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
     n = len(single)
     # A single period does not show its noise: the noise floor is spread evenly over the lines.
     noise = single.var(axis=0, ddof=1) if n > 1 else np.full(K + 1, s.noise**2 / (K + 1))
     excited = np.isin(np.arange(K + 1), record.lines)
-    own = np.abs(spectra[:, -1].mean(axis=0)) ** 2
-    own[0] = 0.0  # a mean velocity only comes from the ends that were cut off
+    of_velocity = np.abs(spectra[:, -1].mean(axis=0)) ** 2
+    of_velocity[0] = 0.0  # a mean velocity only comes from the ends that were cut off
     before = np.abs(single.mean(axis=0)) ** 2 - noise / n
     remaining = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
     frequency = np.asarray(np.arange(K + 1) * base, dtype=np.float64)
     return SpectralLines(
         s.group, s.equation, frequency, before, noise, remaining, excited,
         _shares(before, noise / n, excited), _shares(remaining, noise / n, excited),
-        _shares(own, np.zeros(K + 1), excited), loud,
+        _shares(of_velocity, np.zeros(K + 1), excited), above_noise,
     )  # fmt: skip
 
 
@@ -216,12 +216,10 @@ def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str,
     return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
 
 
-def largest_residual_lines(
-    lines: Sequence[SpectralLines], least: float = 1.0, most: int = 3
-) -> list[SpectralLines]:
-    """Return at most `most` lines, one for each equation with a residual of `least` noises."""
+def largest_residual_lines(lines: Sequence[SpectralLines]) -> list[SpectralLines]:
+    """Return the lines of at most three equations whose residual exceeds the noise."""
     best: dict[str, SpectralLines] = {}
     for equation_lines in lines:
-        if equation_lines.above_noise >= least:
+        if equation_lines.above_noise >= 1.0:
             best.setdefault(equation_lines.equation, equation_lines)
-    return list(best.values())[:most]
+    return list(best.values())[:3]

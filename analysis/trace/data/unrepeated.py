@@ -34,15 +34,15 @@ def unrepeated_floors(data: RegressionData) -> dict[str, Floor]:
 
     Floors of steps whose rows are left out do not count.
     """
-    there = {(s.group, s.equation) for s in data.segments}
-    loudest: dict[str, Floor] = {}
+    used = {(s.group, s.equation) for s in data.segments}
+    worst: dict[str, Floor] = {}
     for floor in data.floors:
-        measured = floor.source in (REPEATS, PERIODS) and (floor.group, floor.equation) in there
+        measured = floor.source in (REPEATS, PERIODS) and (floor.group, floor.equation) in used
         if measured and floor.noise > DATA.unrepeated_ratio * floor.stated:
-            best = loudest.get(floor.equation)
+            best = worst.get(floor.equation)
             if best is None or floor.noise / floor.stated > best.noise / best.stated:
-                loudest[floor.equation] = floor
-    return loudest
+                worst[floor.equation] = floor
+    return worst
 
 
 def _unrepeated_note(data: RegressionData, floor: Floor) -> str:

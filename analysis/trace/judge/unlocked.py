@@ -46,13 +46,13 @@ def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
     and one at which another balance scatters too, as a sensor error would cause.
     """
     repeated = {(f.group, f.equation): f for f in data.floors if f.source == REPEATS}
-    loud: dict[str, list[Segment]] = {}
+    scattered: dict[str, list[Segment]] = {}
     for s in data.segments:
         floor = repeated.get((s.group, s.equation))
         if floor is not None and floor.noise > DATA.line_ratio * floor.stated:
-            loud.setdefault(s.equation, []).append(s)
+            scattered.setdefault(s.equation, []).append(s)
     found: dict[str, float] = {}
-    for e, segments in loud.items():
+    for e, segments in scattered.items():
         f, share = dominant_frequency([scatter(data, s) for s in segments])
         if share > DATA.unrepeated_share:
             found[e] = f
@@ -60,14 +60,14 @@ def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
     for e, f in found.items():
         joint = int(e.rsplit("_", 1)[1]) - 1
         others = [g for other, g in found.items() if other != e]
-        own = [_velocity(data, s, joint) for s in loud[e]]
-        length = max(float(time[-1] - time[0]) for time, _ in own)
+        velocities = [_velocity(data, s, joint) for s in scattered[e]]
+        length = max(float(time[-1] - time[0]) for time, _ in velocities)
         if (
             e == equation("torque", joint)
             and FREQUENCY[0] <= f <= FREQUENCY[1]
             and f * length >= DATA.least_turns
             and not any(abs(f - g) * length < 1.0 for g in others)
-            and not _moves_at(own, f, length)
+            and not _moves_at(velocities, f, length)
         ):
             out.append((joint, f))
     return tuple(out)
@@ -82,8 +82,8 @@ def _velocity(data: RegressionData, segment: Segment, joint: int) -> tuple[Array
 
 def _moves_at(velocities: Sequence[tuple[Array, Array]], frequency: float, length: float) -> bool:
     """Return whether most of the energy of velocities (1, m) lies at a frequency [Hz]."""
-    own, share = dominant_frequency(velocities)
-    return abs(own - frequency) * length < 1.0 and share > DATA.unrepeated_share
+    dominant, share = dominant_frequency(velocities)
+    return abs(dominant - frequency) * length < 1.0 and share > DATA.unrepeated_share
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
     rows = [
         [
             str(r.number), r.result.verdict, named(r.result), _figure(r.predicted),
-            _figure(r.achieved), plain(r.loudest, 2), plain(r.residual, 2),
+            _figure(r.achieved), plain(r.baseline_ratio, 2), plain(r.residual, 2),
         ]
         for r in rounds
     ]  # fmt: skip
