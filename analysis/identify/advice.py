@@ -82,19 +82,19 @@ def mechanical_help(rig: Rig, lacking: Determinacy) -> list[str]:
     helps = []
     while len(undetermined):
         basis = np.linalg.qr((undetermined * scale).T)[0]
-        seen = [np.linalg.svd(X / scale @ basis, full_matrices=True) for X in rows]
-        ranks = [int(np.sum(sigma > IDENTIFY.visible_direction)) for _, sigma, _ in seen]
+        svds = [np.linalg.svd(X / scale @ basis, full_matrices=True) for X in rows]
+        ranks = [int(np.sum(sigma > IDENTIFY.visible_direction)) for _, sigma, _ in svds]
         # Prefer most directions, then the clearest; a closed valve yields under load, a stop does
         # not.
         clear = [
             float(np.sum(sigma)) * 0.9 ** steps[i][1].count(0.0)
-            for i, (_, sigma, _) in enumerate(seen)
+            for i, (_, sigma, _) in enumerate(svds)
         ]
         best = max(range(len(rows)), key=lambda i: (ranks[i], clear[i]))
         if not ranks[best]:
             break
-        helps.append(_motion_text(rig, *steps[best]))
-        undetermined = (basis @ seen[best][2][ranks[best] :].T).T / scale
+        helps.append(_motion_text(*steps[best]))
+        undetermined = (basis @ svds[best][2][ranks[best] :].T).T / scale
     return helps
 
 
@@ -127,7 +127,7 @@ def _rows(rig: Rig, excited: int, places: tuple[float, ...]) -> Array:
     return predicted_rows(rig, moved, locked)["mechanical"]
 
 
-def _motion_text(rig: Rig, excited: int, places: tuple[float, ...]) -> str:
+def _motion_text(excited: int, places: tuple[float, ...]) -> str:
     at = {-1.0: "at end_min", 1.0: "at end_max", 0.0: "closed at 0 mm"}
     still = [f"joint {i + 1} closed at 0 mm" for i in range(excited)]
     still += [f"joint {i} {at[p]}" for i, p in enumerate(places, start=excited + 2)]

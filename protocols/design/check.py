@@ -107,7 +107,7 @@ def _timeline(plan: Plan) -> tuple[Moment, ...]:
     return tuple(moments)
 
 
-def check_step(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ()) -> StepCheck:
+def check_step(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> StepCheck:
     """Predict one step; raises InputError where the twin, or one of its draws, cannot follow it."""
     centring = _centred(step, rig, twin)
     central = judge_motion(step, rig, centring.biases, centring.moved)

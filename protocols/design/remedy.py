@@ -28,7 +28,7 @@ def resized(step: StepPlan, factor: float) -> StepPlan:
     return replace(step, excite=excite)
 
 
-def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ()) -> float | None:
+def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> float | None:
     """Return the largest factor found by which a step's amplitudes keep every limit; None if none.
 
     Found by bisection in hundredths below 1; the factor was proved on the twin and its `draws`.

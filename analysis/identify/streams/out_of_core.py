@@ -86,7 +86,8 @@ def identify_folders(
         for record in head.records
     ]
     reductions: list[RecordReduction] = []
-    for group in workers.map(reduce_tasks, _groups(tasks, workers.workers), reads=_folder_of):
+    groups = _groups(tasks, workers.workers)
+    for group in workers.map(reduce_tasks, groups, reads=lambda part: path_of(part[0])):
         reductions += group
         if progress is not None:
             progress(len(reductions) / len(tasks))
@@ -108,10 +109,6 @@ def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]
             groups.append([])
         groups[-1].append(task)
     return groups
-
-
-def _folder_of(group: Sequence[RecordTask]) -> str:
-    return path_of(group[0])
 
 
 def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:

@@ -131,17 +131,16 @@ def joint_settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[Joint
 
 
 def excitations(
-    rig: Rig, records: Sequence[ConditionedRecord], rng: np.random.Generator,
-    families: Sequence[Family] = FAMILIES,
-) -> Iterator[CandidateExcitation]:  # fmt: skip
+    rig: Rig, records: Sequence[ConditionedRecord], rng: np.random.Generator
+) -> Iterator[CandidateExcitation]:
     """Yield every family in every setting that the twin can follow within the limits.
 
-    None for a rig without nominal values or with electric joints: there is no twin of it.
+    Yields nothing for a rig without nominal values or with electric joints, which has no twin.
     """
     if rig.electric:
         return
     for setting in joint_settings(rig, records):
-        for family in families:
+        for family in FAMILIES:
             candidate = excitation(rig, setting, family, rng)
             if candidate is not None:
                 yield candidate
@@ -151,7 +150,7 @@ def excitation(
     rig: Rig, setting: JointSetting, family: Family, rng: np.random.Generator
 ) -> CandidateExcitation | None:
     """Return a family in a setting, scaled to its share of the limits; None where impossible."""
-    tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
+    tones = {j: _tone(j, family, rng) for j in setting.moving(rig)}
     step = _step(rig, setting, family, tones)
     goal = EXPERIMENT.fill * family.level
     best: CandidateExcitation | None = None
@@ -178,7 +177,7 @@ def _flattened(rig: Rig, played: Played, tone: Tone) -> Tone:
     return replace(tone, spectrum=known.flattened(tone.spectrum, EXPERIMENT.phase_rounds)[0])
 
 
-def _tone(joint: int, family: Family, turn: int, rng: np.random.Generator) -> Tone:
+def _tone(joint: int, family: Family, rng: np.random.Generator) -> Tone:
     lines = np.arange(round(family.low / family.base), round(family.high / family.base) + 1)
     lines = lines[lines % 2 == 1]
     size = lines.astype(np.float64) ** -family.tilt

@@ -43,29 +43,31 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 TELL, COVER, SHOW = "tell apart", "cover", "make visible"
-PROMISE: Final = SEARCH.band  # separation over noise; less would be within the noise's band
+LEAST_SEPARATION: Final = (
+    SEARCH.band
+)  # separation over noise; less would be within the noise's band
 
 
 @dataclass(frozen=True)
 class PredictedAnswer:
-    """Separation of a question [noise]: by the records, and promised by an experiment."""
+    """Separation of a question [noise]: by the records, and as predicted for an experiment."""
 
     question: OpenQuestion
     present: float
-    promised: float = 0.0
+    predicted: float = 0.0
     equation: str = ""
 
     @property
     def open(self) -> bool:
-        """Whether the experiment promises an answer that the records do not give."""
-        return self.promised >= max(PROMISE, EXPERIMENT.least_gain * self.present)
+        """Whether the experiment would give an answer that the records do not give."""
+        return self.predicted >= max(LEAST_SEPARATION, EXPERIMENT.least_gain * self.present)
 
 
 def propose(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect], verdict: str,
-    moves: Sequence[Dependence], families: Sequence[ex.Family] = ex.FAMILIES,
+    moves: Sequence[Dependence],
 ) -> Mapping[str, Any] | None:  # fmt: skip
-    """Return the next experiment as plain data, None where none promises an answer.
+    """Return the next experiment as plain data, None where none would give an answer.
 
     `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
     weakest question's separation in units of one record's noise.
@@ -76,7 +78,7 @@ def propose(
     if not questions and not (verdict == UNEXPLAINED and moves):
         return None
     rng = np.random.default_rng(EXPERIMENT.seed)
-    tried = list(ex.excitations(rig_with_estimates(train_data), train_data.records, rng, families))
+    tried = list(ex.excitations(rig_with_estimates(train_data), train_data.records, rng))
     if not tried:
         return _experiment_in_words(effects, questions) if verdict == CONFOUNDED else None
     measured = noise_ratios(train_data)
@@ -115,7 +117,7 @@ def _questions(
     if verdict == CLEAN:
         asked = [OpenQuestion(h, Explanation(), False) for h in _smallest_effects(hypotheses)]
         answers = [PredictedAnswer(q, present_separation(q, old)) for q in asked]
-        return [a for a in answers if a.present < PROMISE]
+        return [a for a in answers if a.present < LEAST_SEPARATION]
     if verdict == CONFOUNDED:
         others = tied_sets(hypotheses, winner, effects)
         pairs = [OpenQuestion(explanation(winner), explanation(o)) for o in others]
@@ -188,8 +190,8 @@ def _best_steps(
     if not asked:
         return None
     table: list[list[PredictedAnswer]] = []
-    for seen in views:
-        new = ComparisonRows(old.train_data, seen, old)
+    for view in views:
+        new = ComparisonRows(old.train_data, view, old)
         table.append(
             [
                 PredictedAnswer(a.question, a.present, *separation(a.question, old, new))
@@ -216,11 +218,11 @@ def _best_answers(
     table: Sequence[Sequence[PredictedAnswer]], chosen: Sequence[int]
 ) -> list[PredictedAnswer]:
     rows = [table[k] for k in chosen]
-    return [max(column, key=lambda a: a.promised) for column in zip(*rows, strict=True)]
+    return [max(column, key=lambda a: a.predicted) for column in zip(*rows, strict=True)]
 
 
 def _total_answered(answers: Sequence[PredictedAnswer]) -> float:
-    return sum(min(a.promised, EXPERIMENT.useful_separation) for a in answers if a.open)
+    return sum(min(a.predicted, EXPERIMENT.useful_separation) for a in answers if a.open)
 
 
 def _covering_experiment(
@@ -255,10 +257,10 @@ def _proposal(
     chosen: Sequence[ex.CandidateExcitation],
     answers: Sequence[PredictedAnswer],
 ) -> Mapping[str, Any]:
-    weakest = min(answers, key=lambda a: a.promised)
+    weakest = min(answers, key=lambda a: a.predicted)
     separates = _names(answers)
     what = (
-        f"predicted separation {weakest.promised:.1f} times the noise, {weakest.present:.1f} with "
+        f"predicted separation {weakest.predicted:.1f} times the noise, {weakest.present:.1f} with "
         "the present records"
     )
     if kind == SHOW:
@@ -270,12 +272,12 @@ def _proposal(
         "questions": [
             {
                 "one": list(a.question.one.keys), "other": list(a.question.other.keys),
-                "present": a.present, "predicted": a.promised, "equation": a.equation,
+                "present": a.present, "predicted": a.predicted, "equation": a.equation,
             }
             for a in answers
         ],
         "present": weakest.present,
-        "predicted": weakest.promised,
+        "predicted": weakest.predicted,
         "equation": weakest.equation,
         "text": f"{'; then '.join(candidate.text for candidate in chosen)} ({what})",
         **_protocols(train_data, chosen),

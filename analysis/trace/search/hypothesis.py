@@ -94,14 +94,12 @@ def negative_body(rig: Rig, fit: ExactFit, baseline: ExactFit) -> str:
     return ""
 
 
-def energy_above_noise(
-    data: RegressionData, residual: Array, noise: float = 1.0
-) -> dict[str, float]:
+def energy_above_noise(data: RegressionData, residual: Array) -> dict[str, float]:
     """Return the energy above noise that a residual (M,) has in each equation."""
     out: dict[str, float] = {}
     for segment in data.segments:
         part = residual[segment.where]
-        excess = float(part @ part) - noise * len(part)
+        excess = float(part @ part) - len(part)
         out[segment.equation] = out.get(segment.equation, 0.0) + excess
     return out
 
