@@ -66,22 +66,22 @@ def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:
     return tuple(i for i in inputs if i.channel in rig.channels)
 
 
-def moved(rig: Rig, signals: Signals, what: Input, by: float) -> Signals:
+def moved(rig: Rig, signals: Signals, derivative: Input, by: float) -> Signals:
     """Return the signals with one input shifted by `by` at every instant (n,)."""
-    if what.joint is None:
-        return replace(signals, **{what.field: getattr(signals, what.field) + by})
-    i = what.joint
-    if what.field not in ("s", "sd", "sdd"):
-        changed = getattr(signals, what.field).copy()
+    if derivative.joint is None:
+        return replace(signals, **{derivative.field: getattr(signals, derivative.field) + by})
+    i = derivative.joint
+    if derivative.field not in ("s", "sd", "sdd"):
+        changed = getattr(signals, derivative.field).copy()
         changed[:, i] += by
-        return replace(signals, **{what.field: changed})
+        return replace(signals, **{derivative.field: changed})
     s, sd = signals.s.copy(), signals.sd.copy()
     # The second derivative of the piston is not kept; it follows from the joint's.
     slope = rig.joints[i].linkage.jacobian_rate(signals.q[:, i])
     sdd = signals.G[:, i] * signals.qdd[:, i] + slope * signals.qd[:, i] ** 2
-    s[:, i] += by if what.field == "s" else 0.0
-    sd[:, i] += by if what.field == "sd" else 0.0
-    sdd = sdd + (by if what.field == "sdd" else 0.0)
+    s[:, i] += by if derivative.field == "s" else 0.0
+    sd[:, i] += by if derivative.field == "sd" else 0.0
+    sdd = sdd + (by if derivative.field == "sdd" else 0.0)
     q, qd, qdd, G = (a.copy() for a in (signals.q, signals.qd, signals.qdd, signals.G))
     q[:, i], G[:, i], new_slope = rig.joints[i].geometry(s[:, i])
     qd[:, i] = sd[:, i] / G[:, i]
@@ -129,16 +129,16 @@ def score_covariance(
     back = {name: _backwards(r, filtering, n, signals.rate) for name, r in rows.items()}
     out = {family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()}
     by_channel: dict[str, list[Input]] = {}
-    for what in inputs_of(rig, moving):
-        by_channel.setdefault(what.channel, []).append(what)
+    for derivative in inputs_of(rig, moving):
+        by_channel.setdefault(derivative.channel, []).append(derivative)
     for channel, parts in by_channel.items():
         variance = sensor_variance(rig.sensors.of(ch.kind_of(channel)[0]))
         carried: dict[str, Array] = {}
-        for what in parts:
-            taps = channels.taps[what.order]
+        for derivative in parts:
+            taps = channels.taps[derivative.order]
             by = DESIGN.noise_step * float(np.sqrt(variance) * np.linalg.norm(taps))
-            high = residuals(rig, terms, moved(rig, signals, what, by), beta)
-            low = residuals(rig, terms, moved(rig, signals, what, -by), beta)
+            high = residuals(rig, terms, moved(rig, signals, derivative, by), beta)
+            low = residuals(rig, terms, moved(rig, signals, derivative, -by), beta)
             for name, weights in back.items():
                 slope = (high[name] - low[name]) / (2.0 * by)
                 if slope.any():

@@ -141,13 +141,13 @@ def _curve_shares(
     joint = int(equation.rsplit("_", 1)[1]) - 1
     every = [*first.parts, *second.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
-    values = [variables(rig, p.seen, joint) for p in every]
+    values = [variables(rig, p.signals, joint) for p in every]
     by = factors(equation)
     scales = [
-        {f: v[f] if f in v else factor_of(f, p.seen, joint, travel) for f in by}
+        {f: v[f] if f in v else factor_of(f, p.signals, joint, travel) for f in by}
         for v, p in zip(values, every, strict=True)
     ]
-    curves: dict[str, list[Array]] = {"": [np.ones((len(p.seen.t), 1)) for p in every]}
+    curves: dict[str, list[Array]] = {"": [np.ones((len(p.signals.t), 1)) for p in every]}
     for name in values[0]:
         moving = [v[name] for v, p in zip(values, every, strict=True) if _moves(p, joint)]
         knots = _knots(np.concatenate(moving)) if moving else None

@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EquationPart:
-    """A record's rows of one equation, signals `seen` by the model's terms, whitening weight."""
+    """A record's rows of one equation, signals as the model's terms see them, whitening weight."""
 
     conditioned: ConditionedRecord
     rows: Rows
-    seen: Signals
+    signals: Signals
     weight: float
 
 
@@ -48,9 +48,9 @@ def equation_rows(data: RegressionData, residual: Array, equation: str) -> Equat
         if s.equation != equation:
             continue
         conditioned, rows = data.source(s)
-        seen = prepared_signals(data.rig, data.terms, conditioned)
+        signals = prepared_signals(data.rig, data.terms, conditioned)
         weight = float(np.sqrt(s.repeats)) / s.noise
-        parts.append(EquationPart(conditioned, rows, seen, weight))
+        parts.append(EquationPart(conditioned, rows, signals, weight))
         rest.append(residual[s.where])
         base.append(data.base[s.where])
     if not parts:

@@ -90,7 +90,7 @@ def _candidate_monomials(
     joint = int(equation.rsplit("_", 1)[1]) - 1
     every = [*fitted.parts, *judged.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
-    made = [_monomials(rig, equation, p.seen, joint, travel) for p in every]
+    made = [_monomials(rig, equation, p.signals, joint, travel) for p in every]
     names = list(made[0])
     stacks = [np.column_stack([m[n] for n in names]) for m in made]
     count = len(fitted.parts)
@@ -109,14 +109,14 @@ def _candidate_monomials(
 
 
 def _monomials(
-    rig: Rig, equation: str, seen: Signals, joint: int, travel: float
+    rig: Rig, equation: str, signals: Signals, joint: int, travel: float
 ) -> dict[str, Array]:  # fmt: skip
     """Return the monomials (n,) by name, simpler ones first: of equal ones the first is kept."""
-    i, t = joint + 1, seen.t
+    i, t = joint + 1, signals.t
     place, v = ch.channel(rig.position_kind, i), f"velocity_{i}"
-    s, sd = (seen.q, seen.qd) if rig.electric else (seen.s, seen.sd)
+    s, sd = (signals.q, signals.qd) if rig.electric else (signals.s, signals.sd)
     x, w = s[:, joint], sd[:, joint]
-    sign = factor_of("direction", seen, joint, travel)
+    sign = factor_of("direction", signals, joint, travel)
     out = {
         "1": np.ones(len(t)), place: x, f"{place}²": x**2, f"{place}³": x**3,
         v: w, f"{v} |{v}|": w * np.abs(w), f"{v}²": w**2, f"{v}³": w**3,
@@ -125,21 +125,21 @@ def _monomials(
     }  # fmt: skip
     if rig.electric:
         return out
-    cap, rod, u = seen.p_cap[:, joint], seen.p_rod[:, joint], seen.u[:, joint]
+    cap, rod, u = signals.p_cap[:, joint], signals.p_rod[:, joint], signals.u[:, joint]
     sides = {ch.channel(ch.CAP, i): cap, ch.channel(ch.ROD, i): rod}
     for name, y in sides.items():
         out[f"{name} time"] = y * t
     if equation.startswith("torque"):
         # Pressures and their squares are the balance's other side: they would fit any residual.
         out |= {f"{name} sign({v})": y * sign for name, y in sides.items()}
-        return {name: seen.G[:, joint] * y for name, y in out.items()}
+        return {name: signals.G[:, joint] * y for name, y in out.items()}
     # So is the velocity in a flow's balance, and any product with it: for a boom that only comes
     # down all these products are alike.
     out = {name: y for name, y in out.items() if v not in name}
     out |= {f"{name}²": y**2 for name, y in sides.items()}
     spool = ch.channel(ch.SPOOL, i)
     out |= {spool: u, f"{spool}²": u**2, f"{spool} |{spool}|": u * np.abs(u), f"{spool}³": u**3}
-    for name, y in {**sides, ch.SUPPLY: seen.p_s}.items():
+    for name, y in {**sides, ch.SUPPLY: signals.p_s}.items():
         out |= {name: y, f"{name} {spool}": y * u}
     return out | {f"{place} {spool}": x * u, f"{spool} time": u * t}
 

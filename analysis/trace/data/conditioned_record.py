@@ -160,18 +160,18 @@ def shared_rows(
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
         # Signals depend only on the terms that change them, so that families of rows share them.
         changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
-        seen = partial(
+        prepared = partial(
             cache.signals.get,
             (conditioned.group, changing),
             partial(prepared_signals, rig, changing, own),
         )
         bare: dict[str, Rows] = cache.rows.get(
-            key, partial(_rows_of_family, rig, others, own, seen, cache)
+            key, partial(_rows_of_family, rig, others, own, prepared, cache)
         )
         rows = bare
         for u in added:
             more = cache.rows.get(
-                (*key, u), partial(_added_columns, rig, own, seen, bare, u, cache)
+                (*key, u), partial(_added_columns, rig, own, prepared, bare, u, cache)
             )
             rows = {e: _with_columns(r, more.get(e, {})) for e, r in rows.items()}
         out |= rows
@@ -179,12 +179,12 @@ def shared_rows(
 
 
 def _rows_of_family(
-    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, seen: Callable[[], Signals],
-    cache: RowCache,
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord,
+    prepared: Callable[[], Signals], cache: RowCache,
 ) -> dict[str, Rows]:  # fmt: skip
-    """Return the rows of a record with one family, under `terms` and their signals `seen`."""
+    """Return the rows of a record with one family, under `terms` and the signals `prepared`."""
     (family,), filtering = conditioned.families, conditioned.filtering
-    terms, signals = ordered(terms), seen()
+    terms, signals = ordered(terms), prepared()
     parts = [_term_part(rig, u, conditioned, family, signals, cache) for u in terms]
     key = conditioned.group, family
     sides = cache.parts.get(key, signals, lambda x: right_parts(rig, x, filtering, family))
@@ -203,13 +203,13 @@ def _term_part(
 
 
 def _added_columns(
-    rig: Rig, conditioned: ConditionedRecord, seen: Callable[[], Signals],
+    rig: Rig, conditioned: ConditionedRecord, prepared: Callable[[], Signals],
     rows: Mapping[str, Rows], used: Used, cache: RowCache,
 ) -> dict[str, dict[str, Array]]:  # fmt: skip
     """Return the columns of a term that changes no signal: equation -> parameter -> column (m,)."""
     out: dict[str, dict[str, Array]] = {}
     for family in conditioned.families:
-        part = _term_part(rig, used, conditioned, family, seen(), cache)
+        part = _term_part(rig, used, conditioned, family, prepared(), cache)
         for name, columns in part.columns.items():
             if name in rows and any(np.any(v) for v in columns.values()):
                 out[name] = _at_rows(conditioned, columns, rows[name])
@@ -228,7 +228,7 @@ def candidate_columns(
     rig: Rig,
     terms: Sequence[Used],
     conditioned: ConditionedRecord,
-    seen: Signals,
+    prepared: Signals,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
     used: Used,
@@ -236,11 +236,11 @@ def candidate_columns(
 ) -> dict[str, dict[str, Array]]:
     """Return the columns that a candidate adds to a record's rows: equation -> name -> column (m,).
 
-    `seen` and `rows` are the signals and rows under `terms`, `beta` the coefficients of the rows
+    `prepared` and `rows` are the signals and rows under `terms`, `beta` the rows' coefficients
     (1/b for b). The pseudo-column of a change of signals (see the module) is named ''.
     """
     if not changes_signals(used.term):
-        return _added_columns(rig, conditioned, lambda: seen, rows, used, cache)
+        return _added_columns(rig, conditioned, lambda: prepared, rows, used, cache)
     acting = _families(rig, used.term, cache)
     families = tuple(f for f in conditioned.families if f in acting)
     changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), cache)

@@ -55,25 +55,26 @@ def detection_limits(
     asked = [effect for effect in effects if (effect.name, effect.where) not in winner.keys]
     fitted = _fitted_instead(hypotheses, winner)
     small = [
-        what
+        explanation
         for effect in asked
-        if (what := smallest_effect(effect, train_data.rig, fitted.get(effect, ()))) is not None
+        if (explanation := smallest_effect(effect, train_data.rig, fitted.get(effect, ())))
+        is not None
     ]
     if not small:
         return []
     names, X = tangent(train_data, winner.fit)
-    added = np.column_stack([rows.prediction(what) for what in small])
+    added = np.column_stack([rows.prediction(explanation) for explanation in small])
     taken = shortest(X, added, TRACE.rank_limit)
     shown = added - X @ taken
     known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
     found = []
-    for k, what in enumerate(small):
+    for k, explanation in enumerate(small):
         times = _largest_multiple(shown[:, k], winner.fit.residual)
         moved = dict(zip(names, times * taken[:, k], strict=True))
         shifts = _parameter_shifts(rows.train_data, moved, known)
         most = max(shifts, key=lambda name: shifts[name], default="")
         if most and shifts[most] >= TRACE.noted_shift:
-            key, size = what.keys[0], _effect_size(rows.train_data, what, times)
+            key, size = explanation.keys[0], _effect_size(rows.train_data, explanation, times)
             found.append(
                 DetectionLimit(key["name"], key["where"], key["at"], *size, most, shifts[most])
             )
@@ -130,12 +131,14 @@ def _parameter_shifts(
     }
 
 
-def _effect_size(data: RegressionData, what: Explanation, times: float) -> tuple[str, float, str]:
+def _effect_size(
+    data: RegressionData, explanation: Explanation, times: float
+) -> tuple[str, float, str]:
     """Return name, value and unit of the number that says how large an effect is."""
-    (used,) = what.effects
+    (used,) = explanation.effects
     for c in used.term.coefficients(data.rig):
-        if what.beta.get(c.parameter):
-            return c.parameter, abs(what.beta[c.parameter]) * times, c.unit
+        if explanation.beta.get(c.parameter):
+            return c.parameter, abs(explanation.beta[c.parameter]) * times, c.unit
     shapes = shapes_of(data.rig, used)
     k = next(k for k, s in enumerate(shapes) if used.shape[k] != (s.neutral or 0.0))
     neutral = shapes[k].neutral or 0.0

@@ -103,7 +103,7 @@ class MeasurementView:
     terms: tuple[Used, ...]
     beta: Mapping[str, float]
     conditioned: ConditionedRecord
-    seen: Signals
+    signals: Signals
     rows: Mapping[str, Rows]
     noise: Mapping[str, float]
     cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
@@ -113,7 +113,7 @@ class MeasurementView:
         if is_hidden_by_lock(used.term, self.conditioned):
             return {}
         return candidate_columns(
-            self.rig, self.terms, self.conditioned, self.seen, self.rows, self.beta, used,
+            self.rig, self.terms, self.conditioned, self.signals, self.rows, self.beta, used,
             self.cache,
         )  # fmt: skip
 
@@ -155,9 +155,9 @@ def measurement_view(
     rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
     stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
-    seen = prepared_signals(rig, train_data.terms, conditioned)
+    signals = prepared_signals(rig, train_data.terms, conditioned)
     return MeasurementView(
-        rig, tuple(train_data.terms), train_data.beta, conditioned, seen, rows, noise
+        rig, tuple(train_data.terms), train_data.beta, conditioned, signals, rows, noise
     )
 
 
@@ -170,18 +170,18 @@ class ComparisonRows:
     def __init__(
         self,
         train_data: RegressionData,
-        seen: MeasurementView | None = None,
+        view: MeasurementView | None = None,
         old: ComparisonRows | None = None,
     ) -> None:
-        self.train_data, self.seen, self._old = train_data, seen, old
+        self.train_data, self.view, self._old = train_data, view, old
         self._known: dict[Used, dict[str, Array]] = {}
         label = np.empty(train_data.base.shape[0], dtype=object)
         for s in train_data.segments:
             label[s.where] = s.equation
         parts, labels = [train_data.base], [label]
-        if seen is not None:
-            for equation, rows in seen.rows.items():
-                parts.append(matrix_of(rows, train_data.names) * seen.weight(equation))
+        if view is not None:
+            for equation, rows in view.rows.items():
+                parts.append(matrix_of(rows, train_data.names) * view.weight(equation))
                 labels.append(np.full(len(rows.rhs), equation, dtype=object))
         self.base, self.equation = np.concatenate(parts), np.concatenate(labels)
 
@@ -192,7 +192,7 @@ class ComparisonRows:
                 self._old.columns(used) if self._old is not None else self._training_columns(used)
             )
             self._known[used] = (
-                before if self.seen is None else self._with_view_columns(used, before)
+                before if self.view is None else self._with_view_columns(used, before)
             )
         return self._known[used]
 
@@ -202,31 +202,31 @@ class ComparisonRows:
         return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
     def _with_view_columns(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
-        assert self.seen is not None
-        new = self.seen.columns(used)
+        assert self.view is not None
+        new = self.view.columns(used)
         out = {}
         for name in dict.fromkeys([*before, *(n for c in new.values() for n in c)]):
             parts = [before.get(name, np.zeros(self.train_data.base.shape[0]))]
-            for equation, rows in self.seen.rows.items():
+            for equation, rows in self.view.rows.items():
                 column = new.get(equation, {}).get(name, np.zeros(len(rows.rhs)))
-                parts.append(column * self.seen.weight(equation))
+                parts.append(column * self.view.weight(equation))
             out[name] = np.concatenate(parts)
         return out
 
-    def prediction(self, what: Explanation) -> Array:
+    def prediction(self, explanation: Explanation) -> Array:
         """Return what an explanation adds to the rows (m,) at its sizes."""
         total = np.zeros(len(self.equation))
-        for used in what.effects:
+        for used in explanation.effects:
             for name, column in self.columns(used).items():
                 # The baseline's own parameters, which some effects have columns of, are free.
                 if name not in self.train_data.names:
-                    total += column * (what.beta.get(name, 0.0) if name else 1.0)
+                    total += column * (explanation.beta.get(name, 0.0) if name else 1.0)
         return total
 
-    def imitation_columns(self, what: Explanation) -> Array:
+    def imitation_columns(self, explanation: Explanation) -> Array:
         """Return the columns that an explanation is fitted with, shape derivatives included."""
         blocks = [self.base]
-        for used in what.effects:
+        for used in explanation.effects:
             blocks += [c[:, None] for c in self.columns(used).values()]
             for j, shape in enumerate(shapes_of(self.train_data.rig, used)):
                 value = used.shape[j]
@@ -235,7 +235,7 @@ class ComparisonRows:
                 step = EXPERIMENT.shape_step * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
-                ends = [self.prediction(Explanation((u,), what.beta)) for u in (moved, used)]
+                ends = [self.prediction(Explanation((u,), explanation.beta)) for u in (moved, used)]
                 blocks.append((ends[0] - ends[1])[:, None])
         return np.column_stack(blocks)
 
@@ -256,7 +256,7 @@ def separation(
     question: OpenQuestion, old: ComparisonRows, new: ComparisonRows
 ) -> tuple[float, str]:
     """Return the separation [noise] by an experiment, and its equation (see the module)."""
-    assert new.seen is not None
+    assert new.view is not None
     distances = []
     for true, wrong in _directions(question):
         before = old.energy(old.residual(true, wrong))
@@ -265,10 +265,10 @@ def separation(
             e: float(
                 np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (EXPERIMENT.repeats * len(r.rhs)))
             )
-            for e, r in new.seen.rows.items()
+            for e, r in new.view.rows.items()
         }
-        loudest = max(by_equation, key=lambda e: by_equation[e], default="")
-        distances.append((by_equation.get(loudest, 0.0), loudest))
+        largest = max(by_equation, key=lambda e: by_equation[e], default="")
+        distances.append((by_equation.get(largest, 0.0), largest))
     return min(distances)
 
 

@@ -75,7 +75,7 @@ def _range_ratio(
     """Return a variable's range in records and candidate together over that in the records."""
     if joint + 1 in view.conditioned.record.locked:
         return 0.0
-    least, most = np.percentile(variables(train_data.rig, view.seen, joint)[name], [1, 99])
+    least, most = np.percentile(variables(train_data.rig, view.signals, joint)[name], [1, 99])
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 

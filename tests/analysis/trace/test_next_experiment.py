@@ -87,7 +87,7 @@ def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
     """By hand: whiten, project with a QR of one's own, count energy per row and repeat."""
     old, new = rows_of_both()
     question = OpenQuestion(AIR, LEAK, False)
-    assert new.seen is not None
+    assert new.view is not None
     energy = []
     for ground in (old, new):
         X = np.column_stack([ground.base, *ground.columns(LEAK.effects[0]).values()])
@@ -95,10 +95,10 @@ def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
         y = ground.columns(AIR.effects[0])["alpha_air"] * 3e-3
         Q, _ = np.linalg.qr(X / np.linalg.norm(X, axis=0))
         r = y - Q @ (Q.T @ y)
-        energy.append({e: float(np.sum(r[ground.equation == e] ** 2)) for e in new.seen.rows})
+        energy.append({e: float(np.sum(r[ground.equation == e] ** 2)) for e in new.view.rows})
     expected = {
         e: np.sqrt(max(0.0, energy[1][e] - energy[0][e]) / (4 * len(rows.rhs)))
-        for e, rows in new.seen.rows.items()
+        for e, rows in new.view.rows.items()
     }
     figure, equation = separation(question, old, new)
     assert figure == pytest.approx(max(expected.values()), rel=0.02)
@@ -116,9 +116,9 @@ def test_air_hardly_shows_on_the_sine_and_shows_on_fast_lines() -> None:
 
 def test_faster_lines_are_noisier_than_the_sine_and_it_is_foreseen() -> None:
     old, new = rows_of_both()
-    assert new.seen is not None
+    assert new.view is not None
     floor = {f.equation: f.noise for f in old.train_data.floors}
-    assert all(new.seen.noise[e] > 1.5 * floor[e] for e in new.seen.rows)
+    assert all(new.view.noise[e] > 1.5 * floor[e] for e in new.view.rows)
 
 
 def test_an_excitation_fills_its_share_of_the_limits_and_is_a_protocol() -> None:
