@@ -187,13 +187,13 @@ def _prepare(
     out = []
     for family, solution in solutions.items():
         columns = parameters_of(job.rig, (*job.terms, *extra), family)
-        mine = [n for n in solution.names if n not in solution.unidentifiable]
-        if not mine:
+        determined = [n for n in solution.names if n not in solution.unidentifiable]
+        if not determined:
             continue
-        beside = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
-        beside = [n for n in beside if n in columns and n not in mine]
-        prepared = _family(built, family, columns, mine, beside)
-        if beside:
+        nuisances = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
+        nuisances = [n for n in nuisances if n in columns and n not in determined]
+        prepared = _family(built, family, columns, determined, nuisances)
+        if nuisances:
             prepared, stated = _plausible(prepared)
             checks += stated
         out.append(prepared)
@@ -207,16 +207,16 @@ def _plausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:
     error = spread([pieces(fit)], fit.inverse)
     for name in p.names[p.parameters :]:
         # Found anew each time: leaving out a nuisance shifts the columns.
-        belief = next((b for b in nu.beliefs(p.names, fit.beta) if b.name == name), None)
-        if belief is None:
+        prior = next((b for b in nu.priors(p.names, fit.beta) if b.name == name), None)
+        if prior is None:
             continue
-        if not nu.implausible(belief, fit.beta, error.covariance):
-            checks.append(nuisance_statement(belief, p.names, fit.beta, error, None))
+        if not nu.implausible(prior, fit.beta, error.covariance):
+            checks.append(nuisance_statement(prior, p.names, fit.beta, error, None))
             continue
         less = _without(p, name)
         left = least_squares(less.blocks)
         moved = largest_move(p.names[: p.parameters], fit.beta, left.beta, error)
-        checks.append(nuisance_statement(belief, p.names, fit.beta, error, moved))
+        checks.append(nuisance_statement(prior, p.names, fit.beta, error, moved))
         p, fit, error = less, left, spread([pieces(left)], left.inverse)
     return p, checks
 
@@ -232,22 +232,22 @@ def _family(
     built: Sequence[RecordRows],
     family: str,
     columns: Sequence[str],
-    mine: Sequence[str],
-    beside: Sequence[str],
+    determined: Sequence[str],
+    nuisances: Sequence[str],
 ) -> FamilyBlocks:
-    names = (*mine, *beside)
+    names = (*determined, *nuisances)
     kept = [list(columns).index(n) for n in names]
     records = {(rows.conditioned.run, rows.record.name): rows.record for rows in built}
     blocks = levelled(blocks_of(built, family, kept), records)
-    return FamilyBlocks(family, names, len(mine), tuple(blocks))
+    return FamilyBlocks(family, names, len(determined), tuple(blocks))
 
 
 def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:
     fit = _FITS[estimator](p.blocks)
     error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
     beta, inverse = fit.beta, fit.inverse
-    for belief in nu.beliefs(p.names, beta):
-        beta, error, inverse = nu.joined(beta, error, belief, inverse)
+    for prior in nu.priors(p.names, beta):
+        beta, error, inverse = nu.joined(beta, error, prior, inverse)
     return beta[: p.parameters], _first(error, p.parameters), fit
 
 
@@ -259,8 +259,8 @@ def _redo(
     def estimate(blocks: Sequence[RepeatBlock]) -> Array:
         fit = kind(blocks)
         beta, inverse, after = fit.beta, fit.inverse, error
-        for belief in nu.beliefs(p.names, beta):
-            beta, after, inverse = nu.joined(beta, after, belief, inverse)
+        for prior in nu.priors(p.names, beta):
+            beta, after, inverse = nu.joined(beta, after, prior, inverse)
         return beta[: p.parameters]
 
     return estimate

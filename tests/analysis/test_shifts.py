@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman
-from analysis.identify.estimators.nuisance import TAU, Belief, implausible, joined
+from analysis.identify.estimators.nuisance import TAU, Prior, implausible, joined
 from analysis.identify.estimators.shifts import (
     Shift,
     including,
@@ -93,8 +93,8 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
         ]  # fmt: skip
         fit = least_squares(blocks)
         alone = spread([pieces(fit)], fit.inverse)
-        belief = Belief("second", np.array([0.0, 1.0]), known)
-        beta, both, _ = joined(fit.beta, alone, belief, fit.inverse)
+        prior = Prior("second", np.array([0.0, 1.0]), known)
+        beta, both, _ = joined(fit.beta, alone, prior, fit.inverse)
         half = student.ppf(0.975, both.dof[0]) * np.sqrt(both.covariance[0, 0])
         hits.append(abs(beta[0] - 1.0) < half)
         narrower.append(both.covariance[0, 0] / alone.covariance[0, 0])
@@ -119,12 +119,12 @@ def test_an_impossible_law_of_flow_speaks_against_a_gain_that_it_moves_only(
     ]  # fmt: skip
     fit = least_squares(blocks)
     error = spread([pieces(fit)], fit.inverse)
-    belief = Belief(TAU, np.array([0.0, 1.0]), 1e-3)
-    assert implausible(belief, fit.beta, error.covariance)
+    prior = Prior(TAU, np.array([0.0, 1.0]), 1e-3)
+    assert implausible(prior, fit.beta, error.covariance)
     without = least_squares([replace(b, X=b.X[:, :1]) for b in blocks])
     names = ("C_pp_1", TAU)
     moved = largest_move(names[:1], fit.beta, without.beta, error)
-    said = nuisance_statement(belief, names, fit.beta, error, moved)
+    said = nuisance_statement(prior, names, fit.beta, error, moved)
     assert said.ok is ok
     assert ("moves no parameter by more than" in said.detail) is ok
     # The gain takes up the share of the left-out column that is like its own.
@@ -145,7 +145,7 @@ def test_what_records_hold_nothing_of_leaves_every_estimate_as_it_is() -> None:
     fit = least_squares(blocks)
     alone = spread([pieces(fit)], fit.inverse)
     beta, both, inverse = joined(
-        fit.beta, alone, Belief("b", np.array([0.0, 1.0]), 0.1), fit.inverse
+        fit.beta, alone, Prior("b", np.array([0.0, 1.0]), 0.1), fit.inverse
     )
     assert beta == pytest.approx(fit.beta)
     assert both.covariance == pytest.approx(alone.covariance)

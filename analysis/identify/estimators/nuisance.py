@@ -135,7 +135,7 @@ def _lost(drop: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Belief:
+class Prior:
     """A prior observation 0 = h'beta with standard deviation `std`, of column `name`."""
 
     name: str
@@ -164,34 +164,34 @@ def nuisance_terms(
     return tuple(nuisances)
 
 
-def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
+def priors(names: Sequence[str], value: Array) -> list[Prior]:
     """Return the prior knowledge of the nuisances among the columns `names` (k,)."""
     out = []
     if KAPPA in names and "b" in names:
         h = np.zeros(len(names))
         b = names.index("b")
         h[names.index(KAPPA)], h[b] = 1.0, IDENTIFY.bulk_slope
-        out.append(Belief(KAPPA, h, IDENTIFY.bulk_slope_std * abs(float(value[b]))))
+        out.append(Prior(KAPPA, h, IDENTIFY.bulk_slope_std * abs(float(value[b]))))
     if TAU in names:
         h = np.zeros(len(names))
         h[names.index(TAU)] = 1.0
-        out.append(Belief(TAU, h, IDENTIFY.transition_drop**2))
+        out.append(Prior(TAU, h, IDENTIFY.transition_drop**2))
     for k, name in enumerate(names):
         if name.startswith(BETWEEN):
             h = np.zeros(len(names))
             h[k] = 1.0
-            out.append(Belief(name, h, IDENTIFY.path_between_samples))
+            out.append(Prior(name, h, IDENTIFY.path_between_samples))
     return out
 
 
-def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
+def implausible(prior: Prior, beta: Array, covariance: Array) -> bool:
     """Return whether the data contradict prior knowledge: another effect is in that column."""
-    variance = belief.std**2 + float(belief.h @ covariance @ belief.h)
-    return bool(abs(belief.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
+    variance = prior.std**2 + float(prior.h @ covariance @ prior.h)
+    return bool(abs(prior.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
 
 
 def joined(
-    beta: Array, spread: CovarianceParts, belief: Belief, inverse: Array
+    beta: Array, spread: CovarianceParts, prior: Prior, inverse: Array
 ) -> tuple[Array, CovarianceParts, Array]:
     """Join a prior observation into beta (k,), its spread and `inverse`, A^-1 (k, k).
 
@@ -200,15 +200,15 @@ def joined(
     follow their noise and promise too small a variance. An estimate with any gain has the
     covariance (I - g h') V (I - g h')' + g s^2 g' (Joseph's form).
     """
-    V, h = spread.covariance, belief.h
+    V, h = spread.covariance, prior.h
     if h @ inverse @ h <= 0.0:  # a column of zeros: the records hold nothing to join
         return beta, spread, inverse
     shape = 0.5 * (inverse + inverse.T)
     P = shape * (h @ V @ h) / (h @ shape @ h)
-    gain = P @ h / (h @ P @ h + belief.std**2)
+    gain = P @ h / (h @ P @ h + prior.std**2)
     move = np.eye(len(h)) - np.outer(gain, h)
     scatter = move @ V @ move.T
-    after = scatter + belief.std**2 * np.outer(gain, gain)
+    after = scatter + prior.std**2 * np.outer(gain, gain)
     remaining = np.diag(scatter)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Prior knowledge needs no repeats: its part of the variance counts as known.

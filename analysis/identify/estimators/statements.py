@@ -21,7 +21,7 @@ NOISE_CHECK = "noise in regressors"
 
 
 def nuisance_statement(
-    belief: nu.Belief,
+    prior: nu.Prior,
     names: Sequence[str],
     beta: Array,
     error: CovarianceParts,
@@ -32,7 +32,7 @@ def nuisance_statement(
     `moved` of an impossible one is the parameter that moves most without it, and how much
     (relative); the check is ok if that is too little to matter.
     """
-    check = _possible(belief, names, beta, error, moved is not None)
+    check = _possible(prior, names, beta, error, moved is not None)
     if moved is None or moved[1] > shift_limit(moved[0]):
         return check
     least = f"left out, which moves no parameter by more than {100 * moved[1]:.2g} %"
@@ -40,11 +40,11 @@ def nuisance_statement(
 
 
 def _possible(
-    belief: nu.Belief, names: Sequence[str], beta: Array, error: CovarianceParts, wrong: bool
+    prior: nu.Prior, names: Sequence[str], beta: Array, error: CovarianceParts, wrong: bool
 ) -> Check:
-    i = list(names).index(belief.name)
+    i = list(names).index(prior.name)
     value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
-    if belief.name == nu.KAPPA:
+    if prior.name == nu.KAPPA:
         compliance = float(beta[list(names).index("b")])
         alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
         statement = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
@@ -59,7 +59,7 @@ def _possible(
         else:
             statement += "; b is that of the rig's nominal oil temperature"
         return Check("oil temperature", not wrong, statement)
-    if belief.name.startswith(nu.BETWEEN):
+    if prior.name.startswith(nu.BETWEEN):
         statement = (
             f"{value:+.3f} +- {2 * std:.3f} of a sample's interval from the interpolated one"
         )
@@ -67,7 +67,7 @@ def _possible(
             statement += (
                 ", more than a command held between samples makes (a lag, a delay?): left out"
             )
-        return Check(belief.name, not wrong, statement)
+        return Check(prior.name, not wrong, statement)
     size = np.sqrt(max(value, 0.0) + 2 * std)
     statement = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
     if wrong:

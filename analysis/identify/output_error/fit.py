@@ -139,9 +139,9 @@ class Search:
         A = np.sum([r.information for r in good], axis=0)
         g = np.sum([r.score for r in good], axis=0)
         # Each prior is one more observation, in the same units of one sigma.
-        for belief in nu.beliefs(self.names, theta):
-            A = A + np.outer(belief.h, belief.h) / belief.std**2
-            g = g - belief.h * float(belief.h @ theta) / belief.std**2
+        for prior in nu.priors(self.names, theta):
+            A = A + np.outer(prior.h, prior.h) / prior.std**2
+            g = g - prior.h * float(prior.h @ theta) / prior.std**2
         inverse = scaled_inverse(A)
         return inverse @ g, inverse
 
@@ -174,8 +174,8 @@ class Search:
         )
         error = spread([pieces], inverse)
         covariance = error.covariance
-        for belief in nu.beliefs(self.names, theta):
-            moves = inverse @ belief.h / belief.std
+        for prior in nu.priors(self.names, theta):
+            moves = inverse @ prior.h / prior.std
             covariance = covariance + np.outer(moves, moves)
         grown = np.diag(covariance) / np.maximum(np.diag(error.covariance), 1e-300)
         error = CovarianceParts(
