@@ -188,7 +188,7 @@ class Effect(Term):
         """Return why the baseline's free parameters hide it completely ('' if they do not)."""
         return ""
 
-    def twins(self) -> tuple[tuple[str, str], ...]:
+    def inseparable(self) -> tuple[tuple[str, str], ...]:
         """Return (name, where) of effects that no data of this rig can separate from it."""
         return ()
 

@@ -90,9 +90,9 @@ def judge_effects(
         differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
         unphysical = hypotheses.physical_problem(winner, used)
         tied = [r for r in rivals if r.tied]
-        twins = [
+        inseparable = [
             Rival(name, _place(effect_of(name, at)), 1.0, 1.0, True, at)
-            for name, at in used.term.twins()
+            for name, at in used.term.inseparable()
         ]
         gates = (
             Gate(
@@ -105,8 +105,8 @@ def judge_effects(
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
             Gate(
                 NO_RIVAL,
-                not (tied or twins),
-                rivals_in_words([*twins, *rivals])
+                not (tied or inseparable),
+                rivals_in_words([*inseparable, *rivals])
                 + _composites_in_words(hypotheses, winner, used, holdout_data, tie_test),
             ),
         )
@@ -117,7 +117,7 @@ def judge_effects(
                 inference.estimates(train_data, used, errors, shift),
                 p,
                 removed,
-                (*twins, *rivals),
+                (*inseparable, *rivals),
                 gates,
                 used.term.variable,
                 mechanism=used.term.mechanism,
@@ -433,14 +433,14 @@ def _is_refused_simpler_name(
 ) -> bool:  # fmt: skip
     """Return whether a rival fits no better than a simpler reading of both, which is too simple.
 
-    `held` (M,) is the rival's held-out residual, `others` the set's other effects.
+    `rival_residual` (M,) is that of the held-out rows, `others` the set's other effects.
     """
-    mine, other = pair
-    for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
+    effect, other = pair
+    for name in set(other.includes) & set(effect.includes) if other.where == effect.where else ():
         simple = hypotheses.fitted.get(others | {(name, other.where)})
         if simple is not None:
-            more = loss_in_deviations(held_out_residual(holdout_data, simple.fit), rival_residual)
-            return more <= TRACE.standard_errors
+            loss = loss_in_deviations(held_out_residual(holdout_data, simple.fit), rival_residual)
+            return loss <= TRACE.standard_errors
     return False
 
 
@@ -493,8 +493,8 @@ def rivals_in_words(rivals: Sequence[Rival]) -> str:
     nearest = rivals[0]
     words = "cannot be separated from" if nearest.tied else "the closest is"
     training = nearest.training_ratio
-    beside = f", {training:.2f} times the training rms" if np.isfinite(training) else ""
+    in_training = f", {training:.2f} times the training rms" if np.isfinite(training) else ""
     return (
         f"{words} {nearest.name} at {nearest.location}: {nearest.ratio:.2f} times the held-out rms"
-        f"{beside}"
+        f"{in_training}"
     )

@@ -446,7 +446,7 @@ def test_a_payload_adds_to_the_inertia_what_a_point_mass_does(rig: Rig) -> None:
 
 def test_effects_that_no_data_can_tell_apart_name_each_other(rig: Rig) -> None:
     null = effect("spool_offset", "joint 2")
-    assert null.twins() == (("sensor_offset", "joint 2 spool"),)
+    assert null.inseparable() == (("sensor_offset", "joint 2 spool"),)
     assert "joint 2 spool" not in type(effect("sensor_offset", "bench")).places(rig)
     assert effect("sensor_gain", "joint 1 spool").absorbed(rig)
     assert not effect("sensor_gain", "joint 1 cap").absorbed(rig)

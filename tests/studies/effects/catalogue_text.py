@@ -103,7 +103,7 @@ def hidden_from_data(rig: Rig) -> list[str]:
             lines += [
                 f"- `{name}` and `{other}` of the same spool: the same to the data; reported "
                 f"as `{name}`."
-                for other, _ in effect.twins()
+                for other, _ in effect.inseparable()
             ]
     return lines
 

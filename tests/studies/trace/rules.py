@@ -136,7 +136,7 @@ RULES: Final = (
          "a rival with further numbers must remove the price of each, whatever it means",
          ((gates, "_moved_parameter", lambda *_: None),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
-         ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
+         ((SpoolOffset, "inseparable", lambda _: ()), (SensorOffset, "inseparable", lambda _: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
     Rule("further search", "no further effect is searched for in single equations",
          ((HypothesisSet, "extended_in", lambda *_: None),)),
