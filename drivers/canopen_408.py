@@ -188,7 +188,7 @@ class CanOpenValves:
         while self.fault() is not None and time.monotonic() < end:
             self.read()
         if (fault := self.fault()) is not None:
-            raise DeviceError(f"{fault}; the reset did not clear it")
+            raise DeviceError(f"{fault}; the reset did not clear it: remove its cause first")
         self._send(zero, Control.DISABLED | Control.HOLD)
 
     # -- inside -----------------------------------------------------------------------------

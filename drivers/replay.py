@@ -160,7 +160,7 @@ class ReplayDriver:
         kept = np.flatnonzero(~np.isnan(data[first:]).all(axis=1))
         if not len(kept):
             self._streaming = False
-            raise DeviceLost(f"the recording {self._path} has ended at sample {len(data)}")
+            raise DeviceLost(f"{self._path} has ended at sample {len(data)}; play a longer run")
         first += int(kept[0])
         rows = data[first : first + self._settings.block_samples]
         gaps = np.flatnonzero(np.isnan(rows).all(axis=1))
@@ -202,12 +202,12 @@ class ReplayDriver:
         try:
             with h5py.File(self._path, "r") as file:
                 if int(file.attrs.get("format", 0)) != FORMAT:
-                    raise DeviceError(f"{self._path}: no records.h5 of format {FORMAT}")
+                    raise DeviceError(f"{self._path}: expected a records.h5 of format {FORMAT}")
                 parts = [self._columns(group) for group in _in_order(file)]
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             raise DeviceLost(f"{self._path}: cannot be read: {error}") from error
         if not parts:
-            raise DeviceError(f"{self._path}: holds no samples")
+            raise DeviceError(f"{self._path}: holds no samples; play another run")
         return np.concatenate(parts)
 
     def _columns(self, group: Any) -> Array:
@@ -221,7 +221,7 @@ class ReplayDriver:
         if have != want:
             raise DeviceError(
                 f"{self._path}: {group.name} is of another rig: "
-                f"lacks {sorted(want - have)}, has besides {sorted(have - want)}"
+                f"lacks {sorted(want - have)}, has in addition {sorted(have - want)}"
             )
         columns: list[NDArray[np.float64]] = [
             np.asarray(group[name][:], dtype=np.float64) for name in self._rig.recorded

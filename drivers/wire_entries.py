@@ -63,7 +63,7 @@ def _complete(table: str, given: Sequence[str], wanted: Sequence[str], about: st
             raise InputError(f"wire: {table}.{name}: unknown; {about}: {' '.join(wanted)}")
     missing = [name for name in wanted if name not in given]
     if missing:
-        raise InputError(f"wire: {table}: nothing stands for: {' '.join(missing)}")
+        raise InputError(f"wire: {table}: no entry for: {' '.join(missing)}")
 
 
 def scale_of(text: Any, unit: str, key: str, per: str = "") -> float:

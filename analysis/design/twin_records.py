@@ -109,7 +109,7 @@ def play(rig: Rig, step: TwinStep) -> Played:
             motion["command"] = commands[lead:]
             return Played(step, _record(rig, step, motion), motion, gains)
     raise InputError(
-        f"{step.located}: on the twin the state ceases to exist (end of the linkage, vacuum); "
+        f"{step.located}: the twin's simulation fails (end of the linkage, vacuum); "
         "lower the amplitude"
     )
 

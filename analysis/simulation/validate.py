@@ -148,8 +148,8 @@ def arrived(rig: Rig, record: Record) -> Mask:
     longest = int(np.max(edges[1::2] - edges[::2], initial=0))
     if longest > SIMULATION.longest_gap * record.sample_rate:
         raise InputError(
-            f"record {record.name!r}: {longest} samples in a row were lost; a model cannot be "
-            f"simulated through more than {1000 * SIMULATION.longest_gap:g} ms without its spool"
+            f"record {record.name!r}: {longest} samples in a row were lost; leave it out: a model "
+            f"cannot run for more than {1000 * SIMULATION.longest_gap:g} ms without its spool"
         )
     return np.asarray(~lost)
 

@@ -131,7 +131,7 @@ class Manual:
                 self._jog = None
             self._put_out()
             if self._clock() - self._last_command > self._idle_after:
-                log.info("nobody commanded for %g s; the manual session ends", self._idle_after)
+                log.info("no command for %g s; the manual session ends", self._idle_after)
                 break
         bench.zero_outputs()
 

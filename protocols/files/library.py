@@ -61,7 +61,7 @@ def parsed_values(settings: Sequence[str]) -> dict[str, Any]:
         try:
             values_by_name[name.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise InputError(f"--set {setting}: {value!r} is no value") from error
+            raise InputError(f"--set {setting}: found {value!r}, expected a YAML value") from error
     return values_by_name
 
 
@@ -167,7 +167,7 @@ class _Includes:
         same = [seen for seen in self._chain if _same_file(seen, shown)]
         if same:
             circle = " -> ".join((*self._chain[self._chain.index(same[0]) :], shown))
-            raise InputError(f"{self._source}:{line}: include: a circle: {circle}")
+            raise InputError(f"{self._source}:{line}: include: circular: {circle}")
         made, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
         places = (dict(_places(step)) for step in made.steps)
         return list(zip(steps, places, strict=True))

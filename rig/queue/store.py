@@ -90,7 +90,7 @@ class QueueStore:
             self._db.close()
             raise InputError(
                 f"{self.path}: a queue of schema version {version}; this version of bramah reads "
-                f"up to {SCHEMA_VERSION}"
+                f"up to {SCHEMA_VERSION}: update bramah"
             )
         if version == 0 and self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             self._db.close()

@@ -31,7 +31,7 @@ def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
     attributes = {key: _python(value) for key, value in group.attrs.items()}
     missing = [key for key in _OWN if key not in attributes]
     if missing:
-        raise InputError(f"{path}: record {name} lacks the attribute {missing[0]!r}")
+        raise InputError(f"{path}: record {name} lacks {missing[0]!r}; take it from a backup")
     lengths = {str(key): group[key].shape for key in group}
     if not lengths or len(set(lengths.values())) != 1:
         raise InputError(f"{path}: record {name}: channels are missing or of unequal length")

@@ -105,7 +105,7 @@ def test_what_cannot_be_designed_is_said(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "said"), [(40.0, "on the twin the state ceases"), (-1.0, "the twin of joint 2 does")]
+    ("factor", "said"), [(40.0, "the twin's simulation fails"), (-1.0, "the twin of joint 2 does")]
 )
 def test_a_step_that_the_twin_cannot_follow_is_named_with_its_file_and_line(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, factor: float, said: str

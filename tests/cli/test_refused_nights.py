@@ -28,7 +28,7 @@ steps:
         (SWEEP, "night.yaml:6: 10000 steps; expected at most 1000"),
         (
             f"{HEAD}steps:\n  - include: other.yaml\n",
-            "other.yaml:5: include: a circle: night.yaml -> other.yaml -> night.yaml",
+            "other.yaml:5: include: circular: night.yaml -> other.yaml -> night.yaml",
         ),
         (
             "version: 7\nname: night\njoints: 2\nsteps:\n  - hold: 1 s\n",

@@ -426,7 +426,7 @@ def test_a_wrong_map_is_refused_by_the_name_of_its_key(change: tuple[str, str], 
 def test_a_channel_without_a_register_is_named() -> None:
     line = next(line for line in WIRE.splitlines() if "supply_pressure" in line)
     rig = rig_of(change=(line.format() + "\n", ""))
-    with pytest.raises(InputError, match=r"wire: inputs: nothing stands for: supply_pressure"):
+    with pytest.raises(InputError, match=r"wire: inputs: no entry for: supply_pressure"):
         ModbusMapDriver(rig.wire, rig)
 
 

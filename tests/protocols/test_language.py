@@ -138,7 +138,7 @@ def test_a_circle_of_includes_is_refused_with_its_chain(tmp_path: Path) -> None:
     for name, other in (("a", "b"), ("b", "c"), ("c", "a")):
         text = f"{HEAD}steps:\n  - include: {other}.yaml\n"
         (tmp_path / f"{name}.yaml").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=r"circle: \S+a\.yaml -> \S+b\.yaml -> \S+c\.yaml -> \S+a"):
+    with pytest.raises(InputError, match=r"circular: \S+a\.yaml -> \S+b\.yaml -> \S+c\.yaml -> "):
         load(tmp_path / "a.yaml")
 
 

@@ -147,7 +147,7 @@ def make_task(
     if room < 0:
         raise InputError(
             f"record {record.name!r} of {record.samples / record.sample_rate:g} s is too short "
-            f"for a window of {options.seconds:g} s"
+            f"for a window of {options.seconds:g} s; take a longer one"
         )
     channels, every = aligned_channels(rig, record), arrived(rig, record)
     shown = [
@@ -178,7 +178,7 @@ def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
         )
     known = [c.parameter for used in terms for c in used.term.coefficients(rig)]
     if set(names) - set(known):
-        raise InputError("a search needs the paper's terms: inertia, friction, gravity, oil, gains")
+        raise InputError("a search needs every term of the paper's model; identify without --with")
     return model_of(
         rig, terms, {name: rig.nominal.get(name, IDENTIFY.idle_value) for name in known}
     )

@@ -110,7 +110,7 @@ def _stages(
                 noise = np.zeros((width, width)) if noise is None else noise
                 out[family].append(StepRows(step, clusters, noise))
         if not out[family]:
-            raise InputError(f"no {family} row of any record can be used; all of them are masked")
+            raise InputError(f"every {family} row of the records is masked; take other records")
     return out
 
 

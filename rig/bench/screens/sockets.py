@@ -87,7 +87,8 @@ def _private(folder: Path) -> Path:
             raise AttachError(f"{folder}: is not a folder, perhaps a link; remove it")
         if status.st_uid != os.getuid():
             raise AttachError(
-                f"{folder}: belongs to user {status.st_uid}; sockets there are unsafe"
+                f"{folder}: belongs to user {status.st_uid}, who could control the bench there; "
+                "set XDG_RUNTIME_DIR to a folder of your own"
             )
         if stat.S_IMODE(status.st_mode) != 0o700:
             folder.chmod(0o700)
