@@ -185,7 +185,7 @@ class _RigPlanner:
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
-        self._standing: dict[int, Lock] = {}
+        self._in_force: dict[int, Lock] = {}
         self._waves: dict[tuple[str, int], Waveform] = {}
 
     @property
@@ -219,7 +219,7 @@ class _RigPlanner:
 
     def locked(self, locks: Sequence[Lock]) -> None:
         """Keep locks for the steps that follow."""
-        self._standing = {part.joint: part for part in locks}
+        self._in_force = {part.joint: part for part in locks}
 
     def locks(self, step: StepKind, locks: Sequence[Lock]) -> tuple[LockPlan, ...]:
         """Resolve locks; InputError naming step, joint and stroke."""
@@ -231,7 +231,7 @@ class _RigPlanner:
         parts = step.excite if isinstance(step, Step) else step.move
         excite = tuple(self._excite(part, step.name) for part in parts)
         named = {part.joint for part in parts} | {part.joint for part in step.lock}
-        inherited = tuple(lock for joint, lock in self._standing.items() if joint not in named)
+        inherited = tuple(lock for joint, lock in self._in_force.items() if joint not in named)
         rate = self._rig.sample_rate
         period = math.lcm(*(e.wave.period for e in excite))
         if period > LONGEST_PERIOD * rate:

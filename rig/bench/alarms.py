@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
+from rig.bench.checks.active_warnings import Key
 from rig.bench.checks.catalogue import catalogue
-from rig.bench.checks.standing import Key
 from rig.model.alarms import states
 from rig.model.alarms.states import Alarm, AlarmTable
 from rig.model.rig import Rig
@@ -28,7 +28,7 @@ class AlarmLog:
         self._rig = rig
         self._on_event = on_event
         self._texts = {text.limit: text for text in catalogue()}
-        self._standing: dict[Key, str] = {}
+        self._active: dict[Key, str] = {}
 
     def alarm_of(self, violation: Violation, *, trips: bool) -> Alarm:
         """Return the alarm that a violation raises."""
@@ -49,15 +49,15 @@ class AlarmLog:
 
     def update(self, warnings: Mapping[Key, Violation], tick: int) -> None:
         """Update with the warnings active at a tick: raise new ones, end missing ones."""
-        if not warnings and not self._standing:
+        if not warnings and not self._active:
             return
-        for key in self._standing.keys() - warnings.keys():
-            name = self._standing.pop(key)
+        for key in self._active.keys() - warnings.keys():
+            name = self._active.pop(key)
             self.table = states.returned(self.table, name)
             self._on_event("alarm returned", tick, {"alarm": name})
         for key, violation in warnings.items():
-            if key not in self._standing:
-                self._standing[key] = self._raise(self.alarm_of(violation, trips=False))
+            if key not in self._active:
+                self._active[key] = self._raise(self.alarm_of(violation, trips=False))
 
     def trip(self, violation: Violation) -> Alarm:
         """Raise and return the alarm of a trip, which latches."""

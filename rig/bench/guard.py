@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
 from rig.bench.checks import bands
+from rig.bench.checks.active_warnings import ActiveWarnings, Key
 from rig.bench.checks.frozen import Frozen
 from rig.bench.checks.plausibility import Plausibility
 from rig.bench.checks.rates import rate_window, rates
@@ -25,7 +26,6 @@ from rig.bench.checks.recent import Recent
 from rig.bench.checks.roles import EXCITED, FREE, JointRole, piston_bounds
 from rig.bench.checks.saturation import Saturation
 from rig.bench.checks.settings import GuardSettings
-from rig.bench.checks.standing import Key, Standing
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.trips import (
@@ -88,7 +88,7 @@ class Guard:
         warning, trip = bands.delays(rig, self.settings)
         self._outside_trip = bands.Delayed(trip)
         self._outside_warning = bands.Delayed(warning)
-        self._standing = Standing(round(self.settings.return_after * rig.sample_rate))
+        self._active = ActiveWarnings(round(self.settings.return_after * rig.sample_rate))
         self.roles: tuple[JointRole, ...] = ()
         self.set_roles((FREE,) * len(rig.joints))
         self.forget()
@@ -96,7 +96,7 @@ class Guard:
     @property
     def warnings(self) -> Mapping[Key, Violation]:
         """The active warnings by key, each with its first violation."""
-        return self._standing.warnings
+        return self._active.warnings
 
     def forget(self) -> None:
         """Reset: the next block does not continue the previous one."""
@@ -146,7 +146,7 @@ class Guard:
             return longer(allowed)
         self._unbroken = 0
         self._plausibility.skip()
-        self._standing.see([longer(0.0)], tick)
+        self._active.add([longer(0.0)], tick)
         return None
 
     def stale(self, age: float, tick: int) -> Violation | None:
@@ -155,9 +155,7 @@ class Guard:
             return Violation(STALE, age, (-math.inf, self.stale_after), "s", None, "", tick)
         near = self.settings.stale_warning * self.stale_after
         if age > near:
-            self._standing.see(
-                [Violation(STALE, age, (-math.inf, near), "s", None, "", tick)], tick
-            )
+            self._active.add([Violation(STALE, age, (-math.inf, near), "s", None, "", tick)], tick)
         return None
 
     def device_tripped(self, tick: int) -> Violation:
@@ -191,7 +189,7 @@ class Guard:
             trips += self._act(findings, last)
         if not self._calm:
             self._band_warnings(block, last)
-        if self._standing.warnings:
+        if self._active.warnings:
             self._end_warnings(block, last)
         return min(trips, key=lambda violation: violation.tick) if trips else None
 
@@ -211,12 +209,12 @@ class Guard:
                 trip, near = rate.find(self.rig, rows, first, new)
                 if trip is not None:
                     trips.append(trip)
-                self._standing.see(near, last)
+                self._active.add(near, last)
         return trips
 
     def _act(self, violations: Sequence[Violation], last: int) -> list[Violation]:
         """Warn or trip as the rig file says; return the violations that trip."""
-        self._standing.see([v for v in violations if self._actions[v.limit] == "warn"], last)
+        self._active.add([v for v in violations if self._actions[v.limit] == "warn"], last)
         return [v for v in violations if self._actions[v.limit] == "trip"]
 
     def _band_trips(self, block: SampleBlock) -> list[Violation]:
@@ -229,15 +227,15 @@ class Guard:
             columns = np.flatnonzero(over.any(axis=0)).tolist()
             rows = [int(np.argmax(over[:, column])) for column in columns]
             pairs = zip(rows, columns, strict=True)
-            self._standing.see([self._of_band(block, r, c, self._warn) for r, c in pairs], last)
+            self._active.add([self._of_band(block, r, c, self._warn) for r, c in pairs], last)
 
     def _end_warnings(self, block: SampleBlock, last: int) -> None:
         """End the warnings whose cause has been absent for long enough, with hysteresis."""
         outside = self._inner.outside(block.data).any(axis=0)
         for column in np.flatnonzero(outside).tolist():
             name = self.rig.recorded[column]
-            self._standing.keep(name, self._band_of(name), last)
-        self._standing.expire(last)
+            self._active.keep(name, self._band_of(name), last)
+        self._active.expire(last)
 
     def _band_of(self, name: str) -> str:
         """Return the name of a channel's limit for its joint's role."""

@@ -58,10 +58,10 @@ def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
     try:
         if not (folder / runstate.JOURNAL).exists():
             return _without_journal(folder)
-        stood = runstate.read_state(folder)
+        state_before = runstate.read_state(folder)
         runstate.take_ownership(folder)
         try:
-            report = _from_journal(folder, header.rig, stood)
+            report = _from_journal(folder, header.rig, state_before)
             from rig.runs.exchange.trip_window import write_trip_window  # noqa: PLC0415 - as h5py
 
             write_trip_window(folder)
@@ -84,19 +84,19 @@ def _refuse_if_alive(folder: Path, force: bool) -> None:
     if owner.host != runstate.computer_name() and not force:
         raise InputError(
             f"{folder}: was being written on computer {owner.host!r}; recover it there, or with "
-            "force if that run is surely over"
+            "--force if that run is surely over"
         )
 
 
-def _from_journal(folder: Path, rig: Rig, stood: str) -> RecoverReport:
+def _from_journal(folder: Path, rig: Rig, state_before: str) -> RecoverReport:
     _tidy(folder)
     path = folder / runstate.JOURNAL
     damage = find_damage(path, rig)
     if damage is not None:
-        return _from_damaged(folder, rig, stood, damage)
+        return _from_damaged(folder, rig, state_before, damage)
     journal = Journal.open(path)
     try:
-        state = str(journal.meta("outcome") or stood)
+        state = str(journal.meta("outcome") or state_before)
         written = finalise(journal, folder, rig.name, state)
     finally:
         journal.close()
@@ -105,10 +105,10 @@ def _from_journal(folder: Path, rig: Rig, stood: str) -> RecoverReport:
     return _report(folder, state, written, message)
 
 
-def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverReport:
+def _from_damaged(folder: Path, rig: Rig, state_before: str, damage: str) -> RecoverReport:
     """Finalise the readable part of a damaged or cut off journal and keep the journal."""
     path = folder / runstate.JOURNAL
-    state = _outcome(path) or stood
+    state = _outcome(path) or state_before
     journal, rebuilt = rebuild(path, rig, damage)
     try:
         if not rebuilt.blocks:

@@ -14,7 +14,7 @@ def key_of(violation: Violation) -> Key:
     return violation.limit, violation.channel, violation.joint
 
 
-class Standing:
+class ActiveWarnings:
     """The active warnings of a guard by key, each with its first violation."""
 
     def __init__(self, patience: int) -> None:
@@ -23,7 +23,7 @@ class Standing:
         self._last: dict[Key, int] = {}
         self.warnings: dict[Key, Violation] = {}
 
-    def see(self, violations: Iterable[Violation], now: int) -> None:
+    def add(self, violations: Iterable[Violation], now: int) -> None:
         """Add the violations up to tick `now`; an active warning keeps its first violation."""
         for violation in violations:
             key = key_of(violation)
