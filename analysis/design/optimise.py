@@ -94,7 +94,7 @@ def improve(
         candidates[s], cost = search.fitted(candidates[s])
         plays += cost
     best = search.value([c.information for c in candidates])
-    search.loosen([c.information for c in candidates])
+    search.allow([c.information for c in candidates])
     shapes = [(s, joint, tilt) for tilt in DESIGN.first_tilts for s, joint in free]
     while plays < budget:
         s, joint, tilt = shapes.pop(0) if shapes else (*free[int(rng.integers(len(free)))], None)
@@ -145,8 +145,8 @@ class _Search:
         about = aim.get(self.criterion, known.get(self.criterion, 0.0))
         self.allowed = {n: max(DESIGN.kept_error * e, about) for n, e in known.items()}
 
-    def loosen(self, steps: Sequence[StepInformation]) -> None:
-        """Take the errors at the start from a start that was scaled down to keep the limits."""
+    def allow(self, steps: Sequence[StepInformation]) -> None:
+        """Raise the allowed errors to those of the first steps, scaled down to keep the limits."""
         for name, error in self.errors(steps).items():
             if name in self.allowed:
                 self.allowed[name] = max(self.allowed[name], 1.001 * error)

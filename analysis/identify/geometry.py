@@ -89,20 +89,20 @@ def widened(
 ) -> tuple[dict[str, Estimate], Array]:
     """Return the estimates and their covariance (k, k) with the tolerances included."""
     S = parameter_shifts(rig, terms, estimates, geometry)
-    more = np.linalg.norm(S, axis=1)
+    stds = np.linalg.norm(S, axis=1)
     grown = {
-        name: wider(estimate, float(extra))
-        for (name, estimate), extra in zip(estimates.items(), more, strict=True)
+        name: wider(estimate, float(std))
+        for (name, estimate), std in zip(estimates.items(), stds, strict=True)
     }
     return grown, covariance + S @ S.T
 
 
-def wider(estimate: Estimate, more: float) -> Estimate:
-    """Return an estimate with a standard deviation `more` added in quadrature to either side."""
+def wider(estimate: Estimate, std: float) -> Estimate:
+    """Return an estimate with a standard deviation `std` added in quadrature to either side."""
     value, (low, high) = estimate.value, estimate.ci95
-    half = IDENTIFY.normal_quantile * more
+    half = IDENTIFY.normal_quantile * std
     ends = (value - math.hypot(value - low, half), value + math.hypot(high - value, half))
-    return replace(estimate, std=math.hypot(estimate.std, more), ci95=ends)
+    return replace(estimate, std=math.hypot(estimate.std, std), ci95=ends)
 
 
 def parameter_shifts(

@@ -36,7 +36,7 @@ def sensor_variance(sensor: AnySensor) -> float:
     return float(sensor.noise**2 + rounding**2 / 12.0)
 
 
-def disturbed(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
+def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
     """Return the record with the sensors' noise of the rig file added once more."""
     channels = dict(record.channels)
     for name in rig.channels:
@@ -61,7 +61,7 @@ def record_moments(
     """
     if rng is None:
         rng = np.random.default_rng([0, zlib.crc32(conditioned.record.step.encode())])
-    again = conditioned.condition_alike(rig, disturbed(rig, conditioned.record, rng))
+    again = conditioned.condition_alike(rig, with_added_noise(rig, conditioned.record, rng))
     after = record_rows(rig, terms, again.signals, again.filtering)
     out: dict[str, Array] = {}
     for name, rows in before.items():

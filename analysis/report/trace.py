@@ -150,7 +150,7 @@ def _errors(result: Trace) -> list[tuple[str, ...]]:
 def _effect(effect: JudgedEffect, key: str) -> dict[str, Any]:
     return {
         "curve": trace_plots.curves(effect, key) if effect.curves else None,
-        "tried": trace_plots.instead(effect, f"{key}r"),
+        "tried": trace_plots.rival_errors(effect, f"{key}r"),
         "name": effect.name.replace("_", " "),
         "where": effect.location,
         "values": [(n, quantity(e)) for n, e in effect.parameters.items()],

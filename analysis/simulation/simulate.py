@@ -157,8 +157,8 @@ class Effort(enum.Enum):
 def compiled(model: Model, effort: Effort = Effort.ONCE) -> Compiled:
     """Return a model in the integrator's layout; raises InputError for unidentified parameters.
 
-    The generated right-hand side is used if it is on disk; it is generated for every rig's own
-    terms and for a fit. Otherwise terms are called one by one. The results are equal.
+    A generated right-hand side is used if it is on disk; it is generated where all terms are of the
+    rig's baseline, and for a fit. Otherwise terms are called one by one. The results are equal.
     """
     missing = [name for name, p in model.parameters.items() if not p.identified]
     if missing:
@@ -194,8 +194,8 @@ def _fused(
         log.info("the equations are evaluated term by term: %s", reason)
         return None
     compiled_source = compiled_sources.stored(source)
-    own = {u.term.name for u in model.terms} <= {t.name for t in baseline_of(model.rig)}
-    if compiled_source is None and (own or effort is Effort.FIT):
+    only_baseline = {u.term.name for u in model.terms} <= {t.name for t in baseline_of(model.rig)}
+    if compiled_source is None and (only_baseline or effort is Effort.FIT):
         names = " ".join(dict.fromkeys(u.term.name for u in model.terms))
         return compiled_sources.compiled_now(source, f"{len(electric)} joint(s): {names}")
     return compiled_source

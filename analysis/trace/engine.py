@@ -134,7 +134,7 @@ def trace(
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
         seconds = time.perf_counter() - started
         return replace(again, notes=(load.words, *again.notes), seconds=seconds)
-    return replace(result, notes=(*result.notes, load.words)) if load.resists else result
+    return replace(result, notes=(*result.notes, load.words)) if load.shows_inertia else result
 
 
 def _of_rig(rig: Rig, result: Trace) -> Trace:
@@ -336,7 +336,7 @@ def _no_progress(_: float) -> None:
     """Ignore progress."""
 
 
-def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run] = ()) -> None:
+def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run]) -> None:
     if not holdout or not any(run.records for run in holdout):
         raise InputError(
             "no held-out records: give --holdout a run that is not used for the fit, with another "
@@ -345,10 +345,10 @@ def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Ru
     if judge and not any(run.records for run in judge):
         raise InputError("no judging records: the runs of --judge are empty")
     seen: dict[str, str] = {}
-    for kind, option, given in (
+    for kind, option, checked in (
         ("training", "", runs), ("held-out", "--holdout", holdout), ("judging", "--judge", judge),
     ):  # fmt: skip
-        digests = [(_digest(record), record.name) for run in given for record in run.records]
+        digests = [(_digest(record), record.name) for run in checked for record in run.records]
         for digest, name in digests if option else ():
             if digest in seen:
                 raise InputError(
@@ -418,8 +418,8 @@ def _not_in_model(
     candidates: Sequence[Effect], known: Sequence[Used], moving: int = 1
 ) -> list[Effect]:
     """Return the candidates that the model lacks and that can act where `moving` joints move."""
-    there = {(u.term.name, u.term.where) for u in known}
-    fresh = [c for c in candidates if (c.name, c.where) not in there]
+    in_model = {(u.term.name, u.term.where) for u in known}
+    fresh = [c for c in candidates if (c.name, c.where) not in in_model]
     return [c for c in fresh if c.least_joints <= moving]
 
 
@@ -451,13 +451,13 @@ def _identified(
     Temperature and spool path are left out of `terms`: the estimator fits them itself. Torque rows
     of the joints `in_motion` (0-based) are weighted by speed; sines at `lines` are taken out.
     """
-    beside = (BulkTemperature, SpoolPath)
-    own = ordered([u for u in terms if not isinstance(u.term, beside)])
+    nuisances = (BulkTemperature, SpoolPath)
+    kept = ordered([u for u in terms if not isinstance(u.term, nuisances)])
 
     def filtering(record: Record) -> Filtering:
         return replace(default_filtering(record), in_motion=in_motion, lines=lines)
 
-    return coupled(runs, own, filtering, estimator=ESTIMATOR)
+    return coupled(runs, kept, filtering, estimator=ESTIMATOR)
 
 
 def _with_tolerances(effect: JudgedEffect, from_tolerances: Mapping[str, float]) -> JudgedEffect:

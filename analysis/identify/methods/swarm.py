@@ -89,13 +89,13 @@ def search(
     record = single_joint_record(runs)
     ck.refuse_constant_channels(rig, record)
     task = make_task(rig, record, terms, filtering(record), options)
-    trail = run_search(method, task, options, rng)
-    if trail.error >= IDENTIFY.failed_error:
+    history = run_search(method, task, options, rng)
+    if history.error >= IDENTIFY.failed_error:
         raise InputError(
-            f"{method}: every one of {trail.evaluations} candidates lost its state "
-            f"({_failures(trail)}); try more --evaluations"
+            f"{method}: every one of {history.evaluations} candidates lost its state "
+            f"({_failures(history)}); try more --evaluations"
         )
-    return _identification(method, runs, task, trail, options)
+    return _identification(method, runs, task, history, options)
 
 
 def run_search(
@@ -168,49 +168,55 @@ def _values(task: SearchTask, point: Array) -> dict[str, float]:
 
 
 def _identification(
-    method: str, runs: Sequence[Run], task: SearchTask, trail: SearchHistory, options: SearchOptions
+    method: str,
+    runs: Sequence[Run],
+    task: SearchTask,
+    history: SearchHistory,
+    options: SearchOptions,
 ) -> Identification:
     rig, used = task.model.rig, task.model.terms
-    solutions = {family: _as_solution(method, task, trail, family) for family in FAMILIES}
+    solutions = {family: _as_solution(method, task, history, family) for family in FAMILIES}
     estimates, covariance = estimates_of(rig, used, solutions)
-    statements = _statements(method, runs, task, trail)
+    statements = _statements(method, runs, task, history)
     provenance = {
         "method": method,
         "runs": [run.source for run in runs],
         "records": [task.record],
-        "evaluations": trail.evaluations,
+        "evaluations": history.evaluations,
         "checks_failed": [c.name for c in statements if not c.ok],
     }
     model = Model(rig, used, estimates, covariance, provenance)
     rows = dict.fromkeys(FAMILIES, 0)
-    extra = {"search": trail_json(task, trail, options)}
+    extra = {"search": history_json(task, history, options)}
     return Identification(
-        method, estimates, solutions, rows, 0, trail.seconds, statements, model, extra
+        method, estimates, solutions, rows, 0, history.seconds, statements, model, extra
     )
 
 
-def _as_solution(method: str, task: SearchTask, trail: SearchHistory, family: str) -> Solution:
+def _as_solution(method: str, task: SearchTask, history: SearchHistory, family: str) -> Solution:
     """Return a family's values as a solution of no rows: no interval, no condition number."""
-    best_values = inverted(task.model.rig, task.model.terms, trail.values)
+    best_values = inverted(task.model.rig, task.model.terms, history.values)
     names = parameters_of(task.model.rig, task.model.terms, family)
     nan = np.full(len(names), np.nan)
     value = np.array([best_values.get(name, np.nan) for name in names])
-    lost = {n: f"{method} searches STEP1's parameters only" for n in names if n not in trail.values}
+    lost = {
+        n: f"{method} searches STEP1's parameters only" for n in names if n not in history.values
+    }
     return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
 
 
-def _failures(trail: SearchHistory) -> str:
-    return ", ".join(f"{count} {failure}" for failure, count in trail.lost.items())
+def _failures(history: SearchHistory) -> str:
+    return ", ".join(f"{count} {failure}" for failure, count in history.lost.items())
 
 
 def _statements(
-    method: str, runs: Sequence[Run], task: SearchTask, trail: SearchHistory
+    method: str, runs: Sequence[Run], task: SearchTask, history: SearchHistory
 ) -> tuple[Check, ...]:
-    gone = sum(trail.lost.values())
-    share = 100.0 * gone / trail.evaluations
+    gone = sum(history.lost.values())
+    share = 100.0 * gone / history.evaluations
     parameters = len(task.model.parameters)
     span = np.log10(task.high / task.low)
-    place = np.array([np.log10(trail.values[n] / low) for n, low in zip(task.names, task.low)])  # noqa: B905
+    place = np.array([np.log10(history.values[n] / low) for n, low in zip(task.names, task.low)])  # noqa: B905
     stuck = [
         name
         for name, x, width in zip(task.names, place, span, strict=True)
@@ -221,8 +227,8 @@ def _statements(
         Check(
             "state exists",
             gone == 0,
-            f"{gone} of {trail.evaluations} candidates ({share:.1f} %) lost their state: "
-            f"{_failures(trail)}; of the first {trail.sizes[0]}, {trail.lost_first}",
+            f"{gone} of {history.evaluations} candidates ({share:.1f} %) lost their state: "
+            f"{_failures(history)}; of the first {history.sizes[0]}, {history.lost_first}",
         ),
         Check(
             "all parameters",
@@ -240,29 +246,31 @@ def _statements(
         Check(
             "output error",
             True,
-            f"best relative output error {trail.error:.4g} (the first generation's best: "
-            f"{trail.first:.4g}); another search may end at other values",
+            f"best relative output error {history.error:.4g} (the first generation's best: "
+            f"{history.first:.4g}); another search may end at other values",
         ),
     )
 
 
-def trail_json(task: SearchTask, trail: SearchHistory, options: SearchOptions) -> dict[str, Any]:
+def history_json(
+    task: SearchTask, history: SearchHistory, options: SearchOptions
+) -> dict[str, Any]:
     """Return the search as plain data."""
     return {
         "record": task.record,
         "windows": [w.first for w in task.windows],
         "window_seconds": options.seconds,
-        "evaluations": trail.evaluations,
-        "lost": dict(trail.lost),
-        "lost_first_generation": trail.lost_first,
-        "lost_by_generation": list(trail.lost_by_generation),
-        "generation_sizes": list(trail.sizes),
-        "error_first_generation": trail.first if trail.first < IDENTIFY.failed_error else None,
-        "error": trail.error,
-        "error_by_generation": [e if e < IDENTIFY.failed_error else None for e in trail.errors],
+        "evaluations": history.evaluations,
+        "lost": dict(history.lost),
+        "lost_first_generation": history.lost_first,
+        "lost_by_generation": list(history.lost_by_generation),
+        "generation_sizes": list(history.sizes),
+        "error_first_generation": history.first if history.first < IDENTIFY.failed_error else None,
+        "error": history.error,
+        "error_by_generation": [e if e < IDENTIFY.failed_error else None for e in history.errors],
         "bounds": {
             name: [float(a), float(b)]
             for name, a, b in zip(task.names, task.low, task.high, strict=True)
         },
-        "seconds": trail.seconds,
+        "seconds": history.seconds,
     }

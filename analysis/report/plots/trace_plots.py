@@ -164,7 +164,7 @@ def curves(effect: JudgedEffect, key: str) -> Markup:
         return svg(canvas, key, f"{effect.name.replace('_', ' ')} with its 95 % band")
 
 
-def instead(effect: JudgedEffect, key: str) -> Markup | None:
+def rival_errors(effect: JudgedEffect, key: str) -> Markup | None:
     """Draw the held-out error without an effect, with it, and with each rival in its place.
 
     Sorted by error, each with the reason why it is named or not. None where errors are unknown.
@@ -368,5 +368,5 @@ def equation_of(
 
 __all__ = [
     "ResidualSeries", "abscissae", "against", "axis", "equation_of", "held_out", "in_time",
-    "instead", "kind_of", "over_noise", "spectrum",
+    "kind_of", "over_noise", "rival_errors", "spectrum",
 ]  # fmt: skip

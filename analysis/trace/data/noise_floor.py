@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.noise import disturbed
+from analysis.regression.noise import with_added_noise
 from analysis.regression.rows import Rows, in_common
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
@@ -238,7 +238,7 @@ def stated_noise(
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
     again = model_rows(
-        rig, terms, conditioned.condition_alike(rig, disturbed(rig, conditioned.record, rng))
+        rig, terms, conditioned.condition_alike(rig, with_added_noise(rig, conditioned.record, rng))
     )
     out = {}
     for name, before in rows.items():

@@ -40,14 +40,14 @@ Key = tuple[int, str]  # number of the run, name of the record
 class UndeclaredLoad:
     """The runs with every record's load stated as its torque rows show it, and a note on that.
 
-    `resists` as in `LoadFit`.
+    `shows_inertia` as in `LoadFit`.
     """
 
     train: tuple[Run, ...]
     holdout: tuple[Run, ...]
     judge: tuple[Run, ...]
     words: str
-    resists: bool
+    shows_inertia: bool
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,14 @@ class LoadFit:
     """A load that some of the records carry and others do not.
 
     `mass` [kg]; `loaded` are the training records that carry it; `beta` are the coefficients of the
-    torque rows beside it. `resists` is whether the records show its inertia, which then agrees with
-    its weight.
+    torque rows beside it. `shows_inertia` is whether the records show its inertia, which then
+    agrees with its weight.
     """
 
     mass: float
     loaded: frozenset[Key]
     beta: dict[str, float]
-    resists: bool
+    shows_inertia: bool
 
 
 @dataclass(frozen=True)
@@ -108,14 +108,14 @@ def undeclared_load(
         (judge, loaded_records(rig, terms, judge, load, divided=False) if judge else frozenset()),
     ]
     carry = [word for runs, loaded in found for word in _in_words(runs, loaded)]
-    weighed = "" if load.resists else ", by its weight alone"
+    weighed = "" if load.shows_inertia else ", by its weight alone"
     words = (
         f"no record states a load: by the torque balances {' '.join(dict.fromkeys(carry))} carry "
         f"about {plain(load.mass, 2)} kg more at the tip than the other records{weighed}; state "
         "`loaded` of the records where it is known (import manifest)"
     )
     stated = [with_loads(runs, loaded) for runs, loaded in found]
-    return UndeclaredLoad(stated[0], stated[1], stated[2], words, load.resists)
+    return UndeclaredLoad(stated[0], stated[1], stated[2], words, load.shows_inertia)
 
 
 def _in_words(runs: Sequence[Run], loaded: frozenset[Key]) -> list[str]:
@@ -154,13 +154,13 @@ def fitted_load(rig: Rig, terms: Sequence[Used], runs: Sequence[Run]) -> LoadFit
     by_chance = TRACE.standard_errors * np.sqrt(2.0 * len(before))
     if loaded.all() or not loaded.any() or not 0.0 < mass < HEAVIEST:
         return None
-    resists = _resists(rows, basis, loaded)
-    if excess < by_chance or removed < DATA.load_share * excess or resists is False:
+    agrees = _inertia_agrees(rows, basis, loaded)
+    if excess < by_chance or removed < DATA.load_share * excess or agrees is False:
         return None
     beta = dict(rows.data.beta)
     for name, step in zip(rows.data.names, change, strict=True):
         beta[name] = beta.get(name, 0.0) + float(step)
-    return LoadFit(mass, _chosen(rows, loaded), beta, resists is not None)
+    return LoadFit(mass, _chosen(rows, loaded), beta, agrees is not None)
 
 
 def loaded_records(
@@ -255,7 +255,7 @@ def _fit(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:
     return float(found[-1]), found[:-1]
 
 
-def _resists(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
+def _inertia_agrees(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
     """Return whether the inertia of the load in the records `loaded` (U,) agrees with its weight.
 
     The mass from gravity terms alone and that from inertia terms alone may differ by

@@ -135,7 +135,7 @@ def test_an_offset_of_a_pressure_in_one_step_is_not_taken_for_a_mass(
         pushed.append(replace(record, channels={**record.channels, "cap_pressure_1": cap}))
     run = replace(runs[0], records=tuple(pushed))
     load = undeclared_load(rig, tuple(map(Used, baseline_of(rig))), [run], [runs[1]], [])
-    assert load is None or not load.resists
+    assert load is None or not load.shows_inertia
 
 
 def test_runs_that_state_no_load_have_none_where_another_run_states_one(

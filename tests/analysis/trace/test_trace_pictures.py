@@ -135,7 +135,7 @@ def test_a_valve_s_null_is_drawn_beside_the_spool_s_own_sensor(rig: Rig) -> None
 
 
 def test_rivals_stand_by_what_they_leave_and_say_why_they_are_not_named() -> None:
-    drawn = str(trace_plots.instead(LEAK, "e0"))
+    drawn = str(trace_plots.rival_errors(LEAK, "e0"))
     said = [re.sub(r"<[^>]+>", "", line) for line in re.findall(r"<text.*?</text>", drawn)]
     stand = [s for s in said if "joint 2" in s or s == "without the effect"]
     assert [s.partition(":")[0] for s in stand] == [
@@ -151,7 +151,7 @@ def test_rivals_stand_by_what_they_leave_and_say_why_they_are_not_named() -> Non
 
 
 def test_a_trace_of_before_is_drawn_without_what_nobody_knows() -> None:
-    assert trace_plots.instead(replace(LEAK, left_without=float("nan")), "e0") is None
+    assert trace_plots.rival_errors(replace(LEAK, left_without=float("nan")), "e0") is None
 
 
 def test_a_sensor_s_effect_is_told_with_its_sensor_and_stored_by_its_joint() -> None:
