@@ -120,7 +120,7 @@ class CanOpenValves:
         return f"{len(self._nodes)} valve(s) of CiA 408 at {self._at.bus}"
 
     def read(self) -> Array:
-        """Return one sample of every channel [SI] by SYNC and the nodes' TPDOs."""
+        """Return one sample of every channel [SI], (channels,), by SYNC and the nodes' TPDOs."""
         self._usable()
         self._heartbeat()
         with self._received:

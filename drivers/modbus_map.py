@@ -292,7 +292,7 @@ class MappedModule:
         return self._who
 
     def read(self) -> Array:
-        """Return one value [SI] of every channel, in the order of the rig."""
+        """Return one value [SI] of every channel, (channels,), in the order of the rig."""
         values = np.empty(len(self._map.inputs))
         for index, point, data in self._registers():
             values[index] = point.value(data)

@@ -94,13 +94,9 @@ class ModbusConnection(ABC):
                 f"{len(words)} registers from {address}"
             )
 
-    def write_and_read(
-        self, write_at: int, words: list[int], read_at: int, count: int, within: float | None = None
-    ) -> bytes:
-        """Write, then read, in one transaction (function 23) of at most `within` [s]."""
-        return self.registers(
-            write_and_read_request(write_at, words, read_at, count), count, within
-        )
+    def write_and_read(self, write_at: int, words: list[int], read_at: int, count: int) -> bytes:
+        """Write, then read, in one transaction (function 23)."""
+        return self.registers(write_and_read_request(write_at, words, read_at, count), count)
 
     def registers(self, request: bytes, count: int, within: float | None = None) -> bytes:
         """Return the `count` registers for which a request (a PDU) asks, within `within` [s]."""

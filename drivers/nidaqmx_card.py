@@ -178,7 +178,7 @@ class NidaqmxCard:
         return f"DAQ card {' '.join(cards)}"
 
     def read(self) -> Array:
-        """Return one value [SI] of every channel, in the order of the rig."""
+        """Return one value [SI] of every channel, (channels,), in the order of the rig."""
         with self._failing_as_lost():
             volts = np.atleast_1d(self._opened(0).read(timeout=self._timeout))
         values: Array = self._wiring.offsets + self._wiring.scales * volts

@@ -73,7 +73,7 @@ def tilted(tone: Tone, tilt: float, rng: np.random.Generator) -> tuple[Spectrum,
 
 
 def reshaped(tone: Tone, rng: np.random.Generator) -> Array:
-    """Return amplitudes f^-tilt in a random band above the lowest lines, which are kept."""
+    """Return amplitudes (lines,) f^-tilt in a random band above the lowest lines, which stay."""
     size = np.abs(tone.spectrum)
     lowest = np.flatnonzero(size > 0)[: DESIGN.anchors]
     many, first = len(size), int(lowest[-1]) + 1

@@ -2,7 +2,7 @@
 
 The plan's steps are simulated on the twin (nominal parameters), their rows are built exactly as
 `identify` builds them, and the rig's stated sensor noise is carried through the filters
-(`prediction_noise`). With A = sum n_s X_s'X_s and n_s repeats of step s the coupled solution has
+(`sensor_noise`). With A = sum n_s X_s'X_s and n_s repeats of step s the coupled solution has
     cov beta = A^-1 [ sum n_s cov g_s ] A^-1.
 The prediction is the scatter between repeats. It excludes model error; the effect of the oil's
 temperature on b between steps is separate (`oil`), because it differs between experiments but not

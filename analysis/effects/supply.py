@@ -285,8 +285,8 @@ class TankPressure(PortEffect):
         """Reject pressures at their bounds, except a line's part of zero."""
         constant, back = self.whole(rig, shape)
         if constant <= 1e-3 * rig.supply.pressure:
-            more = "" if back <= constant else ": this is return_line"
-            return f"p_tank = {constant:.4g} Pa is nothing{more}"
+            also = "" if back <= constant else ": this is return_line"
+            return f"p_tank = {constant:.4g} Pa is negligible{also}"
         inner = tuple(s.grid[-1] for s in self.shapes(rig))
         kept = (v if v > 1e-3 * s.high else g for v, s, g in
                 zip((constant, back), self.shapes(rig), inner, strict=True))  # fmt: skip

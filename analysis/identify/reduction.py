@@ -249,7 +249,7 @@ def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowC
 
 
 def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None:
-    """Return the summed noise moments of all records; one record represents each step."""
+    """Return the summed noise moments (k+1, k+1) of all records; one represents each step."""
     counts: dict[tuple[int, str], int] = {}
     for reduction in reductions:
         key = (reduction.run, reduction.head.step)

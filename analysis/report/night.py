@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
+from analysis.identify.settings import IDENTIFY
 from analysis.report import format as fm
 from analysis.report.page import page, write
 from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, style, svg
 
 TEMPLATE: Final = "night.html"
-INTERVAL: Final = 1.96  # standard deviations on each side of a 95 % interval
 _COLUMNS = 4  # of the drift's small figures
 _BAR_COLOURS: Final = {"done": BLUE, "tripped": "#d03030"}
 
@@ -231,10 +231,10 @@ def _drift_row(name: str, items: Sequence[NightItem]) -> dict[str, Any]:
         "unit": unit.text,
         "first": fm.significant(values[0].value, 4, unit.scale),
         "last": fm.significant(values[-1].value, 4, unit.scale),
-        "half": fm.significant(INTERVAL * values[-1].std, 2, unit.scale),
+        "half": fm.significant(IDENTIFY.normal_quantile * values[-1].std, 2, unit.scale),
         "change": f"{fm.percent(percent, signed=True)} %" if several else fm.DASH,
         "sigmas": fm.significant(abs(sigmas), 2) if several and sigmas else fm.DASH,
-        "warn": several and abs(sigmas) > INTERVAL,
+        "warn": several and abs(sigmas) > IDENTIFY.normal_quantile,
         "runs": len(values),
     }
 
@@ -251,7 +251,9 @@ def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> M
             shown = [item for item in items if name in item.parameters]
             hours = np.array([_hours(begin, item) for item in shown])
             values = np.array([item.parameters[name].value for item in shown])
-            half = INTERVAL * np.array([item.parameters[name].std for item in shown])
+            half = IDENTIFY.normal_quantile * np.array(
+                [item.parameters[name].std for item in shown]
+            )
             scale = 100.0 / abs(values[0]) if values[0] else 1.0
             percent = scale * (values - values[0])
             axes.axhline(0.0, color=PALE, lw=0.8)

@@ -142,16 +142,14 @@ def differenced(name: str, h0: Array, rate: float, order: int = 8) -> FirSmoothe
     return FirSmoother(name, np.stack((wide / h0.sum(), h1 / h0.sum(), h2 / h0.sum())))
 
 
-def moving_average(rate: float, samples: int = 20) -> FirSmoother:
-    """Return the paper's moving average made zero-phase, with central differences.
+def moving_average(rate: float) -> FirSmoother:
+    """Return the paper's average of 20 samples made zero-phase, with central differences.
 
     An even average has no middle sample; averaging the two that straddle it gives half weights
     at the ends.
     """
-    h0 = np.full(samples, 1.0 / samples)
-    if samples % 2 == 0:
-        h0 = np.convolve(h0, [0.5, 0.5])
-    return differenced(f"moving average, {samples} samples", h0, rate, order=2)
+    h0 = np.convolve(np.full(20, 1.0 / 20), [0.5, 0.5])
+    return differenced("moving average, 20 samples", h0, rate, order=2)
 
 
 def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:

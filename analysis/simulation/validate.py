@@ -169,20 +169,16 @@ def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
         yield first, length
 
 
-def first_state(
-    rig: Rig, record: Record, signals: Signals, channels: Mapping[str, Array] | None = None
-) -> State:
-    """Return the state at the first sample, from a cubic fitted to the first 40 ms of data.
+def first_state(rig: Rig, record: Record, signals: Signals, channels: Mapping[str, Array]) -> State:
+    """Return the state at the first sample, from a cubic fitted to the first 40 ms of `channels`.
 
-    `channels` defaults to the record's, aligned. A zero-phase filter would need samples before the
-    first. The velocity is the cubic's derivative.
+    A zero-phase filter would need samples before the first. The velocity is the cubic's derivative.
     """
     count = min(
         record.samples,
         max(SIMULATION.start_degree + 2, round(SIMULATION.start_samples * record.sample_rate)),
     )
     t = np.arange(count) / record.sample_rate
-    channels = aligned_channels(rig, record) if channels is None else channels
     state = state_at(signals, 0)
     q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
     for i in map(int, np.flatnonzero(signals.excited)):

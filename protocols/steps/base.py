@@ -52,7 +52,7 @@ class Planner(Protocol):
 class PlannedStep:
     """A step resolved on a rig: title, expected time [s], excitations, nested steps.
 
-    `least` and `most` [s] bound the time where only the bench decides it.
+    `most` [s] bounds the time where only the bench decides it.
     """
 
     step: StepKind

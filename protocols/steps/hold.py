@@ -45,5 +45,5 @@ class HoldStep(StepKind):
         return PlannedStep(self, title, seconds, locks=locks, records=records)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Keep still."""
+        """Keep every valve closed for the time of the hold."""
         actions.hold(planned, planned.locks, self.hold)

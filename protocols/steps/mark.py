@@ -21,5 +21,5 @@ class MarkStep(StepKind):
         return PlannedStep(self, f"mark {self.mark!r}", 0.0)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Write it."""
+        """Write the line."""
         actions.mark(self.mark)

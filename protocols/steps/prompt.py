@@ -47,7 +47,7 @@ class PromptStep(StepKind):
         return PlannedStep(self, title, 0.0, most=self.timeout)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Ask."""
+        """Ask the operator; end the run at an answer of `abort_on`."""
         question = Question(self.prompt, self.answers, self.default, self.timeout)
         answer = actions.ask(question)
         if answer in self.abort_on:

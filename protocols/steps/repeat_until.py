@@ -40,7 +40,7 @@ class RepeatStep(StepKind):
         )
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
-        """Repeat."""
+        """Repeat the nested steps until the condition holds."""
         assert planned.condition is not None
         good = actions.repeat(planned, planned.condition, self.at_most)
         if good:

@@ -20,13 +20,13 @@ def record_zero(
     read: Callable[[], SampleBlock],
     keep: Callable[[SampleBlock], None],
     clock: Callable[[], float],
-    seconds: float = BENCH.zero_seconds,
+    seconds: float,
 ) -> bool | None:
     """Record blocks until every command has been zero for `seconds` of consecutive samples.
 
     Call with the outputs zeroed. Returns True for such samples, False if the device still reports
-    a command, None if the device or the disk failed first. Ends after `seconds + QUEUED` of device
-    time, or that much wall time plus two answer times.
+    a command, None if the device or the disk failed first. Ends after `seconds` plus
+    `BENCH.queued_seconds` of device time, or that much wall time plus two answer times.
     """
     wanted = round(seconds * rig.sample_rate)
     most = round((seconds + BENCH.queued_seconds) * rig.sample_rate)

@@ -246,7 +246,7 @@ class QueueStore:
         return self.item(number)
 
     def retry(self, number: int, who: str) -> Item:
-        """Queue an ended item again, at its place; done by a person only."""
+        """Queue an ended item again, at its place, for a person; raises InputError."""
         with self._transaction():
             item = self.item(number)
             if not item.over:
@@ -283,7 +283,7 @@ class QueueStore:
         return self.item(number)
 
     def begin(self, number: int) -> Item:
-        """Enter `running` with the next attempt's folder, before its process is started."""
+        """Enter `running` with the next attempt's folder, before its process; raises InputError."""
         with self._transaction():
             item = self.item(number)
             if item.state != CHECKING:
@@ -301,7 +301,7 @@ class QueueStore:
             self._db.execute("UPDATE item SET pid = ? WHERE id = ?", (pid, number))
 
     def finish(self, number: int, state: str, reason: str) -> Item:
-        """Set an item's final state; an item that has one is left unchanged."""
+        """Set an item's final state, unless it has one; raises ValueError for another state."""
         if state not in OVER:
             raise ValueError(f"{state!r} is not a final state")
         with self._transaction():

@@ -8,7 +8,7 @@ filtered rows; they differ in the instruments Z and the weights w (`equations`):
  robust        w falls for rows far outside the scatter (`robust`).
  output-error  simulates the model from free window starts and fits it to the samples
                (`output_error`); noise is in the outputs only.
-`choose` runs one of them, or prefers by the check on noise in the regressors.
+`analysis.identify.estimation.refine` runs one, or chooses by the check on noise in the regressors.
 """
 
 from __future__ import annotations

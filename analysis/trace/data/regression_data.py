@@ -88,7 +88,7 @@ class RegressionData:
 
     @functools.cached_property
     def family_rows(self) -> dict[str, NDArray[np.int64]]:
-        """The numbers of each family's rows, in the order of the segments."""
+        """The numbers (m,) of each family's rows, in the order of the segments."""
         parts: dict[str, list[NDArray[np.int64]]] = {}
         for s in self.segments:
             rows = np.arange(s.where.start, s.where.stop)

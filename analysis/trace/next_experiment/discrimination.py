@@ -109,7 +109,7 @@ class MeasurementView:
     cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
-        """Return what an effect would add in SI: equation -> name -> column."""
+        """Return what an effect would add in SI: equation -> name -> column (m,)."""
         if is_hidden_by_lock(used.term, self.conditioned):
             return {}
         return candidate_columns(
@@ -224,7 +224,7 @@ class ComparisonRows:
         return total
 
     def imitation_columns(self, explanation: Explanation) -> Array:
-        """Return the columns that an explanation is fitted with, shape derivatives included."""
+        """Return the columns (m, k) of an explanation's fit, derivatives by its shapes included."""
         blocks = [self.base]
         for used in explanation.effects:
             blocks += [c[:, None] for c in self.columns(used).values()]

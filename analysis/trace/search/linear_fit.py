@@ -115,17 +115,17 @@ def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], least: Array) -
     """
     out = np.zeros(len(groups))
     for g, group in enumerate(groups):
-        seen = [j for j in group if K[j, j] > least[j]]
-        if len(seen) == 1:
-            out[g] = c[seen[0]] ** 2 / K[seen[0], seen[0]]
-        elif seen:
-            index = np.ix_(seen, seen)
-            out[g] = c[seen] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[seen]
+        shown = [j for j in group if K[j, j] > least[j]]
+        if len(shown) == 1:
+            out[g] = c[shown[0]] ** 2 / K[shown[0], shown[0]]
+        elif shown:
+            index = np.ix_(shown, shown)
+            out[g] = c[shown] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[shown]
     return out
 
 
 def schur_complement(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
-    """Return K and c with the columns of `group` eliminated, which have joined the set."""
+    """Return K (V, V) and c (V,) without the columns of `group`, which have joined the set."""
     j = list(group)
     inverse = np.linalg.pinv(K[np.ix_(j, j)], rcond=1e-8, hermitian=True)
     return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])

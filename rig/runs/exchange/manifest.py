@@ -143,7 +143,7 @@ def _with_every_load(
 def check_against_rig(
     manifest: Manifest, lines: dict[tuple[str | int, ...], int], path: Path, rig: Rig
 ) -> dict[str, tuple[float, float]]:
-    """Check joints, channels and units; returns (scale, offset) to SI of each mapped channel."""
+    """Return (scale, offset) to SI of each mapped channel; raises InputError naming its line."""
     joints = len(rig.joints)
     for index, entry in enumerate(manifest.records):
         wrong = [j for j in entry.locked if not 1 <= j <= joints]
