@@ -169,7 +169,8 @@ def equations_above_band(
         for e, energy in winner.excess_energy.items()
         if not winner.effects and not hypotheses.negligible(e, energy)
     ]
-    return out + held_out_above_band(holdout_data, hypotheses.empty.fit, winner.fit)
+    held_out = held_out_above_band(holdout_data, hypotheses.empty.fit, winner.fit)
+    return out + [(e, f"{words} in the rows that choose") for e, words in held_out]
 
 
 def held_out_above_band(
