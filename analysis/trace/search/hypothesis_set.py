@@ -8,10 +8,10 @@ fitted on the way is kept, since the rivals of the winner are taken from these s
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from analysis.trace.data.regression_data import (
     variant_columns,
 )
 from analysis.trace.search import linear_fit
+from analysis.trace.search.confounders import BENCH, is_confounder, is_confusable
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -42,7 +43,6 @@ from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
 Array = NDArray[np.float64]
-_BENCH: Final = "bench"
 log = logging.getLogger(__name__)
 
 
@@ -327,7 +327,8 @@ class HypothesisSet:
             v
             for v in self._variants(data, now.fit.residual)
             if v.key not in taken and (law_of(v.used) not in laws if v.effect.free else not free)
-        ]
+            and self._may_act(v, now, equations)
+        ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
@@ -346,6 +347,25 @@ class HypothesisSet:
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
         return [self.refined(effects) for effects in out.values()]
+
+    def _may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
+        """Return whether a candidate may have columns in some of the equations (any if none).
+
+        It has them where it has under the baseline. Only an effect of the bench couples the joints'
+        flows, so that a candidate may act in further ones.
+        """
+        coupled = any(u.term.where.startswith(BENCH) for u in now.effects)
+        if not equations or coupled or variant.key not in self._acting:
+            return True
+        return not self._acting[variant.key].isdisjoint(equations)
+
+    @functools.cached_property
+    def _acting(self) -> dict[Key, set[str]]:
+        """Equations in which each candidate has columns under the baseline."""
+        out: dict[Key, set[str]] = {}
+        for entry in self.columns:
+            out.setdefault(entry.variant.key, set()).update(entry.touched)
+        return out
 
     def exchanged(self, now: Hypothesis) -> Hypothesis:
         """Return the set, or a better one with an effect exchanged for one that is easily confused.
@@ -369,7 +389,7 @@ class HypothesisSet:
         for used in now.effects if len(now.effects) > 1 else ():
             others = tuple(u for u in now.effects if u is not used)
             for effect in self.effects:
-                if (effect.name, effect.where) in now.keys or not _is_confusable(effect, used):
+                if (effect.name, effect.where) in now.keys or not is_confusable(effect, used):
                     continue
                 fresh = self._started(effect, others)
                 sets.append((*others, fresh))
@@ -393,7 +413,7 @@ class HypothesisSet:
         simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
         confounders = [
             e for e in self.effects
-            if _is_confounder(e, own) and e.mechanism != own.mechanism
+            if is_confounder(e, own) and e.mechanism != own.mechanism
             and (e.name, e.where) not in known
         ]  # fmt: skip
         return [
@@ -465,30 +485,6 @@ class HypothesisSet:
     def removes_too_little(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
         return self.log_energy_ratio(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
-
-
-def _is_confusable(effect: Effect, used: Used) -> bool:
-    """Return whether a candidate is easily confused with an effect of the set.
-
-    It is another name of its mechanism at the same place, or one of its confounders at its joint or
-    of the bench.
-    """
-    own = used.term
-    assert isinstance(own, Effect)
-    same = effect.mechanism == own.mechanism and effect.where == own.where
-    return (same or _is_confounder(effect, own)) and not effect.free
-
-
-def _is_confounder(effect: Effect, own: Effect) -> bool:
-    """Return whether an effect is a confounder of another one, at its joint or of the bench."""
-    joints = {_joint(effect), _joint(own)} - {_BENCH}
-    return effect.name in own.confounders and len(joints) <= 1
-
-
-def _joint(effect: Effect) -> str:
-    """Return the part of an effect's place that names its joint, or the bench."""
-    place = effect.where
-    return _BENCH if place.startswith(_BENCH) else " ".join(place.split()[:2])
 
 
 def effect_of(name: str, where: str) -> Effect:

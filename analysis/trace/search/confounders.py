@@ -1,0 +1,34 @@
+"""Candidates that are easily confused with an effect, by mechanism and place."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from analysis.effects.base import Effect
+from analysis.terms.base import Used
+
+BENCH: Final = "bench"
+
+
+def is_confusable(effect: Effect, used: Used) -> bool:
+    """Return whether a candidate is easily confused with an effect of the set.
+
+    It is another name of its mechanism at the same place, or one of its confounders at its joint or
+    of the bench.
+    """
+    own = used.term
+    assert isinstance(own, Effect)
+    same = effect.mechanism == own.mechanism and effect.where == own.where
+    return (same or is_confounder(effect, own)) and not effect.free
+
+
+def is_confounder(effect: Effect, own: Effect) -> bool:
+    """Return whether an effect is a confounder of another one, at its joint or of the bench."""
+    joints = {_joint(effect), _joint(own)} - {BENCH}
+    return effect.name in own.confounders and len(joints) <= 1
+
+
+def _joint(effect: Effect) -> str:
+    """Return the part of an effect's place that names its joint, or the bench."""
+    place = effect.where
+    return BENCH if place.startswith(BENCH) else " ".join(place.split()[:2])
