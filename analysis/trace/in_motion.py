@@ -19,7 +19,7 @@ from analysis.trace.finding import (
     trace_rows,
     without_unnamed_effects,
 )
-from analysis.trace.judge import gates
+from analysis.trace.judge import gates, removal
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.unlocked import judged_line
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
@@ -161,7 +161,7 @@ def _meets_noise(found: Finding, joints: Collection[int]) -> bool:
 def _held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     """Return the error of a set in the choosing rows over the noise floor, by equation."""
     choosing = rows.unseen.choosing
-    return gates.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
+    return removal.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
 
 
 def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:

@@ -15,15 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import shape_values, shapes_of
+from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.regression.solve import half_width
-from analysis.simulation.model import Estimate
+from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.scatter import parameter_covariance
+from analysis.trace.judge.scatter import form_shift, parameter_covariance, with_form_errors
+from analysis.trace.search.hypothesis import of_one_law, parameter_values
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, tangent
+from analysis.trace.search.shapes import ShapeFit
 from analysis.trace.settings import TRACE
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -138,6 +141,63 @@ def estimates(
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
         for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
     }
+
+
+def least_needed_of_unknown_size(
+    rig: Rig,
+    effects: Sequence[Used],
+    sizes: Sequence[Mapping[str, Estimate]],
+    left_without: Sequence[float],
+) -> Used | None:
+    """Return the effect of unknown size without which least is left, None if there is none.
+
+    The 95 % intervals of all its coefficients (`sizes`, by parameter) hold zero, and an effect of
+    its family, but of another law, acts at its place: two frictions of one joint. Only one is
+    returned, since the other may be known without it. `left_without` are energies.
+    """
+    unknown = [
+        (left, k)
+        for k, (used, parameters, left) in enumerate(zip(effects, sizes, left_without, strict=True))
+        if _may_be_zero(rig, used, parameters) and _shares_its_balance(used, effects)
+    ]
+    return effects[min(unknown)[1]] if unknown else None
+
+
+def _may_be_zero(rig: Rig, used: Used, parameters: Mapping[str, Estimate]) -> bool:
+    own = [parameters[c.parameter].ci95 for c in used.term.coefficients(rig)]
+    return bool(own) and all(low <= 0.0 <= high for low, high in own)
+
+
+def _shares_its_balance(used: Used, effects: Sequence[Used]) -> bool:
+    own = used.term
+    assert isinstance(own, Effect)
+    return not own.free and any(
+        isinstance(o.term, Effect)
+        and o is not used
+        and (o.term.family, o.term.where) == (own.family, own.where)
+        and not of_one_law(o.term, own)
+        for o in effects
+    )
+
+
+def with_shape_errors(found: ShapeFit, model: Model) -> tuple[Model, dict[str, Estimate]]:
+    """Return the model with wider intervals, and the shapes found with their 95 % intervals.
+
+    `model` was identified with the shapes of `found` taken as exact. Its intervals then include the
+    uncertainty of the shapes, and errors of the effects' forms (`scatter.with_form_errors`).
+    """
+    data, fit = found.data, found.fit
+    values = parameter_values(data.rig, fit.terms, dict(fit.beta))
+    shift = form_shift(data, fit)
+    shapes: dict[str, Estimate] = {}
+    for used in fit.terms:
+        if used in data.terms or not isinstance(used.term, Effect):
+            continue
+        errors = effect_errors(data, fit, used, values)
+        own = {s.parameter for s in shapes_of(data.rig, used)}
+        every = estimates(data, used, errors, shift)
+        shapes |= {name: e for name, e in every.items() if name in own}
+    return with_form_errors(data, fit, model, shift), shapes
 
 
 def basis_of_others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:

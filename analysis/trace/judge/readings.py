@@ -20,7 +20,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.inference import effect_errors, estimates
 from analysis.trace.judge.scatter import form_shift
-from analysis.trace.search.hypothesis import Hypothesis, Key, parameter_values
+from analysis.trace.search.hypothesis import Hypothesis, Key, of_one_law, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
 
@@ -99,12 +99,6 @@ def loses_by_restriction(restricted: Array, richer: Array) -> bool:
     """
     lost = loss_in_deviations(restricted, richer) > TRACE.standard_errors
     return lost and float(richer @ richer) < float(restricted @ restricted)
-
-
-def of_one_law(effect: Effect, other: Effect) -> bool:
-    """Return whether one of two effects at the same place includes the other as a special case."""
-    near = effect.name in other.includes or other.name in effect.includes
-    return near and effect.where == other.where
 
 
 def _needs_richer(

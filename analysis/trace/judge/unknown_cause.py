@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.gates import NO_RIVAL, REMOVES, rivals_in_words
+from analysis.trace.judge.gates import NO_RIVAL, REMOVES
+from analysis.trace.judge.rivals import rivals_in_words
 from analysis.trace.result import Gate, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet

@@ -53,6 +53,12 @@ def law_of(used: Used) -> Key:
     return used.term.mechanism, used.term.where
 
 
+def of_one_law(effect: Effect, other: Effect) -> bool:
+    """Return whether one of two effects at the same place includes the other as a special case."""
+    near = effect.name in other.includes or other.name in effect.includes
+    return near and effect.where == other.where
+
+
 @dataclass(frozen=True)
 class NoiseBand:
     """Energy above noise `by_equation` that counts as nothing."""

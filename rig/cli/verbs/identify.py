@@ -117,7 +117,7 @@ def _with_shape_errors(
     result: Identification, found: ShapeFit
 ) -> tuple[Identification, dict[str, Estimate]]:
     """Return the result with the errors of shapes that were fitted, and these shapes."""
-    from analysis.trace.judge.given_effects import with_shape_errors
+    from analysis.trace.judge.inference import with_shape_errors
 
     model, shapes = with_shape_errors(found, result.model)
     return replace(result, model=model, estimates=model.parameters), shapes

@@ -21,7 +21,7 @@ from analysis.trace import engine
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.judge import gates, inference
+from analysis.trace.judge import gates, inference, removal
 from analysis.trace.result import Trace
 from analysis.trace.search.refinement import jacobian
 from rig.model.parse import InputError
@@ -479,7 +479,7 @@ def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect
     for segment in rows.segments:
         if segment.equation == "torque_2":
             bad[segment.where] *= 3.0
-    assert gates._disturbed_in_held_out(rows, good, good, bad) == ["torque_2"]
-    assert gates._disturbed_in_held_out(rows, bad, good, bad) == []
-    assert gates._disturbed_in_held_out(rows, good, bad, bad) == []
-    assert gates._disturbed_in_held_out(rows, good, good, good) == []
+    assert removal.disturbed_in_held_out(rows, good, good, bad) == ["torque_2"]
+    assert removal.disturbed_in_held_out(rows, bad, good, bad) == []
+    assert removal.disturbed_in_held_out(rows, good, bad, bad) == []
+    assert removal.disturbed_in_held_out(rows, good, good, good) == []

@@ -8,7 +8,7 @@ from analysis.effects.base import open_shapes
 from analysis.identify.identify import identify
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.trace.judge.given_effects import with_shape_errors
+from analysis.trace.judge.inference import with_shape_errors
 from analysis.trace.search.shapes import ShapeFit, fit_shapes, shapes_in
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -21,7 +21,7 @@ from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, in_motion, remaining
 from analysis.trace.data import noise_floor, regression_data
-from analysis.trace.judge import gates, inference
+from analysis.trace.judge import gates, inference, removal, rivals
 from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
@@ -123,7 +123,7 @@ def _first_repeat(train_data: regression_data.RegressionData) -> Array:
 RULES: Final = (
     Rule("removes on held-out", "held-out errors say nothing for or against an effect",
          (setting("least_removed", -math.inf),
-          (gates, "_disturbed_in_held_out", lambda *_: []))),
+          (removal, "disturbed_in_held_out", lambda *_: []))),
     Rule("no harm elsewhere", "an effect may increase the residual of another equation",
          (setting("harm_ratio", math.inf),)),
     Rule("physics", "any sign, size and shape passes",
@@ -131,10 +131,10 @@ RULES: Final = (
     Rule("invariance", "a size may differ between steps, halves, directions and speeds",
          ((gates, "invariance", lambda *_: []),)),
     Rule("family-wise p", "no significance test", (setting("p_limit", 1.0),)),
-    Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
+    Rule("rivals", "no other effect counts as tied", ((rivals, "rivals_of", lambda *_: []),)),
     Rule("rivals that matter",
          "a rival with further numbers must remove the price of each, whatever it means",
-         ((gates, "_moved_parameter", lambda *_: None),)),
+         ((rivals, "_moved_parameter", lambda *_: None),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
          ((SpoolOffset, "inseparable", lambda _: ()), (SensorOffset, "inseparable", lambda _: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
@@ -173,8 +173,8 @@ FAULTS: Final = (
     Rule("flips by sample", "noise with a memory counts as many independent samples",
          ((inference, "flip_blocks", _single_rows),)),
     Rule("harm never seen", "no equation is said to get worse",
-         ((gates, "_disturbed_equations", lambda *_: []),
-          (gates, "_disturbed_in_held_out", lambda *_: []))),
+         ((removal, "disturbed_equations", lambda *_: []),
+          (removal, "disturbed_in_held_out", lambda *_: []))),
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
          (setting("held_out_band", 3.0),)),
     Rule("form tolerance x 10", "half of what repeated may stay",

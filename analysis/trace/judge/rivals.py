@@ -1,0 +1,214 @@
+"""Rivals: other effects that could take the place of a named one."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge import removal
+from analysis.trace.judge.curves import noise_covariance
+from analysis.trace.judge.held_out import held_out_residual
+from analysis.trace.judge.readings import loss_in_deviations
+from analysis.trace.result import Rival
+from analysis.trace.search.hypothesis import Hypothesis, Key, of_one_law
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import SEARCH, TRACE
+
+Array = NDArray[np.float64]
+
+
+def rivals_of(
+    hypotheses: HypothesisSet,
+    winner: Hypothesis,
+    used: Used,
+    alternative: Hypothesis,
+    holdout_data: RegressionData,
+    held_out_test: TieTest,
+) -> list[Rival]:
+    """Return the rivals of an effect: fitted sets with another effect in its place.
+
+    Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
+    held-out records have shown that it is too simple; a richer one is a rival where it changes a
+    parameter of another law.
+    """
+    judged_effect, train_data = used.term, hypotheses.train_data
+    others = winner.keys - {(judged_effect.name, judged_effect.where)}
+    training_test = TieTest(
+        train_data,
+        removal.removed_energy(winner, alternative),
+        winner.fit.residual,
+        alternative.fit.residual,
+    )
+    out = []
+    assert isinstance(judged_effect, Effect)
+    for hypothesis, fresh in hypotheses.replacements(winner, used):
+        other = fresh.term
+        assert isinstance(other, Effect)
+        same_law = of_one_law(judged_effect, other)
+        justified = _numbers_justified(winner, hypothesis)
+        alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
+        if (
+            not (justified or alike)
+            or (same_law and hypothesis.size <= winner.size)
+            or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
+            or removal.disturbed_equations(hypotheses, hypothesis, alternative)
+        ):
+            continue
+        rival_residual = held_out_residual(holdout_data, hypothesis.fit)
+        if _is_refused_simpler_name(
+            hypotheses, holdout_data, (judged_effect, other), others, rival_residual
+        ):
+            continue
+        ratio = held_out_test.ratio(rival_residual)
+        tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
+            alike or ratio < TRACE.decisive_ratio
+        )
+        own = judged_effect.family if same_law else ""
+        moved = _moved_parameter(train_data, winner, hypothesis, own) if tied else None
+        # However many numbers it has: a free form has no parameters to compare.
+        free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
+        if (same_law and moved is None) or (not justified and (moved is None or free)):
+            continue
+        out.append(
+            Rival(
+                other.name,
+                place_of(other),
+                ratio,
+                training_test.ratio(hypothesis.fit.residual),
+                tied,
+                other.where,
+                moved,
+            )
+        )
+    out.sort(key=lambda r: (not r.tied, r.ratio))
+    return out[: TRACE.most_rivals]
+
+
+def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
+    """Return whether each further free number of a rival removes `SEARCH.number_price`."""
+    more = rival.size[1] - winner.size[1]
+    return more <= 0 or rival.total <= winner.total - SEARCH.number_price * more
+
+
+def _moved_parameter(
+    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str
+) -> tuple[str, float] | None:
+    """Return the baseline parameter that a rival changes most, and its relative change.
+
+    It changes by at least `TRACE.noted_shift` and lies outside the rival's 95 % interval: the
+    stated intervals would be wrong if the rival were true. None where no parameter does. Those of
+    the baseline's term of the same `law` are left out (viscous friction beside dry `friction`,
+    whose forms differ by a slope too); '' leaves out none.
+    """
+    names, covariance = noise_covariance(train_data, rival.fit)
+    most: tuple[str, float] | None = None
+    rig = train_data.rig
+    others = [term for term in baseline_of(rig) if not law or not term.name.endswith(law)]
+    for c in (c for term in others for c in term.coefficients(rig)):
+        value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
+        if not value or not other or c.parameter not in names:
+            continue
+        k = names.index(c.parameter)
+        std = float(np.sqrt(max(covariance[k, k], 0.0)))
+        change = value / other - 1.0 if c.reciprocal else other / value - 1.0
+        large = abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0)
+        if large and abs(other - value) > TRACE.normal_quantile * std:
+            most = c.parameter, float(change)
+    return most
+
+
+def composites_in_words(
+    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData,
+    held_out_test: TieTest,
+) -> str:  # fmt: skip
+    """Name two effects that together leave as little as one ('' if none do).
+
+    For levels of friction by direction one level and an offset torque differ by the lever arm only.
+    They make no rival, since one effect is the simpler explanation.
+    """
+    for effects in hypotheses.composites(winner, used):
+        both = hypotheses.refined(effects)
+        if hypotheses.physical_problem(both):
+            continue
+        residual = held_out_residual(holdout_data, both.fit)
+        if held_out_test.ties(residual, TRACE.tie_ratio):
+            names = " and ".join(u.term.name for u in effects[-2:])
+            ratio = held_out_test.ratio(residual)
+            return f"; {names} together would leave {ratio:.2f} times the held-out rms"
+    return ""
+
+
+def _is_refused_simpler_name(
+    hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
+    others: frozenset[Key], rival_residual: Array,
+) -> bool:  # fmt: skip
+    """Return whether a rival fits no better than a simpler reading of both, which is too simple.
+
+    `rival_residual` (M,) is that of the held-out rows, `others` the set's other effects.
+    """
+    effect, other = pair
+    for name in set(other.includes) & set(effect.includes) if other.where == effect.where else ():
+        simple = hypotheses.fitted.get(others | {(name, other.where)})
+        if simple is not None:
+            loss = loss_in_deviations(held_out_residual(holdout_data, simple.fit), rival_residual)
+            return loss <= TRACE.standard_errors
+    return False
+
+
+class TieTest:
+    """Comparison of other fits with the best one, in the equations in which an effect acts.
+
+    `left` (M,) is the whitened residual of the best fit, `without` (M,) that without the effect.
+    """
+
+    def __init__(
+        self, data: RegressionData, equations: Collection[str], left: Array, without: Array
+    ) -> None:
+        self.rows = np.zeros(len(left), dtype=bool)
+        for s in data.segments:
+            self.rows[s.where] = s.equation in equations
+        self.left = left[self.rows]
+        self.energy = float(self.left @ self.left)
+        self.taken = float(without[self.rows] @ without[self.rows]) - self.energy
+
+    def ratio(self, other: Array) -> float:
+        """Return the residual rms of another fit (M,) over that of the best."""
+        energy = float(other[self.rows] @ other[self.rows])
+        return float(np.sqrt(energy / self.energy)) if self.energy > 0 else float("nan")
+
+    def ties(self, other: Array, tie: float) -> bool:
+        """Return whether another fit (M,) has less than `tie` times the rms, or loses only noise.
+
+        For an effect that removes less energy than remains, the ratio is of the removed energy.
+        """
+        change = other[self.rows] - self.left
+        lost = float(change @ (other[self.rows] + self.left))
+        share = (tie**2 - 1.0) * min(self.energy, max(self.taken, 0.0))
+        return (
+            lost < share or loss_in_deviations(other[self.rows], self.left) <= TRACE.standard_errors
+        )
+
+
+def rivals_in_words(rivals: Sequence[Rival]) -> str:
+    """Say which rivals fit as well, or else how near the closest comes."""
+    if not rivals:
+        return "no other set fits nearly as well"
+    nearest = rivals[0]
+    words = "cannot be separated from" if nearest.tied else "the closest is"
+    training = nearest.training_ratio
+    in_training = f", {training:.2f} times the training rms" if np.isfinite(training) else ""
+    return (
+        f"{words} {nearest.name} at {nearest.location}: {nearest.ratio:.2f} times the held-out rms"
+        f"{in_training}"
+    )
+
+
+def place_of(effect: Effect) -> str:
+    """Return an effect's place in words."""
+    return str(getattr(effect, "place", effect.where))
