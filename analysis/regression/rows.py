@@ -93,14 +93,14 @@ def in_common(one: Rows, other: Rows) -> tuple[Indices | slice, Indices | slice]
 
 def default_filtering(record: Record) -> Filtering:
     """Return the default filters, adapted to the record's excitation."""
-    rate = record.sample_rate
-    cutoff = (
-        REGRESSION.row_cutoff_electric
-        if ch.channel(ch.POSITION, 1) in record.channels
-        else REGRESSION.row_cutoff
-    )
+    rate, cutoff = record.sample_rate, REGRESSION.row_cutoff
     if record.period and record.lines:
         cutoff = lines_cutoff(record)
+    elif ch.channel(ch.POSITION, 1) in record.channels:
+        cutoff = REGRESSION.row_cutoff_electric
+    elif record.bandwidth is not None:
+        wanted = REGRESSION.lines_factor * record.bandwidth
+        cutoff = float(np.clip(wanted, REGRESSION.row_cutoff_range[0], cutoff))
     return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
 
 

@@ -10,8 +10,9 @@ from typing import Final
 class RegressionSettings:
     """Row filter, memory of a reduction, rank rules and limits of the iterative solvers."""
 
-    # Row filter [Hz]: its cutoff where a record names no excited lines, the range it stays within,
-    # and its ratio to the highest excited line otherwise; noise grows with its 5th power.
+    # Row filter [Hz]: its cutoff where neither excited lines nor the motion's bandwidth are known,
+    # the range it stays within, and its ratio to the highest excited line or the bandwidth
+    # otherwise; noise grows with its 5th power. A bandwidth can only narrow the filter.
     row_cutoff: float = 15.0
     row_cutoff_range: tuple[float, float] = (8.0, 30.0)
     lines_factor: float = 1.5

@@ -13,6 +13,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
+BANDWIDTH: Final = "bandwidth"  # attribute of a record: below it is the motion [Hz]
 LOADED: Final = "loaded"  # attribute of a record: 1 with a load on the last link, 0 without
 
 
@@ -46,6 +47,11 @@ class Record:
     def loaded(self) -> bool | None:
         """Whether the last link carries a load that it has not in other records; None: unknown."""
         return stated_load(self.attributes)
+
+    @property
+    def bandwidth(self) -> float | None:
+        """Frequency [Hz] below which the joints' motion is; None: not known."""
+        return float(self.attributes[BANDWIDTH]) if BANDWIDTH in self.attributes else None
 
     @property
     def samples(self) -> int:

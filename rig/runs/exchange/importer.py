@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.model.parse import InputError
+from rig.model.records import BANDWIDTH
 from rig.model.rig import Rig
 from rig.runs import archive, store
+from rig.runs.exchange.bandwidth import motion_bandwidth
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.dead_sensors import silent_sensors
 from rig.runs.exchange.manifest import (
@@ -78,7 +80,7 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
     except InputError as error:
         raise InputError(f"{path}:{lines.get(('rig',), 1)}: rig: {error}") from error
     source = _Source(path, manifest, rig, check_against_rig(manifest, lines, path, rig))
-    records = [_read(source, entry) for entry in manifest.records]
+    records = _with_bandwidths(rig, [_read(source, entry) for entry in manifest.records])
     warnings = _warnings(source, records)
     _write(source, records, folder, warnings)
     samples = sum(len(next(iter(r.channels.values()))) for r in records)
@@ -108,6 +110,26 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     part = _part(entry, file, rate, first, last)
     channels = {n: by_channel[n][part] for n in every if n in by_channel}
     return _Imported(entry, rate, start + part.start / rate, channels)
+
+
+def _with_bandwidths(rig: Rig, records: list[_Imported]) -> list[_Imported]:
+    """Return records with the bandwidth of each step's motion, where its lines are not stated.
+
+    It is the largest of the step's repeats: all must pass the same filters.
+    """
+    measured: dict[str, float] = {}
+    for r in records:
+        entry = r.entry
+        if not entry.lines and entry.bandwidth is None:
+            width = motion_bandwidth(rig, entry.locked, r.channels, r.sample_rate)
+            if width is not None:
+                measured[entry.step] = max(width, measured.get(entry.step, 0.0))
+    out = []
+    for r in records:
+        stated = r.entry.lines or r.entry.bandwidth is not None
+        more = {} if stated or r.entry.step not in measured else {BANDWIDTH: measured[r.entry.step]}
+        out.append(replace(r, entry=r.entry.model_copy(update=more)))
+    return out
 
 
 def _common(

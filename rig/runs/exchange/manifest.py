@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rig.model import channels as ch
 from rig.model.parse import InputError, load_yaml, validate_model
 from rig.model.quantity import Frequency, Time, UnitError, unit_map
-from rig.model.records import LOADED
+from rig.model.records import BANDWIDTH, LOADED
 from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.recorder import RecordMeta
@@ -47,7 +47,8 @@ class ManifestRecord(_Part):
     """One record: a file, or its part from `begin` to `end`.
 
     `period` [samples] and `lines` describe a periodic excitation. `loaded` says whether the last
-    link carries a load (of any unknown mass) that it has not in other records.
+    link carries a load (of any unknown mass) that it has not in other records. `bandwidth` [Hz] is
+    that of the motion; it is measured where neither it nor `lines` are stated.
     """
 
     file: str = Field(min_length=1)
@@ -57,6 +58,7 @@ class ManifestRecord(_Part):
     name: str = ""
     period: int = Field(default=0, ge=0)
     lines: tuple[int, ...] = ()
+    bandwidth: Frequency | None = Field(default=None, gt=0, description="of the motion [Hz]")
     loaded: bool | None = None
     begin: Time = Field(default=0.0, ge=0, description="first sample, from the file's start [s]")
     end: Time | None = Field(default=None, gt=0, description="last sample is before this [s]")
@@ -72,10 +74,14 @@ class ManifestRecord(_Part):
 
     def meta(self) -> RecordMeta:
         """Return the description of the record."""
+        stated: dict[str, str | float | int] = {}
+        if self.loaded is not None:
+            stated[LOADED] = int(self.loaded)
+        if self.bandwidth is not None:
+            stated[BANDWIDTH] = self.bandwidth
         return RecordMeta(
-            self.step, self.repeat, self.locked, self.period, self.lines, self.name,
-            {} if self.loaded is None else {LOADED: int(self.loaded)},
-        )  # fmt: skip
+            self.step, self.repeat, self.locked, self.period, self.lines, self.name, stated
+        )
 
 
 class Manifest(_Part):

@@ -19,6 +19,12 @@ class ExchangeSettings:
     uneven: float = 0.1  # of the mean step: allowed deviation of rounded time stamps
     trip_seconds: float = 2.0  # [s] before the offending sample, and after it
 
+    # Bandwidth of the motion in records without excited lines: the share of the velocity's power
+    # below it, the highest frequency looked at [Hz], and the shortest record [s] that states one.
+    velocity_share: float = 0.99
+    highest: float = 30.0
+    bandwidth_seconds: float = 6.0
+
     # Clipped and constant sensors.
     levels: int = 500  # of resolution within the range; a coarser channel has flat tops anyway
     near: float = 0.02  # of the channel's range, counted from its extreme

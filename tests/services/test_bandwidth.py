@@ -1,0 +1,86 @@
+"""Records of other systems: the bandwidth of their motion narrows the filter of their rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.regression.rows import default_filtering
+from analysis.regression.settings import REGRESSION
+from rig.model.records import Record
+from rig.model.rig import Rig
+from rig.runs.exchange.bandwidth import motion_bandwidth
+from rig.runs.exchange.importer import import_records
+from rig.runs.rigs import load_rig
+from rig.runs.store import load_run
+
+RATE = 500.0
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("shinshu-2dof")
+
+
+def moved(rig: Rig, *tones: float, seconds: float = 10.0, seed: int = 1) -> dict[str, np.ndarray]:
+    """Return every channel of a rig whose first joint moves at some frequencies [Hz]."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    rng = np.random.default_rng(seed)
+    channels = {name: np.full(len(t), 1.0) for name in rig.channels}
+    s = sum(1e-2 / (1 + f) * np.sin(2 * np.pi * f * t + f + seed) for f in tones)
+    noise = rig.sensors.piston.noise * rng.standard_normal(len(t))
+    return {**channels, "piston_1": s + noise, "piston_2": np.zeros(len(t))}
+
+
+def imported(folder: Path, rig: Rig, record: str, *repeats: dict[str, np.ndarray]) -> list[Record]:
+    """Return records after an import, `record` being further keys of each in the manifest."""
+    lines = ["rig: shinshu-2dof", f"sample_rate: {RATE} Hz", "records:"]
+    for k, channels in enumerate(repeats, start=1):
+        table = np.column_stack([channels[name] for name in rig.channels])
+        np.savetxt(
+            folder / f"{k}.csv", table, "%.9g", ",", header=",".join(rig.channels), comments=""
+        )
+        lines.append(f"  - {{file: {k}.csv, step: a, locked: [2], repeat: {k}{record}}}")
+    manifest = folder / "manifest.yaml"
+    manifest.write_text("\n".join(lines))
+    import_records(manifest, folder / "run")
+    return list(load_run(folder / "run").records)
+
+
+def cutoff_of(record: Record) -> float:
+    """Return the frequency [Hz] at which the filter of a record's rows passes half."""
+    rows = default_filtering(record).rows
+    assert rows is not None
+    response = np.abs(np.fft.rfft(rows.taps[0], 1 << 16))
+    return float(np.fft.rfftfreq(1 << 16, 1 / RATE)[np.argmax(response < 0.5)])
+
+
+def test_slow_motion_has_a_narrow_filter_alike_in_all_repeats(rig: Rig, tmp_path: Path) -> None:
+    """A machine that moves below 1.3 Hz, in the second repeat up to 4 Hz."""
+    records = imported(tmp_path, rig, "", moved(rig, 0.3, 1.3), moved(rig, 0.3, 1.3, 4.0, seed=2))
+    assert [r.bandwidth for r in records] == pytest.approx([4.0, 4.0], abs=0.2)
+    low, wide = REGRESSION.row_cutoff_range[0], REGRESSION.row_cutoff
+    half = [cutoff_of(r) for r in records]
+    assert half == pytest.approx([1.3 * low] * 2, rel=0.05)  # halfway to where it is closed
+    bare = Record("a", "a", (2,), 1, RATE, records[0].channels)
+    assert cutoff_of(bare) == pytest.approx(1.3 * wide, rel=0.05)
+
+
+def test_the_bandwidth_that_a_manifest_states_holds(rig: Rig, tmp_path: Path) -> None:
+    (record,) = imported(tmp_path, rig, ", bandwidth: 8 Hz", moved(rig, 0.3, 1.3))
+    assert record.bandwidth == 8.0
+    assert cutoff_of(record) == pytest.approx(1.3 * 12.0, rel=0.05)
+
+
+def test_known_lines_need_no_bandwidth(rig: Rig, tmp_path: Path) -> None:
+    (record,) = imported(tmp_path, rig, ", period: 5000, lines: [3, 13]", moved(rig, 0.3, 1.3))
+    assert record.bandwidth is None
+
+
+def test_what_has_no_bandwidth(rig: Rig) -> None:
+    """No joint that moves, and records too short to lose rows to a narrow filter."""
+    assert motion_bandwidth(rig, (1, 2), moved(rig, 1.0), RATE) is None
+    assert motion_bandwidth(rig, (2,), moved(rig, 1.0, seconds=5.0), RATE) is None
+    assert motion_bandwidth(rig, (2,), moved(rig, 1.0), RATE) == pytest.approx(1.0, abs=0.2)
