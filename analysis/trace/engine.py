@@ -25,6 +25,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
@@ -118,12 +119,14 @@ def trace(
     options = _Options(
         catalogue(rig) if effects is None else effects, known, seed, look_ahead, free_forms
     )
-    stated = iter(with_loads_stated([*runs, *holdout, *judge]))
+    apart, notes = with_other_motions_apart(with_loads_stated([*runs, *holdout, *judge]))
+    stated = iter(apart)
     train, unseen, judging = (tuple(next(stated) for _ in x) for x in (runs, holdout, judge))
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(train, unseen, judging, tuple(families))
     result = _of_rig(rig, _traced(with_b, records, options, progress or _no_progress))
+    result = replace(result, notes=(*notes, *result.notes))
     load = None
     if result.verdict == UNEXPLAINED and MECHANICAL in families and options.may_be_load:
         load = undeclared_load(with_b, known, train, unseen, judging)
@@ -133,7 +136,7 @@ def trace(
     again = _of_rig(rig, _traced(with_b, records, options, _no_progress))
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
         seconds = time.perf_counter() - started
-        return replace(again, notes=(load.words, *again.notes), seconds=seconds)
+        return replace(again, notes=(*notes, load.words, *again.notes), seconds=seconds)
     return replace(result, notes=(*result.notes, load.words)) if load.shows_inertia else result
 
 

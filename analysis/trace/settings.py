@@ -152,6 +152,13 @@ class DataSettings:
     judging_block: float = 1.0
     """[s] Length of a block of a held-out record, of which the second of every three only judges
     (arithmetic: ten times the row filter's memory, and a short record still has several)."""
+    other_motion: float = 0.2
+    """Difference of a joint's position between repeats over its standard deviation, from which they
+    are no repeats of one motion (recordings that start 0.4 s apart made clean benches
+    `unexplained` on a plant written apart from the study's)."""
+    seen_motion: float = 20.0
+    """Least standard deviation of a position over its sensor's noise, to be compared between
+    repeats (arithmetic)."""
     least_noise: float = 0.2
     """Smallest noise floor over the noise that the rig file states; a floor measured lower is set
     to it (tuned)."""

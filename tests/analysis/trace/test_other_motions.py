@@ -1,0 +1,48 @@
+"""Records that are called repeats, but did not start with the excitation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from analysis.trace import engine
+from analysis.trace.data.repeats import with_other_motions_apart
+from rig.model.records import Run
+from rig.model.rig import Rig
+from tests.analysis.trace.gate_cases import at_joint_2
+from tests.analysis.trace.hidden import pair_of_runs
+
+
+def started_late(run: Run, repeat: int, seconds: float) -> Run:
+    """Return a run of a periodic excitation, one repeat recorded from later on."""
+    records = []
+    for record in run.records:
+        if record.repeat == repeat:
+            by = -round(seconds * record.sample_rate)
+            channels = {name: np.roll(x, by) for name, x in record.channels.items()}
+            records.append(replace(record, channels=channels))
+        else:
+            records.append(record)
+    return replace(run, records=tuple(records))
+
+
+def test_a_repeat_of_another_motion_is_a_step_of_its_own(rig: Rig) -> None:
+    train, _ = pair_of_runs(rig)
+    (alike,), nothing = with_other_motions_apart([train])
+    assert ([r.step for r in alike.records], nothing) == (["step1"] * 4, ())
+    (apart,), notes = with_other_motions_apart([started_late(train, 3, 0.4)])
+    assert [r.step for r in apart.records] == ["step1", "step1", "step1 repeat 3", "step1"]
+    (note,) = notes
+    assert note.startswith("step 'step1': repeat 3 differs from the first by ")
+
+
+def test_a_clean_bench_stays_clean(rig: Rig) -> None:
+    """Averaged with the other repeat, it left several times the noise."""
+    train, held_out = pair_of_runs(rig)
+    candidates = at_joint_2(rig, "internal_leakage", "coulomb_friction")
+    found = engine.trace(
+        [train], [started_late(held_out, 2, 0.4)], candidates, look_ahead=False, free_forms=False
+    )
+    assert (found.verdict, found.effects) == ("clean", ())
+    assert found.notes[0].startswith("step 'step1': repeat 2 differs from the first by ")
