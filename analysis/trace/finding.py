@@ -34,6 +34,7 @@ from analysis.trace.result import (
     UNEXPLAINED,
     JudgedEffect,
 )
+from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.hypothesis import Hypothesis, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
@@ -195,7 +196,7 @@ def search_and_judge(
     in_noise = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    winner = hypotheses.run(done)
+    winner = improved_by_exact_trials(hypotheses, hypotheses.run(done))
     found = judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
     named = any(map(gates.passes_gates, found.effects))
     notes = remainder_notes(found.verdict, found.remainders, in_noise, named)

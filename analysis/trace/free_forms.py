@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Sequence
 
 import numpy as np
 
 from analysis.effects.base import Effect
+from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import gates
 from analysis.trace.judge.curves import rows_within_curves
 from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.remaining import remainders
 from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
+from analysis.trace.search.confounders import act_at_one_joint
 from analysis.trace.search.hypothesis import Hypothesis, law_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
@@ -96,14 +99,27 @@ def _simplest_first(sets: Sequence[Hypothesis]) -> list[Hypothesis]:
 def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
     """Return the set with one more effect for the equations that keep too much, if there is one.
 
-    Where all keep no more than form error, an effect must leave only noise.
+    Where all keep no more than form error, an effect must leave only noise. Two curves in one
+    balance are no explanation: together they follow whatever is in it.
     """
     above_form_error = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
+    larger: Hypothesis | None = None
     if not above_form_error:
-        return wide.completed_to_noise(hypothesis)
-    if len(hypothesis.effects) >= SEARCH.largest_set:
-        return hypothesis
-    return wide.extended_in(hypothesis, above_form_error) or hypothesis
+        larger = wide.completed_to_noise(hypothesis)
+    elif len(hypothesis.effects) < SEARCH.largest_set:
+        larger = wide.extended_in(hypothesis, above_form_error)
+    return hypothesis if larger is None or _curves_share_a_balance(wide, larger) else larger
+
+
+def _curves_share_a_balance(wide: HypothesisSet, hypothesis: Hypothesis) -> bool:
+    """Return whether two free forms of a set act in the same family of rows of one joint."""
+    terms = [u.term for u in hypothesis.effects]
+    curves = [t for t in terms if isinstance(t, Effect) and t.free]
+    rig = wide.train_data.rig
+    return any(
+        act_at_one_joint(a, b) and bool(families_of(rig, a) & families_of(rig, b))
+        for a, b in itertools.combinations(curves, 2)
+    )
 
 
 def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:

@@ -244,6 +244,8 @@ class SearchSettings:
     form_share: float = 0.02
     """Share of an equation's energy above noise under the baseline, by which the catalogue's form
     of an effect may differ from the real one (tuned)."""
+    exact_trials: int = 3
+    """Number of candidates that are refined of those tried by exact columns (tuned)."""
     negative_share: float = 0.1
     """Least size of a negative inertia or weight over its value in the baseline's fit, to be
     impossible (a spring for an inclination of 0.3 rad made a weight of 206 kg m one of -243, on a

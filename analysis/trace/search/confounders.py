@@ -24,8 +24,12 @@ def is_confusable(effect: Effect, used: Used) -> bool:
 
 def is_confounder(effect: Effect, own: Effect) -> bool:
     """Return whether an effect is a confounder of another one, at its joint or of the bench."""
-    joints = {_joint(effect), _joint(own)} - {BENCH}
-    return effect.name in own.confounders and len(joints) <= 1
+    return effect.name in own.confounders and act_at_one_joint(effect, own)
+
+
+def act_at_one_joint(effect: Effect, other: Effect) -> bool:
+    """Return whether two effects are at the same joint, or one of them is of the bench."""
+    return len({_joint(effect), _joint(other)} - {BENCH}) <= 1
 
 
 def _joint(effect: Effect) -> str:

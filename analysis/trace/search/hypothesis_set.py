@@ -76,14 +76,14 @@ class HypothesisSet:
         wide = copy.copy(self)
         wide.effects = tuple(effects)
         more = variant_columns(
-            self.train_data, wide._variants(self.train_data, self.train_data.mean_residual)
+            self.train_data, wide.variants_of(self.train_data, self.train_data.mean_residual)
         )
         wide.columns = [*self.columns, *more]
         wide.candidates = self._candidate_columns(self.train_data, wide.columns)
         wide.effects = (*self.effects, *effects)
         return wide
 
-    def _variants(self, data: RegressionData, residual: Array) -> list[Variant]:
+    def variants_of(self, data: RegressionData, residual: Array) -> list[Variant]:
         """Return the candidates at every point of their shape grids.
 
         `residual` (M,) of the data places the points of effects whose grid depends on the data.
@@ -205,7 +205,7 @@ class HypothesisSet:
         """
         self.columns = variant_columns(
             self.train_data,
-            self._variants(self.train_data, self.train_data.mean_residual),
+            self.variants_of(self.train_data, self.train_data.mean_residual),
             progress,
         )
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
@@ -325,7 +325,7 @@ class HypothesisSet:
         data, taken, laws = rebased(self.train_data, now.fit), now.keys, now.laws
         tried = [
             v
-            for v in self._variants(data, now.fit.residual)
+            for v in self.variants_of(data, now.fit.residual)
             if v.key not in taken and (law_of(v.used) not in laws if v.effect.free else not free)
             and self._may_act(v, now, equations)
         ]  # fmt: skip

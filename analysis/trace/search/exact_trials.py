@@ -1,0 +1,56 @@
+"""Sets found by exact columns, where the search by first-order columns leaves too much.
+
+A sensor's cross-talk of a quarter or a pressure in the return line of a fifth of the supply's is
+far from the sizes for which first-order columns hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from analysis.terms.base import Used
+from analysis.trace.search.hypothesis import Hypothesis, Key
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.refinement import fit_coefficients
+from analysis.trace.settings import SEARCH
+
+
+def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypothesis:
+    """Return the set, or a better one with an effect added or exchanged, of all candidates.
+
+    It is asked while the set leaves more than the tolerance for its forms.
+    """
+    while not hypotheses.within_form_tolerance(now):
+        tried = [hypotheses.refined(effects) for effects in _best_trials(hypotheses, now)]
+        better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([now, *tried])))
+        if hypotheses.log_energy_ratio(now, better) < SEARCH.least_log_gain:
+            break
+        now = better
+    return now
+
+
+def _best_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Iterator[tuple[Used, ...]]:
+    """Yield the sets of the best candidates, added to the set or in place of one of its effects."""
+    starts: list[tuple[Used, ...]] = [
+        tuple(u for u in now.effects if u is not used) for used in now.effects
+    ]
+    if len(now.effects) < SEARCH.largest_set:
+        starts.append(now.effects)
+    for start in starts:
+        yield from _best_additions(hypotheses, now, start)
+
+
+def _best_additions(
+    hypotheses: HypothesisSet, now: Hypothesis, start: Sequence[Used]
+) -> list[tuple[Used, ...]]:
+    """Return the sets with one more effect that leave least at a point of its shape grid."""
+    data = hypotheses.train_data
+    least: dict[Key, tuple[float, tuple[Used, ...]]] = {}
+    for variant in hypotheses.variants_of(data, now.fit.residual):
+        if variant.key not in now.keys and not variant.effect.free:
+            effects = (*start, variant.used)
+            energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
+            if energy < least.get(variant.key, (float("inf"), ()))[0]:
+                least[variant.key] = energy, effects
+    best = sorted(least.values(), key=lambda trial: trial[0])[: SEARCH.exact_trials]
+    return [effects for _, effects in best]
