@@ -344,13 +344,34 @@ def _passing_set(
     refused: tuple[JudgedEffect, ...] = ()
     while winner.effects:
         effects = gates.judge_effects(hypotheses, winner, holdout_data, rng)
-        failed = tuple(f for f in effects if not gates.passes_gates(f))
+        judged = dict(zip(winner.effects, effects, strict=True))
+        failed = [used for used, f in judged.items() if not gates.passes_gates(f)]
         if not failed:
             return effects, refused, winner
-        refused += failed
-        kept = [u for u, f in zip(winner.effects, effects, strict=True) if gates.passes_gates(f)]
+        dropped = _least_needed(hypotheses, winner, failed)
+        refused += tuple(judged[used] for used in dropped)
+        kept = [used for used in winner.effects if used not in dropped]
         winner = hypotheses.refined(kept) if kept else hypotheses.empty
     return (), refused, winner
+
+
+def _least_needed(
+    hypotheses: HypothesisSet, winner: Hypothesis, failed: Sequence[Used]
+) -> list[Used]:
+    """Return the failed effects to leave out: of those of one family at one place, one.
+
+    Each of two frictions of a joint removes little beside the other, and one of them is needed. The
+    one without which least is left goes first.
+    """
+
+    def left_without(used: Used) -> float:
+        return hypotheses.refined([u for u in winner.effects if u is not used]).total
+
+    least: dict[tuple[str, str], Used] = {}
+    for used in sorted(failed, key=left_without, reverse=True):
+        assert isinstance(used.term, Effect)
+        least[used.term.family, used.term.where] = used
+    return [used for used in failed if used in least.values()]
 
 
 def _extended_set(

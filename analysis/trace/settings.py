@@ -244,6 +244,9 @@ class SearchSettings:
     form_share: float = 0.02
     """Share of an equation's energy above noise under the baseline, by which the catalogue's form
     of an effect may differ from the real one (tuned)."""
+    exact_from: float = 10.0
+    """Energy that an equation keeps over the noise's band, from which a set within the tolerance
+    for its forms is compared with all others by exact columns (tuned)."""
     exact_trials: int = 3
     """Number of candidates that are refined of those tried by exact columns (tuned)."""
     negative_share: float = 0.1

@@ -18,15 +18,24 @@ from analysis.trace.settings import SEARCH
 def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypothesis:
     """Return the set, or a better one with an effect added or exchanged, of all candidates.
 
-    It is asked while the set leaves more than the tolerance for its forms.
+    It is asked while the set leaves more than the tolerance for its forms, or far more than noise.
+    A set within that tolerance is left only for one that leaves a tenth.
     """
-    while not hypotheses.within_form_tolerance(now):
+    while not hypotheses.within_form_tolerance(now) or _leaves_far_more(hypotheses, now):
         tried = [hypotheses.refined(effects) for effects in _best_trials(hypotheses, now)]
         better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([now, *tried])))
-        if hypotheses.log_energy_ratio(now, better) < SEARCH.least_log_gain:
+        tolerated = hypotheses.within_form_tolerance(now)
+        least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
+        if hypotheses.log_energy_ratio(now, better) < least:
             break
         now = better
     return now
+
+
+def _leaves_far_more(hypotheses: HypothesisSet, now: Hypothesis) -> bool:
+    """Return whether an equation keeps `SEARCH.exact_from` times the noise's band."""
+    band = hypotheses.noise_band.by_equation
+    return any(v > SEARCH.exact_from * band[e] for e, v in now.excess_energy.items())
 
 
 def _best_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Iterator[tuple[Used, ...]]:

@@ -364,6 +364,13 @@ def a_spring_that_fits_like_an_inclination_is_its_rival(b: Benches) -> None:
     assert any(said in note for note in result.notes)
 
 
+def a_high_return_pressure_is_found_beside_an_underlap(b: Benches) -> None:
+    """A fifth of the supply's: far from the sizes for which first-order columns are made."""
+    runs = b.runs(w_underlap=0.01, p_tank=1.6e6)
+    result = b.traced(runs, "underlap_leakage", "tank_pressure", "internal_leakage")
+    assert {f.name for f in result.effects} == {"underlap_leakage", "tank_pressure"}
+
+
 def wrong_volumes_at_one_joint_name_nothing_at_the_other(b: Benches) -> None:
     """Volumes in the rig file that one bulk modulus cannot make up for bend it for both joints."""
     for joint, cap, rod in ((1, 0.2, 3.0), (2, 0.2, 0.2)):
@@ -420,6 +427,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (a_quiet_friction_is_named_beside_a_loud_leak, ("further search",)),
     (twice_the_noise_on_the_held_out_day_is_not_clean, ("held-out band", "held-out floor x 2")),
     (what_the_judging_rows_alone_show_is_not_explained, ("judging rows unread",)),
+    (a_high_return_pressure_is_found_beside_an_underlap, ("exact columns",)),
     (wrong_volumes_at_one_joint_name_nothing_at_the_other, ("unknown cause",)),
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),

@@ -152,6 +152,8 @@ RULES: Final = (
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
     Rule("two for one", "no effect is exchanged for two that leave less",
          ((HypothesisSet, "composites", lambda *_: []),)),
+    Rule("exact columns", "first-order columns alone find the effects",
+         ((finding, "improved_by_exact_trials", lambda _sets, now: now),)),
     Rule("unknown cause", "names beside an unknown cause need no more than other names do",
          ((finding, "judged_beside_unknown_cause", lambda _sets, _set, effects, _left: effects),)),
     Rule("simpler name", "an effect that equals a simpler one is refused, and that one not tried",
