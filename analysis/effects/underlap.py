@@ -72,11 +72,11 @@ class UnderlapLeakage(ValveEffect):
         return f"w_underlap_{joint}", f"rounding_{joint}", f"corner_{joint}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the underlap [V], up to a tenth of the spool's stroke, and the edges' form."""
+        """Return the underlap [V], up to half of the stroke, and the edges' form."""
         stroke = rig.joints[self.joint].valve.spool_stroke
-        grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke)
+        grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke, 0.1 * stroke)
         own, r, c = self.shape_names()
-        return Shape(own, "V", 0.0, 0.1 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
+        return Shape(own, "V", 0.0, 0.5 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Return the signals unchanged."""

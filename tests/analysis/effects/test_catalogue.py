@@ -358,7 +358,7 @@ REFUSED = [
     ("torque_offset", "joint 2", {"T_offset_2": 1e4}, ()),
     ("valve_deadband", "joint 1", {}, (0.56, 0.56, 1e-3)),
     ("spool_offset", "joint 1", {}, (0.14,)),
-    ("underlap_leakage", "joint 1", {}, (0.14, 1e-3)),
+    ("underlap_leakage", "joint 1", {}, (0.7, 1e-3)),
     ("spool_lag", "joint 1", {}, (0.1,)),
     ("internal_leakage", "joint 1", {"c_internal_1": -2e-12}, ()),
     ("external_leakage", "joint 1 rod", {"c_external_1_rod": 1e-9}, ()),
