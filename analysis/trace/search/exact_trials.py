@@ -6,7 +6,7 @@ far from the sizes for which first-order columns hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from analysis.terms.base import Used
 from analysis.trace.search.hypothesis import Hypothesis, Key
@@ -21,8 +21,8 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
     It is asked while the set leaves more than the tolerance for its forms, or far more than noise.
     A set within that tolerance is left only for one that leaves a tenth.
     """
-    while not hypotheses.within_form_tolerance(now) or _leaves_far_more(hypotheses, now):
-        tried = [hypotheses.refined(effects) for effects in _best_trials(hypotheses, now)]
+    while above := _equations_above(hypotheses, now):
+        tried = [hypotheses.refined(effects) for effects in _best_trials(hypotheses, now, above)]
         better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([now, *tried])))
         tolerated = hypotheses.within_form_tolerance(now)
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
@@ -32,31 +32,41 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
     return now
 
 
-def _leaves_far_more(hypotheses: HypothesisSet, now: Hypothesis) -> bool:
-    """Return whether an equation keeps `SEARCH.exact_from` times the noise's band."""
+def _equations_above(hypotheses: HypothesisSet, now: Hypothesis) -> set[str]:
+    """Return the equations above the tolerance, or `SEARCH.exact_from` times the noise's band."""
     band = hypotheses.noise_band.by_equation
-    return any(v > SEARCH.exact_from * band[e] for e, v in now.excess_energy.items())
+    return {
+        e
+        for e, v in now.excess_energy.items()
+        if not hypotheses.negligible(e, v) or v > SEARCH.exact_from * band[e]
+    }
 
 
-def _best_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Iterator[tuple[Used, ...]]:
-    """Yield the sets of the best candidates, added to the set or in place of one of its effects."""
+def _best_trials(
+    hypotheses: HypothesisSet, now: Hypothesis, equations: Collection[str]
+) -> Iterator[tuple[Used, ...]]:
+    """Yield the sets of the best candidates, added to the set or in place of one of its effects.
+
+    A candidate must act in one of the `equations`.
+    """
     starts: list[tuple[Used, ...]] = [
         tuple(u for u in now.effects if u is not used) for used in now.effects
     ]
     if len(now.effects) < SEARCH.largest_set:
         starts.append(now.effects)
     for start in starts:
-        yield from _best_additions(hypotheses, now, start)
+        yield from _best_additions(hypotheses, now, start, equations)
 
 
 def _best_additions(
-    hypotheses: HypothesisSet, now: Hypothesis, start: Sequence[Used]
+    hypotheses: HypothesisSet, now: Hypothesis, start: Sequence[Used], equations: Collection[str]
 ) -> list[tuple[Used, ...]]:
     """Return the sets with one more effect that leave least at a point of its shape grid."""
     data = hypotheses.train_data
     least: dict[Key, tuple[float, tuple[Used, ...]]] = {}
     for variant in hypotheses.variants_of(data, now.fit.residual):
-        if variant.key not in now.keys and not variant.effect.free:
+        fresh = variant.key not in now.keys and not variant.effect.free
+        if fresh and hypotheses.may_act(variant, now, equations):
             effects = (*start, variant.used)
             energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
             if energy < least.get(variant.key, (float("inf"), ()))[0]:

@@ -327,7 +327,7 @@ class HypothesisSet:
             v
             for v in self.variants_of(data, now.fit.residual)
             if v.key not in taken and (law_of(v.used) not in laws if v.effect.free else not free)
-            and self._may_act(v, now, equations)
+            and self.may_act(v, now, equations)
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
         mask = np.ones(len(now.fit.residual))
@@ -348,7 +348,7 @@ class HypothesisSet:
                 out.setdefault(variant.key, (*now.effects, variant.used))
         return [self.refined(effects) for effects in out.values()]
 
-    def _may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
+    def may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
         """Return whether a candidate may have columns in some of the equations (any if none).
 
         It has them where it has under the baseline. Only an effect of the bench couples the joints'
