@@ -27,7 +27,7 @@ from analysis.regression.rows import (
     without_sines,
 )
 from analysis.terms.base import FAMILIES, Used, family_of
-from rig.model.records import Record, RecordHead, Run
+from rig.model.records import Record, RecordHead, Run, with_common_bandwidth
 from rig.model.rig import Rig
 
 
@@ -66,7 +66,7 @@ def build_rows(
     """
     ck.refuse_constant_records(rig, runs)
     out: list[RecordRows] = []
-    for number, run in enumerate(runs):
+    for number, run in enumerate(with_common_bandwidth(runs)):
         for conditioned in condition_runs(rig, [run], filtering):
             rows = record_rows(rig, terms, conditioned.signals, conditioned.filtering)
             out.append(RecordRows(replace(conditioned, run=number), rows))

@@ -69,7 +69,7 @@ from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError
-from rig.model.records import Record, Run, with_loads_stated
+from rig.model.records import Record, Run, with_common_bandwidth, with_loads_stated
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -119,7 +119,9 @@ def trace(
     options = _Options(
         catalogue(rig) if effects is None else effects, known, seed, look_ahead, free_forms
     )
-    apart, notes = with_other_motions_apart(with_loads_stated([*runs, *holdout, *judge]))
+    apart, notes = with_other_motions_apart(
+        with_common_bandwidth(with_loads_stated([*runs, *holdout, *judge]))
+    )
     stated = iter(apart)
     train, unseen, judging = (tuple(next(stated) for _ in x) for x in (runs, holdout, judge))
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)

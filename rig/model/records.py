@@ -107,6 +107,28 @@ class Run:
     state: str = "done"
 
 
+def with_common_bandwidth(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return runs whose records state the largest bandwidth of all, or none where one lacks it.
+
+    Records with excited lines state none and do not count. Rows that are fitted together must have
+    passed alike filters: what a model misses would else weigh more in the wider ones.
+    """
+    widths = [r.bandwidth for run in runs for r in run.records if not r.lines]
+    known = [w for w in widths if w is not None]
+    if not known:
+        return tuple(runs)
+    common = {BANDWIDTH: max(known)} if len(known) == len(widths) else {}
+    out = []
+    for run in runs:
+        bare = [{k: v for k, v in r.attributes.items() if k != BANDWIDTH} for r in run.records]
+        records = (
+            r if r.lines else replace(r, attributes={**attributes, **common})
+            for r, attributes in zip(run.records, bare, strict=True)
+        )
+        out.append(replace(run, records=tuple(records)))
+    return tuple(out)
+
+
 def with_loads_stated(runs: Sequence[Run]) -> tuple[Run, ...]:
     """Return runs whose records all state their load, where one of them does: the others have none.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from analysis.regression.rows import default_filtering
 from analysis.regression.settings import REGRESSION
-from rig.model.records import Record
+from rig.model.records import Record, Run, with_common_bandwidth
 from rig.model.rig import Rig
 from rig.runs.exchange.bandwidth import motion_bandwidth
 from rig.runs.exchange.importer import import_records
@@ -57,7 +58,7 @@ def cutoff_of(record: Record) -> float:
     return float(np.fft.rfftfreq(1 << 16, 1 / RATE)[np.argmax(response < 0.5)])
 
 
-def test_slow_motion_has_a_narrow_filter_alike_in_all_repeats(rig: Rig, tmp_path: Path) -> None:
+def test_slow_motion_has_a_narrow_filter_alike_in_all_records(rig: Rig, tmp_path: Path) -> None:
     """A machine that moves below 1.3 Hz, in the second repeat up to 4 Hz."""
     records = imported(tmp_path, rig, "", moved(rig, 0.3, 1.3), moved(rig, 0.3, 1.3, 4.0, seed=2))
     assert [r.bandwidth for r in records] == pytest.approx([4.0, 4.0], abs=0.2)
@@ -77,6 +78,21 @@ def test_the_bandwidth_that_a_manifest_states_holds(rig: Rig, tmp_path: Path) ->
 def test_known_lines_need_no_bandwidth(rig: Rig, tmp_path: Path) -> None:
     (record,) = imported(tmp_path, rig, ", period: 5000, lines: [3, 13]", moved(rig, 0.3, 1.3))
     assert record.bandwidth is None
+
+
+def test_records_that_are_analysed_together_pass_alike_filters(rig: Rig, tmp_path: Path) -> None:
+    """A slow and a quick run; with a record that states nothing, none is narrowed."""
+    runs = []
+    for name, tone in (("slow", 1.3), ("quick", 7.0)):
+        (tmp_path / name).mkdir()
+        records = imported(tmp_path / name, rig, "", moved(rig, tone))
+        runs.append(Run(rig, tuple(records)))
+    common = [r.bandwidth for run in with_common_bandwidth(runs) for r in run.records]
+    assert common == pytest.approx([7.0, 7.0], abs=0.2)
+    bare = Run(rig, (replace(runs[0].records[0], attributes={}),))
+    assert [r.bandwidth for run in with_common_bandwidth([*runs, bare]) for r in run.records] == (
+        [None] * 3
+    )
 
 
 def test_what_has_no_bandwidth(rig: Rig) -> None:

@@ -80,7 +80,7 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
     except InputError as error:
         raise InputError(f"{path}:{lines.get(('rig',), 1)}: rig: {error}") from error
     source = _Source(path, manifest, rig, check_against_rig(manifest, lines, path, rig))
-    records = _with_bandwidths(rig, [_read(source, entry) for entry in manifest.records])
+    records = _with_bandwidth(rig, [_read(source, entry) for entry in manifest.records])
     warnings = _warnings(source, records)
     _write(source, records, folder, warnings)
     samples = sum(len(next(iter(r.channels.values()))) for r in records)
@@ -112,24 +112,26 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     return _Imported(entry, rate, start + part.start / rate, channels)
 
 
-def _with_bandwidths(rig: Rig, records: list[_Imported]) -> list[_Imported]:
-    """Return records with the bandwidth of each step's motion, where its lines are not stated.
+def _with_bandwidth(rig: Rig, records: list[_Imported]) -> list[_Imported]:
+    """Return records with the largest bandwidth of all their motions, where none is stated.
 
-    It is the largest of the step's repeats: all must pass the same filters.
+    All must pass alike filters. It is not stated where one record has none (`motion_bandwidth`);
+    records with excited lines do not count.
     """
-    measured: dict[str, float] = {}
-    for r in records:
-        entry = r.entry
-        if not entry.lines and entry.bandwidth is None:
-            width = motion_bandwidth(rig, entry.locked, r.channels, r.sample_rate)
-            if width is not None:
-                measured[entry.step] = max(width, measured.get(entry.step, 0.0))
-    out = []
-    for r in records:
-        stated = r.entry.lines or r.entry.bandwidth is not None
-        more = {} if stated or r.entry.step not in measured else {BANDWIDTH: measured[r.entry.step]}
-        out.append(replace(r, entry=r.entry.model_copy(update=more)))
-    return out
+    bare = [not r.entry.lines and r.entry.bandwidth is None for r in records]
+    widths = [
+        motion_bandwidth(rig, r.entry.locked, r.channels, r.sample_rate)
+        for r, asked in zip(records, bare, strict=True)
+        if asked
+    ]
+    known = [w for w in widths if w is not None]
+    if not known or len(known) < len(widths):
+        return records
+    more = {BANDWIDTH: max(known)}
+    return [
+        replace(r, entry=r.entry.model_copy(update=more)) if asked else r
+        for r, asked in zip(records, bare, strict=True)
+    ]
 
 
 def _common(
