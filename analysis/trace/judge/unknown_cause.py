@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.gates import NO_RIVAL, REMOVES
@@ -96,10 +97,7 @@ def _energy(data: RegressionData, hypothesis: Hypothesis, rows: NDArray[np.bool_
     """Return the energy that a set leaves in some rows if its coefficients are fitted to these."""
     design = design_matrix(data, hypothesis.fit.terms)
     X, y = design.matrix[rows], design.rhs[rows]
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0] = 1.0
-    solution = np.linalg.lstsq(X / scale, y, rcond=TRACE.rank_limit)[0]
-    left = y - X / scale @ solution
+    left = y - X @ shortest(X, y, TRACE.rank_limit)
     return float(left @ left)
 
 
