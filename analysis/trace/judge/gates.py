@@ -76,22 +76,10 @@ def judge_effects(
     )
     before, after = (held_out_residual(holdout_data, o.fit) for o in (hypotheses.empty, winner))
     shift = form_shift(train_data, winner.fit)
-    alternatives = [_set_without(hypotheses, winner, used) for used in winner.effects]
-    every_errors = [
-        inference.effect_errors(train_data, winner.fit, used, values) for used in winner.effects
-    ]
-    every_estimates = [
-        inference.estimates(train_data, used, errors, shift)
-        for used, errors in zip(winner.effects, every_errors, strict=True)
-    ]
-    may_be_zero = inference.least_needed_of_unknown_size(
-        train_data.rig, winner.effects, every_estimates, [o.total for o in alternatives]
-    )
     out = []
-    for used, alternative, errors, estimates in zip(
-        winner.effects, alternatives, every_errors, every_estimates, strict=True
-    ):
+    for used in winner.effects:
         assert isinstance(used.term, Effect)
+        alternative = _set_without(hypotheses, winner, used)
         without = held_out_residual(holdout_data, alternative.fit)
         changes = removal.removed_energy(winner, alternative)
         tie_test = rivals.TieTest(holdout_data, changes, after, without)
@@ -102,6 +90,9 @@ def judge_effects(
             *removal.disturbed_in_held_out(holdout_data, before, without, after),
         }
         p = inference.p_value(alternative.fit.energy - winner.fit.energy, null)
+        errors = inference.effect_errors(train_data, winner.fit, used, values)
+        estimates = inference.estimates(train_data, used, errors, shift)
+        unknown = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
         differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
         unphysical = hypotheses.physical_problem(winner, used)
         tied = [r for r in others if r.tied]
@@ -119,8 +110,8 @@ def judge_effects(
             Gate(INVARIANT, not differing, _differences_in_words(differing)),
             Gate(
                 SIGNIFICANT,
-                p <= TRACE.p_limit and used is not may_be_zero,
-                f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if used is may_be_zero else ""),
+                p <= TRACE.p_limit and not unknown,
+                f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown else ""),
             ),
             Gate(
                 NO_RIVAL,

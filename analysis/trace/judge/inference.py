@@ -143,40 +143,23 @@ def estimates(
     }
 
 
-def least_needed_of_unknown_size(
-    rig: Rig,
-    effects: Sequence[Used],
-    sizes: Sequence[Mapping[str, Estimate]],
-    left_without: Sequence[float],
-) -> Used | None:
-    """Return the effect of unknown size without which least is left, None if there is none.
+def is_of_unknown_size(
+    rig: Rig, used: Used, parameters: Mapping[str, Estimate], effects: Sequence[Used]
+) -> bool:
+    """Return whether rows do not determine how an effect and another share one force or flow.
 
-    The 95 % intervals of all its coefficients (`sizes`, by parameter) hold zero, and an effect of
-    its family, but of another law, acts at its place: two frictions of one joint. Only one is
-    returned, since the other may be known without it. `left_without` are energies.
+    The 95 % intervals of all its coefficients (among `parameters`, by name) hold zero, and one of
+    the other `effects` of its family, but of another law, acts at its place: two frictions of one
+    joint.
     """
-    unknown = [
-        (left, k)
-        for k, (used, parameters, left) in enumerate(zip(effects, sizes, left_without, strict=True))
-        if _may_be_zero(rig, used, parameters) and _shares_its_balance(used, effects)
-    ]
-    return effects[min(unknown)[1]] if unknown else None
-
-
-def _may_be_zero(rig: Rig, used: Used, parameters: Mapping[str, Estimate]) -> bool:
-    own = [parameters[c.parameter].ci95 for c in used.term.coefficients(rig)]
-    return bool(own) and all(low <= 0.0 <= high for low, high in own)
-
-
-def _shares_its_balance(used: Used, effects: Sequence[Used]) -> bool:
     own = used.term
     assert isinstance(own, Effect)
-    return not own.free and any(
-        isinstance(o.term, Effect)
-        and o is not used
-        and (o.term.family, o.term.where) == (own.family, own.where)
-        and not of_one_law(o.term, own)
-        for o in effects
+    intervals = [parameters[c.parameter].ci95 for c in own.coefficients(rig)]
+    if own.free or not intervals or not all(low <= 0.0 <= high for low, high in intervals):
+        return False
+    others = [o.term for o in effects if o is not used and isinstance(o.term, Effect)]
+    return any(
+        (o.family, o.where) == (own.family, own.where) and not of_one_law(o, own) for o in others
     )
 
 
