@@ -107,26 +107,31 @@ class Run:
     state: str = "done"
 
 
-def with_common_bandwidth(runs: Sequence[Run]) -> tuple[Run, ...]:
-    """Return runs whose records state the largest bandwidth of all, or none where one lacks it.
+def common_bandwidth(widths: Sequence[float | None]) -> float | None:
+    """Return the largest of bandwidths [Hz], None where one is not known or there are none.
 
-    Records with excited lines state none and do not count. Rows that are fitted together must have
-    passed alike filters: what a model misses would else weigh more in the wider ones.
+    Rows that are fitted together must pass alike filters: what a model misses would else weigh more
+    in the wider ones.
     """
-    widths = [r.bandwidth for run in runs for r in run.records if not r.lines]
     known = [w for w in widths if w is not None]
-    if not known:
-        return tuple(runs)
-    common = {BANDWIDTH: max(known)} if len(known) == len(widths) else {}
-    out = []
-    for run in runs:
-        bare = [{k: v for k, v in r.attributes.items() if k != BANDWIDTH} for r in run.records]
-        records = (
-            r if r.lines else replace(r, attributes={**attributes, **common})
-            for r, attributes in zip(run.records, bare, strict=True)
-        )
-        out.append(replace(run, records=tuple(records)))
-    return tuple(out)
+    return max(known) if known and len(known) == len(widths) else None
+
+
+def with_common_bandwidth(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return runs whose records state their `common_bandwidth`; those with excited lines none."""
+    width = common_bandwidth([r.bandwidth for run in runs for r in run.records if not r.lines])
+    return tuple(
+        replace(run, records=tuple(r if r.lines else _of_bandwidth(r, width) for r in run.records))
+        for run in runs
+    )
+
+
+def _of_bandwidth(record: Record, width: float | None) -> Record:
+    if record.bandwidth == width:
+        return record
+    others = {k: v for k, v in record.attributes.items() if k != BANDWIDTH}
+    stated = {} if width is None else {BANDWIDTH: width}
+    return replace(record, attributes={**others, **stated})
 
 
 def with_loads_stated(runs: Sequence[Run]) -> tuple[Run, ...]:

@@ -22,10 +22,8 @@ def motion_bandwidth(
     `channels` are positions (n,) and others by name, `rate` [Hz]. None where no joint moves, and
     for a record shorter than `EXCHANGE.bandwidth_seconds`, which needs all its rows.
     """
-    joints = [i for i in range(1, len(rig.joints) + 1) if i not in locked]
-    positions = [
-        channels[name] for i in joints if (name := ch.channel(rig.position_kind, i)) in channels
-    ]
+    free = [i for i in range(1, len(rig.joints) + 1) if i not in locked]
+    positions = [channels[ch.channel(rig.position_kind, i)] for i in free]
     moving = [x for x in positions if np.ptp(x) > 0.0]
     if not moving or len(moving[0]) < EXCHANGE.bandwidth_seconds * rate:
         return None

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.model.parse import InputError
-from rig.model.records import BANDWIDTH
+from rig.model.records import BANDWIDTH, common_bandwidth
 from rig.model.rig import Rig
 from rig.runs import archive, store
 from rig.runs.exchange.bandwidth import motion_bandwidth
@@ -113,24 +113,22 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
 
 
 def _with_bandwidth(rig: Rig, records: list[_Imported]) -> list[_Imported]:
-    """Return records with the largest bandwidth of all their motions, where none is stated.
+    """Return records with the `common_bandwidth` of those that state neither it nor lines."""
 
-    All must pass alike filters. It is not stated where one record has none (`motion_bandwidth`);
-    records with excited lines do not count.
-    """
-    bare = [not r.entry.lines and r.entry.bandwidth is None for r in records]
-    widths = [
-        motion_bandwidth(rig, r.entry.locked, r.channels, r.sample_rate)
-        for r, asked in zip(records, bare, strict=True)
-        if asked
-    ]
-    known = [w for w in widths if w is not None]
-    if not known or len(known) < len(widths):
-        return records
-    more = {BANDWIDTH: max(known)}
+    def is_measured(r: _Imported) -> bool:
+        return not r.entry.lines and r.entry.bandwidth is None
+
+    width = common_bandwidth(
+        [
+            motion_bandwidth(rig, r.entry.locked, r.channels, r.sample_rate)
+            for r in records
+            if is_measured(r)
+        ]
+    )
+    stated = {BANDWIDTH: width}
     return [
-        replace(r, entry=r.entry.model_copy(update=more)) if asked else r
-        for r, asked in zip(records, bare, strict=True)
+        replace(r, entry=r.entry.model_copy(update=stated)) if is_measured(r) else r
+        for r in records
     ]
 
 
