@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import subprocess
@@ -44,6 +45,7 @@ def compile_c(*arguments: str) -> None:
 def built() -> Path:
     """Compile the device with its pty; returns the program."""
     folder = Path(tempfile.mkdtemp(prefix="bramah-firmware-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     program = folder / "posix_bench"
     sources = [str(FIRMWARE / name) for name in ("serial_device.c", "posix_bench.c")]
     compile_c("-O1", "-fno-sanitize=all", *sources, "-o", str(program))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -197,6 +198,7 @@ def _a_run(folder: Path, rig: Rig, *, finish: bool) -> Path:
 
 def _file(name: str, rig: Rig, *, finish: bool) -> Target:
     base = Path(tempfile.mkdtemp(prefix="bramah-fuzz-"))
+    atexit.register(shutil.rmtree, base, ignore_errors=True)
     whole = _a_run(base, rig, finish=finish)
     what = ARCHIVE if finish else runstate.JOURNAL
     if not finish:  # let what stands in the log stand in the file
