@@ -49,7 +49,6 @@ class PeriodicDisturbance(Effect):
     separated_by: ClassVar[str] = (
         "another excitation, which changes effects of the joint's motion but not this one"
     )
-    per_joint: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     where: str = "joint 1"
 

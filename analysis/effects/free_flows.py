@@ -71,7 +71,6 @@ class MeteringCurve(Effect):
     quantity: ClassVar[str] = "spool"
     confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "supply_sag", "tank_pressure")
     separated_by: ClassVar[str] = "the same opening at several pressures across the edge"
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property

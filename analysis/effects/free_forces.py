@@ -220,7 +220,6 @@ class PositionForce(Effect):
     quantity: ClassVar[str] = "position"
     confounders: ClassVar[tuple[str, ...]] = ("friction_curve",)
     separated_by: ClassVar[str] = "slow motion over the whole stroke at two poses of other joints"
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property

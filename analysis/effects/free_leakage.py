@@ -53,7 +53,6 @@ class _FreeLeakage(Effect):
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     def _refused(self, rig: Rig, flow: Array) -> str:

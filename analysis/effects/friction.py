@@ -69,7 +69,6 @@ class Friction(Effect):
     element: ClassVar[str] = "piston"
     family: ClassVar[str] = "friction"
     quantity: ClassVar[str] = "velocity"
-    per_joint: ClassVar[bool] = True
     stiffens: ClassVar[bool] = False
     before: ClassVar[int] = 0
     after: ClassVar[int] = 0

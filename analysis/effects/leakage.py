@@ -48,7 +48,6 @@ class _Leakage(Effect):
     element: ClassVar[str] = "piston"
     family: ClassVar[str] = "fluid"
     hydraulic: ClassVar[bool] = True
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property

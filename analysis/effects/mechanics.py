@@ -125,7 +125,6 @@ class JointSpring(Effect):
         "slow motion over the whole stroke at two poses of the other joints: gravity "
         "depends on the absolute angle, the spring on the joint's angle"
     )
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property
@@ -213,7 +212,6 @@ class TorqueOffset(Effect):
         "slow motion over the whole stroke: torques of gravity, a spring and a pressure's offset "
         "change with it"
     )
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property

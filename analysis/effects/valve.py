@@ -40,7 +40,6 @@ class ValveEffect(Effect):
     quantity: ClassVar[str] = "spool"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     prepares: ClassVar[bool] = True
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:

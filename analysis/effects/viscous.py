@@ -56,7 +56,6 @@ class AsymmetricViscousFriction(Effect):
     separated_by: ClassVar[str] = (
         "two speeds of one motion: offset and difference of levels stay the same, this doubles"
     )
-    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property

@@ -6,6 +6,7 @@ import difflib
 import functools
 import importlib
 import pkgutil
+import re
 from collections.abc import Sequence
 from typing import Final
 
@@ -62,19 +63,30 @@ def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
     terms = list(baseline_of(rig))
     for effect in effects:
         name, _, where = (part.strip() for part in effect.partition("@"))
-        each = [where] if where else ["bench"]
-        if not where and make(name).per_joint:
-            each = [f"joint {i}" for i in range(1, len(rig.joints) + 1)]
-        for place in each:
+        for place in _places(rig, name, where):
             term = make(INCLINED if name == "base_inclination" else name, place)
             if term in terms:
                 raise InputError(f"effect {name!r} at {place} is in the model already")
-            if term.per_joint and term.joint >= len(rig.joints):
-                raise InputError(f"effect {name!r}: rig {rig.name!r} has no {place}")
             if name == "base_inclination":
                 terms = [t for t in terms if t.name != "gravity"]
             terms.append(term)
     return tuple(terms)
+
+
+def _places(rig: Rig, name: str, where: str) -> list[str]:
+    """Return the place asked for, of several channels or chambers the one, or the bench or joints.
+
+    Raises InputError where the rig has no such place for the effect.
+    """
+    places = make(name).places(rig)
+    asked = [where] if where else [p for p in places if re.fullmatch(r"bench|joint \d+", p)]
+    if asked and set(asked) <= set(places):
+        return asked
+    if not places:
+        raise InputError(f"effect {name!r} does not act on rig {rig.name!r}")
+    written = ", ".join(f"'{name}@{place}'" for place in places)
+    found = f"has no place {where!r}" if where else "needs its place"
+    raise InputError(f"effect {name!r} {found} on rig {rig.name!r}: write one of {written}")
 
 
 def baseline() -> tuple[Term, ...]:

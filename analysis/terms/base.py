@@ -118,7 +118,6 @@ class Term:
     name: ClassVar[str]
     prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
     rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that simulation needs because of this term
-    per_joint: ClassVar[bool] = False  # whether it is at one joint, `where` being `joint I`
     where: str = "bench"
 
     @property
@@ -133,6 +132,11 @@ class Term:
     def parameters(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the model's parameters (default: the linear unknowns themselves)."""
         return self.coefficients(rig)
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return every `where` of this term on a rig."""
+        return ("bench",)
 
     def reduction(self, rig: Rig) -> ParameterReduction | None:
         """Return how the linear unknowns depend on fewer parameters, None if they do not."""

@@ -197,13 +197,25 @@ def test_a_model_with_a_slope_survives_its_file(robot: ElectricRig, run: Run, tm
     ("effect", "said"),
     [
         ("stiction", "unknown term 'stiction'"),
-        ("coulomb_friction@joint 3", "has no joint 3"),
-        ("coulomb_friction@elbow", "'elbow' is not like 'joint 1'"),
+        ("coulomb_friction@joint 3", "no place 'joint 3' .* one of 'coulomb_friction@joint 1'"),
+        ("coulomb_friction@elbow", "no place 'elbow' .* one of 'coulomb_friction@joint 1'"),
+        ("internal_leakage", "does not act on rig"),
     ],
 )
 def test_an_effect_that_cannot_be_is_refused(robot: ElectricRig, effect: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         with_effects(robot, [effect])
+
+
+@pytest.mark.parametrize("effect", ["channel_delay@joint 1", "sensor_gain@joint 2 bogus"])
+def test_an_effect_of_a_sensor_needs_its_channel(effect: str) -> None:
+    with pytest.raises(InputError, match="no place .* one of .*@joint 1 piston'"):
+        with_effects(load_rig("shinshu-2dof"), [effect])
+
+
+def test_an_effect_of_one_chamber_needs_its_chamber() -> None:
+    with pytest.raises(InputError, match="needs its place .* one of 'dead_volume@joint 1 cap'"):
+        with_effects(load_rig("shinshu-2dof"), ["dead_volume"])
 
 
 def test_an_effect_given_twice_is_refused(robot: ElectricRig) -> None:

@@ -66,7 +66,7 @@ def _linear_effects(rig: Rig) -> list[str]:
     joint_effects = {
         name: kind("joint 1")
         for name, kind in known().items()
-        if issubclass(kind, Effect) and kind.per_joint
+        if issubclass(kind, Effect) and "joint 1" in kind.places(rig)
     }
     return sorted(
         name for name, effect in joint_effects.items() if all(s.detail for s in effect.shapes(rig))
