@@ -13,13 +13,14 @@ BENCH: Final = "bench"
 def is_confusable(effect: Effect, used: Used) -> bool:
     """Return whether a candidate is easily confused with an effect of the set.
 
-    It is another name of its mechanism at the same place, or one of its confounders at its joint or
-    of the bench.
+    It is another name of its mechanism at the same place, or, at its joint or of the bench, the
+    same effect on another channel or chamber or one of its confounders.
     """
     own = used.term
     assert isinstance(own, Effect)
     same = effect.mechanism == own.mechanism and effect.where == own.where
-    return (same or is_confounder(effect, own)) and not effect.free
+    alike = effect.name in (own.name, *own.confounders) and act_at_one_joint(effect, own)
+    return (same or alike) and not effect.free
 
 
 def is_confounder(effect: Effect, own: Effect) -> bool:
