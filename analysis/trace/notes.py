@@ -122,7 +122,7 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
         size = f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
         out.append(
             f"with {rival.name} at {rival.location} in place of {effect.name}, {parameter} would "
-            f"be {size}: its interval holds only if {effect.name} is the cause"
+            f"be {size}: its interval is wide enough for either cause"
         )
     return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from analysis.trace.judge import removal
 from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
-from analysis.trace.result import Rival
+from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, Key, of_one_law
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
@@ -121,6 +122,27 @@ def _moved_parameter(
         if large and abs(other - value) > TRACE.normal_quantile * std:
             most = c.parameter, float(change)
     return most
+
+
+def shift_by_tied_rivals(
+    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
+) -> dict[str, float]:
+    """Return by how much tied rivals of judged effects may shift each coefficient, by name.
+
+    It is the root mean square shift over the sets that the records cannot separate, all with the
+    same weight and the best one with none (Buckland, Burnham and Augustin, Biometrics 53, 1997).
+    """
+    tied = [
+        hypotheses.fitted.get(winner.keys - {(effect.name, effect.at)} | {(rival.name, rival.at)})
+        for effect in effects for rival in effect.rivals if rival.tied
+    ]  # fmt: skip
+    fits = [hypothesis.fit.beta for hypothesis in tied if hypothesis is not None]
+    return {
+        name: math.sqrt(
+            sum((beta.get(name, value) - value) ** 2 for beta in fits) / (len(fits) + 1)
+        )
+        for name, value in winner.fit.beta.items()
+    }
 
 
 def composites_in_words(
