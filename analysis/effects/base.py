@@ -229,6 +229,16 @@ class Effect(Term):
         """
         return ""
 
+    def not_shown(
+        self, rig: Rig, values: Mapping[str, float], shape: Sequence[float],
+        terms: Sequence[Used], signals: Sequence[Signals],
+    ) -> str:  # fmt: skip
+        """Return why the records do not show what sets the effect apart ('' if they do).
+
+        `terms` are all of the model, `values` its linear coefficients.
+        """
+        return ""
+
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State a size at the conditions of the records ('' where its parameter states it)."""
         return ""

@@ -47,12 +47,15 @@ from analysis.terms.base import (
     Columns,
     G,
     Kernel,
+    Used,
     equation,
     kernel,
 )
 from rig.model.rig import Rig
 
 BREAKAWAY: Final = 0.1  # of the sliding level: less is the form of the contact, not a breakaway
+FALLEN: Final = 1 / 3  # of the breakaway, up to the records' top speed: less is one level's form
+SPEEDS: Final = 200  # points of the curve over speed in which a fall is looked for
 LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it is negligible: prevents division by zero
 
 
@@ -166,6 +169,12 @@ class Friction(Effect):
         if not self.remembers(shape):
             return memoryless(signals.sd[:, self.joint], speed)
         return np.asarray(contact_state(self.path(signals, shape), distance))
+
+    def over_speed(self, speed: Array, shape: Sequence[float]) -> Array:
+        """Return z (n,) in steady motion at speeds (n,) [m/s] above 0."""
+        if self.remembers(shape):
+            return np.ones(len(speed))
+        return memoryless(speed, self.contact_of(shape)[2])
 
     def row(self, columns: Mapping[str, Array]) -> Columns:
         """Return columns of the joint's torque row."""
@@ -321,6 +330,35 @@ class StribeckFriction(Friction):
             return f"{name} = {force:.3g} N is {force / level:.1%} of the sliding level"
         too_large = beyond(name, force, "N", force_limit(rig, self.joint))
         return too_large or Effect.outside(self, rig, shape[:1])
+
+    def not_shown(
+        self, rig: Rig, values: Mapping[str, float], shape: Sequence[float],
+        terms: Sequence[Used], signals: Sequence[Signals],
+    ) -> str:  # fmt: skip
+        """Say so where the joint's dry friction hardly falls up to the records' top speed.
+
+        Two contacts of different transition speeds give any smooth curve that only rises.
+        """
+        i = self.joint
+        top = max((float(np.abs(s.sd[:, i]).max()) for s in signals if s.excited[i]), default=0.0)
+        v = np.linspace(0.0, top, SPEEDS + 1)[1:]
+        own = self.coefficients(rig)[0]
+        falling = values[own.parameter] * np.exp(-((v / self.shape_of(rig, shape)[0]) ** 2))
+        total = falling * self.over_speed(v, shape)
+        for used in terms:
+            other = used.term
+            if not isinstance(other, Friction) or other == self or other.where != self.where:
+                continue
+            levels = [c for c in other.coefficients(rig) if c.unit == own.unit]
+            level = sum(values.get(c.parameter, 0.0) for c in levels) / max(len(levels), 1)
+            total = total + level * other.over_speed(v, used.shape)
+        fall = float(total.max() - total[-1])
+        if fall >= FALLEN * values[own.parameter]:
+            return ""
+        return (
+            f"up to {top:.3g} m/s, the top speed of the records, dry friction falls by {fall:.3g} "
+            f"{own.unit}: that is no breakaway of {own.parameter} = {values[own.parameter]:.3g}"
+        )
 
 
 @kernel

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.signals.conditioning import Signals
 from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant, complexity, shape_grid, variants
@@ -109,7 +110,9 @@ class HypothesisSet:
             for name in used.term.excludes:
                 if (name, used.term.where) in hypothesis.keys:
                     return f"{used.term.name} and {name} exclude each other at one place"
+            terms, signals = hypothesis.fit.terms, self._signals
             problem = used.term.problem(rig, values, used.shape)
+            problem = problem or used.term.not_shown(rig, values, used.shape, terms, signals)
             if (used.term.name, used.term.where) not in may_be_at_bounds:
                 problem = problem or used.term.outside(rig, used.shape)
             if problem:
@@ -358,6 +361,10 @@ class HypothesisSet:
         if not equations or coupled or variant.key not in self._acting:
             return True
         return not self._acting[variant.key].isdisjoint(equations)
+
+    @functools.cached_property
+    def _signals(self) -> list[Signals]:
+        return [conditioned.signals for conditioned in self.train_data.records]
 
     @functools.cached_property
     def _acting(self) -> dict[Key, set[str]]:

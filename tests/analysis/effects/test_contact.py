@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.special import erf
 
 from analysis.effects.contact import contact_state, contact_under_load, worked
 from analysis.effects.friction import CoulombFriction, StribeckFriction
 from analysis.effects.friction_levels import PressureDependentFriction
 from analysis.signals.conditioning import condition
+from analysis.terms.base import Used
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -70,3 +72,36 @@ def test_a_shape_without_the_detail_is_a_contact_that_does_not_stiffen(
         packed = [effect.pack(rig, values, s).tolist() for s in ((4e-5,), (4e-5, 0.0))]
         assert packed[0] == packed[1]
     assert "stiffening_1" not in StribeckFriction("joint 1").shape_names()
+
+
+@pytest.mark.parametrize(
+    ("coulomb", "breakaway", "falls"),
+    [
+        # Force [N] and transition speed [m/s]; then force, Stribeck and transition speed.
+        ((300.0, 1e-3), (400.0, 0.01, 1e-3), True),
+        ((0.0, 1e-3), (400.0, 0.01, 1e-3), True),
+        # Rises over a wide transition while the breakaway falls: the sum only rises.
+        ((1000.0, 0.02), (450.0, 0.016, 4e-3), False),
+        # Falls beyond the speeds of the records.
+        ((300.0, 1e-3), (400.0, 0.3, 1e-3), False),
+    ],
+)
+def test_a_breakaway_is_seen_where_friction_falls_within_the_speeds_of_the_records(
+    rig: Rig, multisine_run: Run,
+    coulomb: tuple[float, float], breakaway: tuple[float, float, float], falls: bool,
+) -> None:  # fmt: skip
+    conditioned = (condition(rig, record) for record in multisine_run.records)
+    signals = [s for s in conditioned if s.excited[1]][:1]
+    Fc, Fs = CoulombFriction("joint 2"), StribeckFriction("joint 2")
+    force, falling, width = breakaway
+    shape = (falling, 0.0, width)
+    terms = [Used(Fc, (0.0, 0.0, coulomb[1])), Used(Fs, shape)]
+    said = Fs.not_shown(rig, {"Fc2": coulomb[0], "Fs2": force}, shape, terms, signals)
+    assert (said == "") == falls
+    # The curve itself, by hand.
+    top = float(np.abs(signals[0].sd[:, 1]).max())
+    v = np.linspace(1e-4, top, 3000)
+    curve = coulomb[0] * erf(v / coulomb[1]) + force * np.exp(-((v / falling) ** 2)) * erf(
+        v / width
+    )
+    assert (curve.max() - curve[-1] > force / 3) == falls
