@@ -22,6 +22,7 @@ from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
+from analysis.trace.judge.rivals import best_tied_set
 from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
 from analysis.trace.judge.unlocked import Line
 from analysis.trace.judgement import Judgement, has_tied_rival
@@ -248,6 +249,8 @@ def judge_winner(
     """Judge the set that the search has found, and try free forms where it does not explain."""
     winner = readings.best_readings(hypotheses, winner, holdout_data)
     found = _apply_gates(hypotheses, winner, holdout_data, rng)
+    if found.verdict == CONFOUNDED:
+        found = _with_best_tied_set(found, holdout_data, rng)
     by_free_form = _try_free_forms(found, free, holdout_data, rng)
     if by_free_form is not None:
         return by_free_form
@@ -255,6 +258,17 @@ def judge_winner(
         unphysical = _refused_as_unphysical(hypotheses, holdout_data, rng)
         return replace(found, effects=(*found.effects, *unphysical))
     return found
+
+
+def _with_best_tied_set(
+    found: Judgement, holdout_data: RegressionData, rng: np.random.Generator
+) -> Judgement:
+    """Return the judgement of the best of the sets that the records cannot separate."""
+    best = best_tied_set(found.hypotheses, found.winner, found.effects, holdout_data)
+    if best is found.winner:
+        return found
+    other = _apply_gates(found.hypotheses, best, holdout_data, rng)
+    return other if other.verdict == CONFOUNDED else found
 
 
 def _try_free_forms(

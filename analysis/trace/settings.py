@@ -127,7 +127,7 @@ class TraceSettings:
     least_rows: int = 40
     """Least number of rows of an equation in one step (arithmetic)."""
     most_rivals: int = 4
-    """Largest number of rivals in a result."""
+    """Largest number of rivals in a result, but for tied ones: all are listed."""
     noted_shift: float = 0.01
     """Relative change of a parameter from which it matters: by an effect at its detection limit, by
     the fit to held-out rows, or by a rival in place of a named effect (tuned: with good excitation
@@ -267,8 +267,8 @@ class SearchSettings:
     """Sum over equations of log ratios of remaining energy that a further effect must gain
     (tuned)."""
     far_log_gain: float = 2.3
-    """Sum over equations of log ratios of remaining energy that another pair must gain over a
-    single effect that is accepted by the tolerance for its form only (tuned: a tenth)."""
+    """Sum over equations of log ratios of remaining energy that another set must gain over one that
+    is accepted by the tolerance for its forms (tuned: a tenth)."""
     number_price: float = 20.0
     """Energy that each further free number must remove: ten times what noise gives it (tuned)."""
     least_projected_length: float = 0.03
@@ -281,8 +281,6 @@ class SearchSettings:
     """Largest fitted size over the size for which the first-order column of a signal change was
     computed; smaller sizes are closer to linear (tuned)."""
     # Effort.
-    largest_linear_set: int = 4
-    """Largest number of effects in a set of the linear search."""
     largest_set: int = 3
     """Largest number of effects in a set that is extended."""
     pair_starts: int = 10

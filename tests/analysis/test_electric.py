@@ -209,12 +209,12 @@ def test_an_effect_that_cannot_be_is_refused(robot: ElectricRig, effect: str, sa
 
 @pytest.mark.parametrize("effect", ["channel_delay@joint 1", "sensor_gain@joint 2 bogus"])
 def test_an_effect_of_a_sensor_needs_its_channel(effect: str) -> None:
-    with pytest.raises(InputError, match="no place .* one of .*@joint 1 piston'"):
+    with pytest.raises(InputError, match=r"no place .* one of .*@joint 1 piston'"):
         with_effects(load_rig("shinshu-2dof"), [effect])
 
 
 def test_an_effect_of_one_chamber_needs_its_chamber() -> None:
-    with pytest.raises(InputError, match="needs its place .* one of 'dead_volume@joint 1 cap'"):
+    with pytest.raises(InputError, match=r"needs its place .* one of 'dead_volume@joint 1 cap'"):
         with_effects(load_rig("shinshu-2dof"), ["dead_volume"])
 
 

@@ -88,7 +88,7 @@ def rivals_of(
             )
         )
     out.sort(key=lambda r: (not r.tied, r.ratio))
-    return out[: TRACE.most_rivals]
+    return out[: max(TRACE.most_rivals, sum(r.tied for r in out))]
 
 
 def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
@@ -124,6 +124,36 @@ def _moved_parameter(
     return most
 
 
+def tied_sets(
+    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
+) -> list[Hypothesis]:
+    """Return the fitted sets with a tied rival in place of one judged effect of the winner."""
+    keys = (
+        winner.keys - {(effect.name, effect.at)} | {(rival.name, rival.at)}
+        for effect in effects for rival in effect.rivals if rival.tied
+    )  # fmt: skip
+    return [hypotheses.fitted[k] for k in keys if k in hypotheses.fitted]
+
+
+def best_tied_set(
+    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect],
+    holdout_data: RegressionData,
+) -> Hypothesis:  # fmt: skip
+    """Return the winner, or the set with a tied rival that training and held-out rows prefer.
+
+    It leaves less energy by more than `SEARCH.number_price`, and by that for each further free
+    number: the search saw the training rows only.
+    """
+
+    def priced(hypothesis: Hypothesis) -> float:
+        residual = held_out_residual(holdout_data, hypothesis.fit)
+        energy = hypothesis.fit.energy + float(residual @ residual)
+        return energy + SEARCH.number_price * hypothesis.size[1]
+
+    best = min(tied_sets(hypotheses, winner, effects), key=priced, default=winner)
+    return best if priced(best) < priced(winner) - SEARCH.number_price else winner
+
+
 def shift_by_tied_rivals(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
 ) -> dict[str, float]:
@@ -132,11 +162,7 @@ def shift_by_tied_rivals(
     It is the root mean square shift over the sets that the records cannot separate, all with the
     same weight and the best one with none (Buckland, Burnham and Augustin, Biometrics 53, 1997).
     """
-    tied = [
-        hypotheses.fitted.get(winner.keys - {(effect.name, effect.at)} | {(rival.name, rival.at)})
-        for effect in effects for rival in effect.rivals if rival.tied
-    ]  # fmt: skip
-    fits = [hypothesis.fit.beta for hypothesis in tied if hypothesis is not None]
+    fits = [h.fit.beta for h in tied_sets(hypotheses, winner, effects)]
     return {
         name: math.sqrt(
             sum((beta.get(name, value) - value) ** 2 for beta in fits) / (len(fits) + 1)

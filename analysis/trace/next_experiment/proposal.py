@@ -17,9 +17,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.effects.base import Effect
 from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge.rivals import tied_sets
 from analysis.trace.next_experiment import excitations as ex
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
@@ -131,30 +133,6 @@ def _questions(
 def explanation(hypothesis: Hypothesis) -> Explanation:
     """Return a fitted set as an explanation."""
     return Explanation(hypothesis.effects, hypothesis.fit.beta)
-
-
-def tied_sets(
-    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
-) -> list[Hypothesis]:
-    """Return the sets with a tied rival in place of one effect of the winner."""
-    out = []
-    for effect in effects:
-        tied = {(r.name, r.where) for r in effect.rivals if r.tied}
-        others = [u for u in winner.effects if _key(u.term) != (effect.name, effect.where)]
-        for hypothesis in hypotheses.fitted.values():
-            fresh = [
-                u for u in hypothesis.effects if u.term not in [w.term for w in winner.effects]
-            ]
-            kept = {u.term for u in hypothesis.effects} - {u.term for u in fresh}
-            if len(fresh) == 1 and _key(fresh[0].term) in tied and kept == {
-                u.term for u in others
-            }:  # fmt: skip
-                out.append(hypothesis)
-    return out
-
-
-def _key(term: Any) -> tuple[str, str]:
-    return term.name, str(getattr(term, "place", term.where))
 
 
 def _undecided_questions(hypotheses: HypothesisSet) -> list[OpenQuestion]:
@@ -312,10 +290,19 @@ def _experiment_in_words(
     effects: Sequence[JudgedEffect], asked: Sequence[PredictedAnswer]
 ) -> Mapping[str, Any] | None:
     """Describe an experiment in words, for rigs without nominal values and so without a twin."""
-    tied = [e.name for e in effects if any(r.tied for r in e.rivals)]
-    texts = [getattr(known()[name], "separated_by", "") for name in tied]
+    pairs = [(e.name, r.name) for e in effects for r in e.rivals if r.tied]
+    texts = [_separated_by(*pair) for pair in pairs]
     return {
         "kind": TELL,
         "separates": _names(asked),
         "text": next((t for t in texts if t), "another amplitude and frequency"),
     }
+
+
+def _separated_by(name: str, rival: str) -> str:
+    """Return the excitation that separates two effects, from the one that confounds the other."""
+    for one, other in ((rival, name), (name, rival)):
+        kind = known()[one]
+        if issubclass(kind, Effect) and other in kind.confounders:
+            return kind.separated_by
+    return ""

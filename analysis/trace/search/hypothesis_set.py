@@ -1,8 +1,8 @@
-"""The search for a set of effects: a linear search on columns, then exact fits of the best sets.
+"""The search for a set of effects: candidates ranked by their columns, then fitted exactly.
 
-The columns are of first order in a change of signals. A set found with them is refined exactly and,
-where more than noise remains, extended from data that have the set among their terms. Every set
-fitted on the way is kept, since the rivals of the winner are taken from these sets.
+The columns are of first order in a change of signals. The best single effects and pairs are fitted
+exactly and, where more than noise remains, extended from data that have the set among their terms.
+Every set fitted on the way is kept, since the rivals of the winner are taken from these sets.
 """
 
 from __future__ import annotations
@@ -223,7 +223,10 @@ class HypothesisSet:
         now = self.prune(self.best([self.empty, *singles]))
         if within_band(now.excess_energy, self.noise_band):
             return now
-        pairs = [self.refined(effects) for effects in self._pairs(candidates, r)]
+        pairs = [
+            self.refined([candidates.entries[m].variant.used for m in pair.members])
+            for pair in linear_fit.best_pairs(candidates, r, SEARCH.refined_pairs)
+        ]
         if self.within_form_tolerance(now):
             others = [o for o in pairs if not now.keys & o.keys]
             far = [o for o in others if self.log_energy_ratio(o, now) < -SEARCH.far_log_gain]
@@ -305,17 +308,6 @@ class HypothesisSet:
                 out[variant.key] = (variant.used,)
         return list(out.values())
 
-    def _pairs(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
-        chosen = linear_fit.search(candidates, r)
-        out = [
-            tuple(candidates.entries[m].variant.used for m in chosen.members[: SEARCH.largest_set])
-        ]
-        out += [
-            tuple(candidates.entries[m].variant.used for m in pair.members)
-            for pair in linear_fit.best_pairs(candidates, r, SEARCH.refined_pairs)
-        ]
-        return [effects for effects in out if len(effects) > 1]
-
     def extensions(
         self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
     ) -> list[Hypothesis]:
@@ -345,7 +337,7 @@ class HypothesisSet:
         r = now.fit.residual * mask
         r = r - candidates.basis @ (candidates.basis.T @ r)
         out: dict[Key, tuple[Used, ...]] = {}
-        for trial in linear_fit.sets_with_one_more(candidates, (), r, 1.0):
+        for trial in linear_fit.sets_with_one_more(candidates, (), r):
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))

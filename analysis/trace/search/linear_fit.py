@@ -1,11 +1,11 @@
-"""Linear search: candidates, alone and in sets, whose columns remove the residual down to noise.
+"""Linear fit: candidates, alone and in pairs, by the energy that their columns remove.
 
 All columns are made orthogonal to the baseline's, since the baseline's fit can absorb any part of
 them along its own. On the projected columns D (M, V) and residual r (M,), with K = D'D and c = D'r,
-the energy that a candidate with columns j removes (its gain) is c_j' K_jj^-1 c_j. Adding it to the
-set updates K and c by a Schur complement, so that a search over the whole catalogue with pairs
-costs products of small matrices only. Of candidates that leave about the same energy, the one with
-the fewest free numbers is chosen.
+the energy that a candidate with columns j removes (its gain) is c_j' K_jj^-1 c_j. Beside another
+candidate K and c change by a Schur complement, so that pairs of the whole catalogue cost products
+of small matrices only. Of candidates that leave about the same energy, the one with the fewest free
+numbers comes first.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class CandidateColumns:
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A fitted set of candidates: energy above noise by equation, and the residual (M,).
+    """A fitted set of candidates with its energy above noise by equation.
 
     `members` are numbers of entries, `coefficients` the fitted ones of each.
     """
@@ -57,7 +57,6 @@ class LinearFit:
     members: tuple[int, ...]
     coefficients: tuple[Array, ...]
     excess_energy: dict[str, float]
-    residual: Array
 
     @property
     def total(self) -> float:
@@ -131,10 +130,8 @@ def schur_complement(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, A
     return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])
 
 
-def fit_members(
-    candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
-) -> LinearFit:
-    """Fit a set to the projected residual r (M,); `noise` is its noise energy per row."""
+def fit_members(candidates: CandidateColumns, members: Sequence[int], r: Array) -> LinearFit:
+    """Fit a set to the projected whitened residual r (M,)."""
     columns = [j for m in members for j in candidates.groups[m]]
     residual, parts = r, []
     if columns:
@@ -146,17 +143,9 @@ def fit_members(
             parts.append(fit[at : at + len(candidates.groups[m])])
             at += len(candidates.groups[m])
     excess_energy = {
-        e: float(residual[w] @ residual[w]) - noise * len(w) for e, w in candidates.rows.items()
+        e: float(residual[w] @ residual[w]) - len(w) for e, w in candidates.rows.items()
     }
-    return LinearFit(tuple(members), tuple(parts), excess_energy, residual)
-
-
-def in_band(candidates: CandidateColumns, chosen: LinearFit, noise: float) -> bool:
-    """Return whether every equation's energy above noise lies within its band."""
-    return all(
-        excess_energy <= max(candidates.band[e], 4 * noise * np.sqrt(2 * len(candidates.rows[e])))
-        for e, excess_energy in chosen.excess_energy.items()
-    )
+    return LinearFit(tuple(members), tuple(parts), excess_energy)
 
 
 def energy_touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
@@ -167,14 +156,14 @@ def energy_touched(candidates: CandidateColumns, member: int, chosen: LinearFit)
 
 
 def sets_with_one_more(
-    candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
+    candidates: CandidateColumns, members: Sequence[int], r: Array
 ) -> list[LinearFit]:
     """Return the sets with one more entry that removes enough energy, the best set first.
 
     Sets that leave about the least come first, by number of free numbers; then the others by the
     energy that they leave.
     """
-    now = fit_members(candidates, members, r, noise)
+    now = fit_members(candidates, members, r)
     K, c = candidates.K, candidates.columns.T @ r
     for m in members:
         K, c = schur_complement(K, c, candidates.groups[m])
@@ -186,7 +175,7 @@ def sets_with_one_more(
             continue
         if g[i] < SEARCH.add_share * energy_touched(candidates, i, now):
             continue
-        trial = fit_members(candidates, (*members, i), r, noise)
+        trial = fit_members(candidates, (*members, i), r)
         if admissible(candidates, trial):
             trials.append(trial)
     if not trials:
@@ -211,29 +200,6 @@ def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
     )
 
 
-def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> LinearFit:
-    """Return the best set, grown from the empty set and from pairs with `grow`."""
-    empty = fit_members(candidates, (), r, noise)
-    if in_band(candidates, empty, noise) or not candidates.entries:
-        return empty
-    greedy = grow(candidates, (), r, noise)
-    if len(greedy.members) == 1 and in_band(candidates, greedy, noise):
-        return greedy
-    best, seen = greedy, set[Key]()
-    for first in sets_with_one_more(candidates, (), r, noise)[
-        : 3 * SEARCH.pair_starts
-    ] or _best_singles(candidates, r):
-        key = candidates.entries[first.members[0]].variant.key
-        if key in seen or len(seen) >= SEARCH.pair_starts:
-            continue
-        seen.add(key)
-        for pair in sets_with_one_more(candidates, first.members, r, noise)[:1]:
-            other = grow(candidates, pair.members, r, noise)
-            if len(other.members) <= max(2, len(best.members)) and other.total < 0.7 * best.total:
-                best = other
-    return best
-
-
 def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[LinearFit]:
     """Return the `count` pairs of different candidates that leave least."""
     starts: dict[Key, LinearFit] = {}
@@ -241,7 +207,7 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
         starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[: SEARCH.pair_starts]:
-        for pair in sets_with_one_more(candidates, first.members, r, 1.0)[:3]:
+        for pair in sets_with_one_more(candidates, first.members, r)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
@@ -252,59 +218,7 @@ def _best_singles(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
     """Return the best single entries, even if none removes enough alone: a pair may."""
     g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least)
     return [
-        fit_members(candidates, (int(i),), r, 1.0)
+        fit_members(candidates, (int(i),), r)
         for i in np.argsort(-g)[: 6 * SEARCH.pair_starts]
         if g[i] > 0
     ]
-
-
-def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float) -> LinearFit:
-    """Return a set with entries added while they remove enough; earlier ones may be exchanged."""
-    now = fit_members(candidates, members, r, noise)
-    while not in_band(candidates, now, noise) and len(now.members) < SEARCH.largest_linear_set:
-        more = sets_with_one_more(candidates, now.members, r, noise)
-        if not more:
-            break
-        grown = prune(candidates, swap(candidates, more[0], r, noise), r, noise)
-        if grown.total > 0.95 * now.total:
-            break
-        now = grown
-    return prune(candidates, now, r, noise)
-
-
-def swap(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
-    """Return the set with members exchanged, one by one, for entries that leave less."""
-    for _ in range(2):
-        before = chosen
-        for m in chosen.members[:-1]:
-            others = tuple(k for k in chosen.members if k != m)
-            for trial in sets_with_one_more(candidates, others, r, noise)[:1]:
-                if trial.total < 0.9 * chosen.total:
-                    chosen = trial
-                    break
-        if chosen is before:
-            break
-    return chosen
-
-
-def prune(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
-    """Return the set without members that remove less than `SEARCH.add_share`."""
-    while len(chosen.members) > 1:
-        shares = {m: removed_share(candidates, chosen, m, r, noise) for m in chosen.members}
-        worst = min(shares, key=lambda m: shares[m])
-        if shares[worst] >= SEARCH.add_share:
-            break
-        chosen = fit_members(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
-    return chosen
-
-
-def removed_share(
-    candidates: CandidateColumns, chosen: LinearFit, member: int, r: Array, noise: float
-) -> float:
-    """Return the share of energy above noise that a member removes in its equations."""
-    rest = fit_members(candidates, tuple(m for m in chosen.members if m != member), r, noise)
-    before, after = (
-        energy_touched(candidates, member, rest),
-        energy_touched(candidates, member, chosen),
-    )
-    return (before - after) / before if before > 0 else 0.0

@@ -147,7 +147,7 @@ RULES: Final = (
     Rule("pruning", "effects that remove little are kept",
          ((HypothesisSet, "prune", lambda _, one: one),)),
     Rule("pairs", "no pair of effects is tried at once",
-         ((HypothesisSet, "_pairs", lambda *_: []),)),
+         ((linear_fit, "best_pairs", lambda *_: []),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
     Rule("two for one", "no effect is exchanged for two that leave less",
