@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -349,6 +350,7 @@ PRESSURE = 4e6 + 1e6 * WAVE
         ("cap_pressure_2", np.maximum(PRESSURE, 3.1e6), "its bottom; is the sensor"),
         ("cap_pressure_2", 3 * PRESSURE, "to an end of the range -100000 to 1e+07 of the rig's"),
         ("supply_pressure", np.full(4000, 7e6), "every sample is 7e+06 Pa"),
+        ("piston_2", 5e-5 * WAVE, "moves by 0.00013 m, 0.16 % of the range of the rig's"),
         ("cap_pressure_2", np.round(np.minimum(PRESSURE, 4.8e6) / 200) * 200, "its top"),
     ],
 )
@@ -381,6 +383,22 @@ def test_channels_of_a_locked_joint_may_stand_still(tmp_path: Path) -> None:
     still = np.zeros(4000)
     data = moving(spool_1=still, piston_1=still, oil_temperature=np.full(4000, 40.0))
     assert bring(tmp_path, ONE, a__csv=csv(data=data)).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("locked: [1, 2]", "a.csv: every joint is locked"),
+        ("locked: [1], period: 5000", "a.csv: has 4000 samples, less than its period of 5000"),
+        ("locked: [1], bandwidth: 600 Hz", "a.csv: bandwidth of 600 Hz, expected below .*500 Hz"),
+    ],
+)
+def test_an_entry_that_its_samples_contradict_is_spoken_of(
+    tmp_path: Path, entry: str, said: str
+) -> None:
+    manifest = ONE.replace("locked: [1]", entry)
+    report = bring(tmp_path, manifest, a__csv=csv(data=moving()))
+    assert any(re.match(said, warning) for warning in report.warnings)
 
 
 def test_a_full_disk_is_said_and_leaves_no_half_run(tmp_path: Path) -> None:

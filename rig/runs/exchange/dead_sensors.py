@@ -22,7 +22,7 @@ _DRIVEN = (ch.SPOOL, ch.DRIVE)  # channels that a waveform or its limit may keep
 
 
 def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
-    """Return a sentence for each constant or clipped channel (n,); [] if there is none.
+    """Return a sentence for each constant, clipped or hardly moving channel (n,); else [].
 
     Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
     """
@@ -36,6 +36,15 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
         if low == high:
             said.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
             continue
+        if kind in (ch.PISTON, ch.POSITION):
+            ends = rig.sensors.of(kind).range
+            share = (high - low) / (ends[1] - ends[0])
+            if share < EXCHANGE.least_travel:
+                said.append(
+                    f"{name}: moves by {high - low:.3g} {unit}, {100 * share:.2f} % of the range "
+                    "of the rig's sensor; is the unit another?"
+                )
+                continue
         beyond = _beyond(rig, kind, name, low, high)
         flat = [] if beyond or kind in _DRIVEN else _flat(name, values, unit)
         said += beyond + flat

@@ -247,6 +247,7 @@ def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
         if abs(rate - rig.sample_rate) > 1e-6 * rig.sample_rate:
             warnings.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")
     for r in records:
+        warnings += _warnings_of_entry(rig, r)
         silent = silent_sensors(rig, r.entry.locked, r.channels)
         warnings += [f"{r.entry.file}, {sentence}" for sentence in silent]
     lengths: dict[str, set[int]] = {}
@@ -257,6 +258,20 @@ def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
             few, many = min(sizes), max(sizes)
             warnings.append(f"step {step!r}: its repeats have {few} to {many} samples")
     return tuple(warnings)
+
+
+def _warnings_of_entry(rig: Rig, r: _Imported) -> list[str]:
+    """Say what a record's entry states that its samples contradict, or that leaves it no use."""
+    file, samples = r.entry.file, len(next(iter(r.channels.values())))
+    out = []
+    if len(r.entry.locked) == len(rig.joints):
+        out.append(f"{file}: every joint is locked; a record is of use where one moves")
+    if r.entry.period > samples:
+        out.append(f"{file}: has {samples} samples, less than its period of {r.entry.period}")
+    if r.entry.bandwidth is not None and r.entry.bandwidth >= 0.5 * r.sample_rate:
+        width, half = r.entry.bandwidth, 0.5 * r.sample_rate
+        out.append(f"{file}: bandwidth of {width:g} Hz, expected below half the rate, {half:g} Hz")
+    return out
 
 
 def _write(

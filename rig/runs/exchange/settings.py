@@ -31,6 +31,7 @@ class ExchangeSettings:
     share: float = 0.5  # of the samples near an extreme with its exact value; a parabola: a third
     least: int = 10  # samples at one value before it is reported
     end: float = 1e-3  # of a sensor's range, from its end
+    least_travel: float = 2e-3  # of a position sensor's range: a joint that is free moves more
 
 
 EXCHANGE: Final = ExchangeSettings()
