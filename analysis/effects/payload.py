@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.constants import g as standard_gravity
 
 from analysis.effects.base import Array, Effect, beyond
 from analysis.signals.conditioning import Signals
@@ -26,8 +27,6 @@ from analysis.terms.inertia import Inertia, inertia_map
 from analysis.terms.sine_cosine import sine_cosine
 from rig.model.parameters import inertia_names
 from rig.model.rig import Rig
-
-HEAVIEST = 200.0  # [kg] beyond what the catalogue's benches carry
 
 
 @dataclass(frozen=True)
@@ -90,12 +89,21 @@ class Payload(Effect):
         return np.array([values["m_payload"], rig.gravity, *(j.link_length for j in rig.joints)])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a negative mass, or one beyond any bench."""
-        return beyond("m_payload", values["m_payload"], "kg", HEAVIEST)
+        """Reject a negative mass, and one that no joint can lift."""
+        return beyond("m_payload", values["m_payload"], "kg", heaviest_payload(rig))
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return each link's absolute angle [rad]."""
         return {equation("torque", i): signals.theta[:, i] for i in range(signals.joints)}
+
+
+def heaviest_payload(rig: Rig) -> float:
+    """Return the largest mass [kg] that a joint can lift at its link's end, in mid-stroke."""
+    joints = enumerate(rig.joints)
+    lifted = [
+        rig.largest_force(i) * abs(float(j.geometry(0.0)[1])) / j.link_length for i, j in joints
+    ]
+    return float(max(lifted) / standard_gravity)
 
 
 def growth(rig: Rig) -> dict[str, float]:

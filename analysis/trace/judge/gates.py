@@ -48,6 +48,11 @@ def passes_gates(effect: JudgedEffect) -> bool:
     return all(gate.ok for gate in effect.gates if gate.name != NO_RIVAL)
 
 
+def removes(effect: JudgedEffect) -> bool:
+    """Return whether an effect removes enough held-out residual, whatever else refuses it."""
+    return any(gate.ok for gate in effect.gates if gate.name == REMOVES)
+
+
 def refused_effects(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
     """Return the effects that fail a gate, each once, those that remove most first.
 

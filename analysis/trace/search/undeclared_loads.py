@@ -18,7 +18,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.payload import HEAVIEST, Payload, growth
+from analysis.effects.base import Effect
+from analysis.effects.payload import Payload, growth, heaviest_payload
 from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
@@ -89,17 +90,20 @@ class _LoadRows:
 
 def undeclared_load(
     rig: Rig, terms: Sequence[Used], train: Sequence[Run], holdout: Sequence[Run],
-    judge: Sequence[Run],
+    judge: Sequence[Run], beside: Sequence[Effect] = (),
 ) -> UndeclaredLoad | None:  # fmt: skip
     """Return the runs with the load that the torque rows show in some records, None if in none.
 
-    In a record that nothing is fitted to, its rows alone decide; in a held-out record whose rows
-    are divided, the rows that choose.
+    The load alone is tried, then with the effects `beside` it. In a record that nothing is fitted
+    to, its rows alone decide; in a held-out record whose rows are divided, the rows that choose.
     """
     unseen = (*holdout, *judge)
     if any(record.loaded is not None for run in (*train, *unseen) for record in run.records):
         return None
     load = fitted_load(rig, terms, train)
+    if load is None and beside:
+        terms = (*terms, *(Used(effect, effect.shape_of(rig, ())) for effect in beside))
+        load = fitted_load(rig, terms, train)
     if load is None:
         return None
     found = [
@@ -152,7 +156,7 @@ def fitted_load(rig: Rig, terms: Sequence[Used], runs: Sequence[Run]) -> LoadFit
     start = float(before @ before)
     removed, excess = start - float(after @ after), start - len(before)
     by_chance = TRACE.standard_errors * np.sqrt(2.0 * len(before))
-    if loaded.all() or not loaded.any() or not 0.0 < mass < HEAVIEST:
+    if loaded.all() or not loaded.any() or not 0.0 < mass < heaviest_payload(rig):
         return None
     agrees = _inertia_agrees(rows, basis, loaded)
     if excess < by_chance or removed < DATA.load_share * excess or agrees is False:

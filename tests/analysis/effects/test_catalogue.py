@@ -353,6 +353,7 @@ REFUSED = [
     ("tank_pressure", "bench", {}, (0.0, 5e5)),
     ("base_inclination", "bench", {}, (0.35,)),
     ("payload", "bench", {"m_payload": -1.0}, ()),
+    ("payload", "bench", {"m_payload": 1000.0}, ()),
     ("joint_spring", "joint 2", {"k_spring_2": -30.0}, (-1.44,)),
     ("joint_spring", "joint 2", {"k_spring_2": 30.0}, (0.5,)),
     ("torque_offset", "joint 2", {"T_offset_2": 1e4}, ()),

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis.effects.friction import CoulombFriction
 from analysis.effects.payload import Payload
 from analysis.identify.identify import identify
 from analysis.simulation.validate import validate
@@ -77,6 +78,7 @@ def test_a_stated_load_is_identified_with_the_bare_arm_beside_it(
         assert min(x for name, x in fit.items() if name.startswith("piston")) > 90.0
 
 
+@pytest.mark.slow
 def test_an_undeclared_load_is_named_with_the_steps_that_carry_it(
     rig: Rig, runs: tuple[Run, Run]
 ) -> None:
@@ -111,6 +113,31 @@ def test_a_load_in_one_repeat_of_a_step_makes_it_a_step_of_its_own(
         (f"step{k}{word}", bool(word)) for k in (1, 2, 3) for word in ("", ", loaded")
     }
     assert "step1_heavy_r2" in load.words
+
+
+def rubbing(run: Run, force: float) -> Run:
+    """Return the run as if dry friction [N] braked piston 2, carried by both chambers alike."""
+    window = np.hanning(41) / np.hanning(41).sum()
+    records = []
+    for record in run.records:
+        s = np.convolve(np.pad(record.channels["piston_2"], 20, mode="edge"), window, "valid")
+        extra = force * np.tanh(np.gradient(s) * record.sample_rate / 2e-3)
+        channels = dict(record.channels)
+        channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * extra / 7.0e-4
+        channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * extra / 5.4e-4
+        records.append(replace(record, channels=channels))
+    return replace(run, records=tuple(records))
+
+
+def test_a_load_is_found_beside_louder_friction(rig: Rig, runs: tuple[Run, Run]) -> None:
+    train, held_out = (rubbing(run, 400.0) for run in runs)
+    terms = tuple(map(Used, baseline_of(rig)))
+    assert undeclared_load(rig, terms, [train], [held_out], []) is None
+    friction = [CoulombFriction("joint 2")]
+    load = undeclared_load(rig, terms, [train], [held_out], [], friction)
+    assert load is not None
+    assert [r.loaded for r in load.train[0].records] == list(map(heavy, train.records))
+    assert "carry about 1.5 kg more" in load.words
 
 
 @pytest.mark.parametrize("word", [0, 1])
