@@ -122,7 +122,8 @@ class Effect(Term):
 
     `stage` orders the terms' `prepare` (see `ordered`): sensor errors are undone first, then come
     effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
-    others need not be rebuilt for another shape. `hydraulic` marks effects on oil, valve or
+    others need not be rebuilt for another shape. `rescales` marks effects that multiply signals and
+    their noise by a factor. `hydraulic` marks effects on oil, valve or
     cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
     [SI] of the smallest size of interest on a bench of some kW at some MPa.
 
@@ -149,6 +150,7 @@ class Effect(Term):
     stage: ClassVar[int] = PLANT
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False
+    rescales: ClassVar[bool] = False
 
     @property
     def place(self) -> str:

@@ -275,6 +275,7 @@ class SensorLag(Late):
 class SensorCrosstalk(Sensor):
     """reading of one chamber's pressure = p + k times the other chamber's (electrical coupling)."""
 
+    rescales: ClassVar[bool] = True
     name: ClassVar[str] = "sensor_crosstalk"
     least_shape: ClassVar[tuple[float, ...]] = (0.01,)
     variable: ClassVar[str] = "the other chamber's pressure"
@@ -328,6 +329,7 @@ class SensorCrosstalk(Sensor):
 class SensorGain(Sensor):
     """reading = gain x."""
 
+    rescales: ClassVar[bool] = True
     name: ClassVar[str] = "sensor_gain"
     least_shape: ClassVar[tuple[float, ...]] = (1.01,)
     variable: ClassVar[str] = "the channel itself"

@@ -94,8 +94,10 @@ def negative_body(rig: Rig, fit: ExactFit, baseline: ExactFit) -> str:
         is_body = name[0] in "MW" and name[1:].isdigit() and rig.nominal.get(name, 0.0) >= 0.0
         if is_body and value < -share * abs(before) and before > share * value:
             scale = np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
-            inverse = np.linalg.pinv(fit.information / np.outer(scale, scale), hermitian=True)
-            if value < -TRACE.standard_errors * np.sqrt(inverse[k, k]) / scale[k]:
+            unit = fit.information / np.outer(scale, scale)
+            inverse = np.linalg.pinv(unit, hermitian=True)
+            determined = float(inverse[k] @ unit[k]) > 0.5  # 1, or 0 where the rows say nothing
+            if determined and value < -TRACE.standard_errors * np.sqrt(inverse[k, k]) / scale[k]:
                 return f"{name} would be {value:.4g}, below zero"
     return ""
 

@@ -1,9 +1,9 @@
 """Refinement: the exact fit of a set of effects, with shapes by variable projection.
 
 The rows of the averaged records are computed again at every shape, the linear coefficients are
-solved for, and only the shapes are searched (Golub and Pereyra, 1973). An effect that changes the
-size of the right side (a sensor's gain) must not reduce the residual by that: rows are scaled back
-to the right side's size before the change.
+solved for, and only the shapes are searched (Golub and Pereyra, 1973). An effect that rescales the
+right side and its noise (a sensor's gain) must not reduce the residual by that: rows are scaled
+back to the right side's size before the change.
 """
 
 from __future__ import annotations
@@ -112,6 +112,9 @@ def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> 
         for record, rows in zip(data.records, data.rows, strict=True)
     }
     own_rows = data.family_rows[family]
+    rescaled = any(
+        isinstance(u.term, Effect) and u.term.rescales and u not in data.terms for u in terms
+    )
     X, y = np.zeros((len(own_rows), len(names))), data.mean_residual[own_rows]
     kept: dict[str, list[Indices]] = {}
     every: dict[str, list[Indices]] = {}
@@ -121,9 +124,9 @@ def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> 
             continue
         before, rows = (side[segment.equation] for side in built[segment.group])
         here, there = in_common(before, rows)
-        size = np.linalg.norm(before.rhs[here]) / max(
-            float(np.linalg.norm(rows.rhs[there])), 1e-300
-        )
+        size = 1.0
+        if rescaled:  # about the mean, which is the difference of two large forces
+            size = float(np.std(before.rhs[here])) / max(float(np.std(rows.rhs[there])), 1e-300)
         weight = np.sqrt(segment.repeats) / segment.noise * size
         own = np.arange(start, start + len(before.rhs))
         inside = slice(start, start + len(own))
