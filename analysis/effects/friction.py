@@ -225,7 +225,7 @@ class CoulombFriction(Friction):
         "pressure_dependent_friction",
     )
     separated_by: ClassVar[str] = (
-        "two amplitudes of one frequency: its torque is the same, that of viscous friction doubles"
+        "the same motion at two speeds and at two levels of chamber pressure: its level is the same"
     )
 
     @property

@@ -14,12 +14,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shapes_of
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces, segments
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
+from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.search.refinement import (
     ExactFit,
@@ -29,6 +30,7 @@ from analysis.trace.search.refinement import (
     tangent,
 )
 from analysis.trace.settings import SEARCH, TRACE
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -109,7 +111,8 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     """Return the possible error of every coefficient and shape by unknown forms, by name.
 
     Two errors are added as squares. (1) Where an effect has another form (`Effect.other_forms`),
-    that is fitted too and shifts each coefficient. The shift counts by sqrt(E / E'), with E and E'
+    that is fitted too and shifts each coefficient, but for its own under another load, where they
+    mean something else. The shift counts by sqrt(E / E'), with E and E'
     the energies above noise that the chosen and the other form leave: in full where the other is as
     good. (2) An effect may not grow in proportion, with x (1 + e |x| / rms x) in place of its
     contribution x to the rows. Where e exceeds `TRACE.standard_errors` of its noise, the shift that
@@ -121,10 +124,28 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     for other in fits_in_other_forms(train_data, fit):
         left = max(other.energy - noise, np.sqrt(2.0 * noise))
         share = min(1.0, own / left)
+        incomparable = _of_other_meaning(train_data.rig, fit, other)
         for name, value in other.beta.items():
+            if name in incomparable:
+                continue
             shift = value - fit.beta.get(name, value)
             squares[name] = squares.get(name, 0.0) + share * shift**2
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
+
+
+def _of_other_meaning(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:
+    """Return the coefficients of effects whose fixed shapes, as the load of a friction, differ."""
+
+    def fixed(used: Used) -> list[float]:
+        shapes = shapes_of(rig, used)
+        return [v for s, v in zip(shapes, used.shape, strict=True) if s.fixed]
+
+    return {
+        c.parameter
+        for used, changed in zip(fit.terms, other.terms, strict=True)
+        if isinstance(used.term, Effect) and fixed(used) != fixed(changed)
+        for c in used.term.coefficients(rig)
+    }
 
 
 def _growth_shift_squares(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
