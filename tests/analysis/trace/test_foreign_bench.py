@@ -111,6 +111,7 @@ def test_a_joint_that_sticks_now_and_then_is_fitted_in_motion(rig: Rig) -> None:
     assert any("without the samples at which the joint rests" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_levels_by_direction_of_a_joint_that_sticks_are_found_in_motion(rig: Rig) -> None:
     """In all rows one level of 53 N seems to explain them."""
     result = traced(rig, Hidden(60.0, 40.0, 5e-4, KARNOPP), *FORCES)
@@ -235,6 +236,7 @@ def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
     assert {k["unit"] for n, k in knots.items() if "knot" in n} == {"m/s"}
 
 
+@pytest.mark.slow
 def test_dry_friction_that_grows_along_the_stroke_is_a_curve_that_grows(rig: Rig) -> None:
     """The level of 80 N grows by 1 % a millimetre, where Coulomb's law has one level."""
     result = traced(rig, Hidden(80.0, 80.0, tighter=10.0), *FORCES)
