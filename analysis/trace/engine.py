@@ -30,7 +30,13 @@ from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
-from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows
+from analysis.trace.finding import (
+    Finding,
+    TraceRows,
+    TraceRuns,
+    trace_rows,
+    unstated_noise,
+)
 from analysis.trace.in_motion import (
     find,
     fitted_in_motion,
@@ -67,7 +73,7 @@ from analysis.trace.result import (
     Trace,
 )
 from analysis.trace.search.hypothesis import Hypothesis
-from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError
@@ -133,7 +139,8 @@ def trace(
     result = replace(result, notes=(*notes, *result.notes))
     load = None
     if result.verdict == UNEXPLAINED and MECHANICAL in families and options.may_be_load:
-        load = undeclared_load(with_b, known, train, unseen, judging)
+        beside = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
+        load = undeclared_load(with_b, known, train, unseen, judging, beside)
     if load is None:
         return result
     records = TraceRuns(load.train, load.holdout, load.judge, records.families)
@@ -171,7 +178,7 @@ class _Options:
 class _Prepared:
     """What a trace begins with: rows without unlocked lines, candidates, the baseline identified.
 
-    `as_recorded` are the training rows with the lines, `notes` what the rows and the baseline show.
+    `as_recorded` are the training rows with the lines, `notes` what the baseline shows.
     """
 
     records: TraceRuns
@@ -193,8 +200,6 @@ def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
     moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
     baseline = _identified(records.train, rows.train.terms)
     notes = (
-        *rows.unseen.notes,
-        *evidence_notes(rows.train, rows.unseen.choosing),
         *undetermined_notes(baseline.model),
         *(check.detail for check in baseline.checks if check.name == GEOMETRY),
     )
@@ -253,15 +258,18 @@ def _traced(
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
     started = time.perf_counter()
     prepared = _prepared(rig, records, options)
-    before, rows, terms = prepared.baseline, prepared.rows, prepared.terms
+    before, terms = prepared.baseline, prepared.terms
 
     def columns(share: float) -> None:
         done(PREPARED + (COLUMNS - PREPARED) * share)
 
-    finding = find(
-        rig, terms, prepared.records, rows, prepared.candidates, prepared.free, options.seed,
-        columns,
-    )  # fmt: skip
+    def searched(p: _Prepared) -> Finding:
+        return find(rig, terms, p.records, p.rows, p.candidates, p.free, options.seed, columns)
+
+    finding = searched(prepared)
+    if known := unstated_noise(rig, terms, prepared.records, finding):
+        prepared = replace(prepared, records=known[0], rows=known[1])
+        finding = searched(prepared)
     done(JUDGED)
     records = replace(prepared.records, lines=finding.rows.lines)
     hypotheses, train_data, unseen = finding.hypotheses, finding.rows.train, finding.rows.unseen
@@ -287,7 +295,14 @@ def _traced(
     )
     curves = curves_that_limit(unseen.judging, winner.fit)
     error = held_out.errors(
-        rig, unseen.members, first, last, unseen.divided, curves, train_data.floors
+        rig,
+        unseen.members,
+        first,
+        last,
+        unseen.divided,
+        curves,
+        train_data.floors,
+        records.noise_ratio,
     )
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
@@ -297,6 +312,8 @@ def _traced(
     )
     undetermined = [n for n, e in before.parameters.items() if not e.identified]
     notes = [
+        *prepared.rows.unseen.notes,
+        *evidence_notes(prepared.rows.train, prepared.rows.unseen.choosing),
         *prepared.notes,
         *unrepeated_notes(train_data),
         *finding.notes,

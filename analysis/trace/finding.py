@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from analysis.trace.data.conditioned_record import (
     conditioned_records,
     trace_filtering,
 )
+from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import UnseenRows, set_aside
 from analysis.trace.data.spool_path import path_terms
@@ -27,7 +28,7 @@ from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
 from analysis.trace.judge.unlocked import Line
 from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.notes import WHY_MASKED
-from analysis.trace.remaining import Remainder, remainders
+from analysis.trace.remaining import Remainder, clues_to, remainders
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -38,7 +39,7 @@ from analysis.trace.result import (
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.hypothesis import Hypothesis, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import DATA, TRACE
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -54,7 +55,8 @@ ONLY_HELD_OUT_MISSED = (
 class TraceRuns:
     """Runs by their task, and the families of equations that are traced.
 
-    Sines at `lines` (joint, 0-based, and frequency [Hz]) are taken out of the torque balances.
+    Sines at `lines` (joint, 0-based, and frequency [Hz]) are taken out of the torque balances;
+    `noise_ratio` is by equation that of the noise to the stated noise where nothing repeats.
     """
 
     train: tuple[Run, ...]
@@ -62,6 +64,7 @@ class TraceRuns:
     judge: tuple[Run, ...]
     families: tuple[str, ...]
     lines: tuple[Line, ...] = ()
+    noise_ratio: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -132,26 +135,64 @@ def trace_rows(
     def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
         return conditioned_records(rig, runs, filters, records.families)
 
-    train_data = _training_rows(rig, terms, conditioned(records.train), cache)
-    terms, beta = train_data.terms, train_data.beta
+    train_data = _training_rows(rig, terms, conditioned(records.train), cache, records.noise_ratio)
+
+    def unseen(members: Sequence[ConditionedRecord]) -> RegressionData:
+        beta, floors = train_data.beta, train_data.floors
+        return regression_data(
+            rig, train_data.terms, members, beta, others=floors, noise_ratio=records.noise_ratio
+        )
+
     members = conditioned(records.holdout)
-    data = regression_data(rig, terms, members, beta, others=train_data.floors)
+    data = unseen(members)
     if not records.judge:
         return TraceRows(train_data, set_aside(data, members, records.holdout))
     members = conditioned(records.judge)
-    judging = regression_data(rig, terms, members, beta, others=train_data.floors)
+    judging = unseen(members)
     return TraceRows(train_data, UnseenRows(data, judging, tuple(members), records.holdout))
 
 
 def _training_rows(
-    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord], cache: RowCache | None
-) -> RegressionData:
+    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord], cache: RowCache | None,
+    noise_ratio: Mapping[str, float],
+) -> RegressionData:  # fmt: skip
     """Return the training rows, with the columns of the spools' paths between samples."""
-    data = _without_masked_steps(regression_data(rig, terms, train, cache=cache))
+
+    def rows(terms: tuple[Used, ...]) -> RegressionData:
+        data = regression_data(rig, terms, train, cache=cache, noise_ratio=noise_ratio)
+        return _without_masked_steps(data)
+
+    data = rows(terms)
     paths = path_terms(data)
-    if not paths:
-        return data
-    return _without_masked_steps(regression_data(rig, (*terms, *paths), train, cache=cache))
+    return rows((*terms, *paths)) if paths else data
+
+
+def unstated_noise(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, finding: Finding
+) -> tuple[TraceRuns, TraceRows] | None:
+    """Return runs and rows whose noise floors are what the baseline leaves, where nothing repeats.
+
+    The stated noise may lack what a sensor has at low frequencies. None where an equation's noise
+    was measured, where it leaves more than `DATA.unstated_ratio` times the stated noise, or where
+    an effect or a variable of the records removes a part of that from held-out records.
+    """
+    data, winner = finding.rows.train, finding.winner
+    measured = any(f.source != STATED for f in data.floors)
+    removed = any(map(gates.removes, finding.effects))
+    if finding.verdict != UNEXPLAINED or winner.effects or removed or measured:
+        return None
+    ratio = {}
+    for name in {f.equation for f in data.floors}:
+        own = [f for f in data.floors if f.equation == name]
+        powers = (sum(f.total**2 for f in own), sum(f.stated**2 for f in own))
+        ratio[name] = float(np.sqrt(powers[0] / max(powers[1], 1e-300)))
+    moves, formulas = clues_to(data, finding.rows.unseen.choosing, winner, ())
+    follows = formulas or any(m.share > DATA.unstated_clue for m in moves)
+    if max(ratio.values()) > DATA.unstated_ratio or follows:
+        return None
+    above = {name: max(1.0, value) for name, value in ratio.items()}
+    records = replace(records, noise_ratio=above)
+    return records, trace_rows(rig, terms, records)
 
 
 def _without_masked_steps(train_data: RegressionData) -> RegressionData:

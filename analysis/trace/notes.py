@@ -6,9 +6,17 @@ from collections.abc import Collection, Sequence
 from typing import Final
 
 from analysis.effects.base import Effect
+from analysis.effects.free_flows import BulkModulusCurve
 from analysis.effects.free_forces import FrictionCurve, PositionForce
 from analysis.simulation.model import Model
-from analysis.trace.data.noise_floor import NEIGHBOURS, OTHER_STEPS, PERIODS, REPEATS, STATED
+from analysis.trace.data.noise_floor import (
+    NEIGHBOURS,
+    OTHER_STEPS,
+    PERIODS,
+    REPEATS,
+    STATED,
+    UNSTATED,
+)
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.judge.held_out import refitted_names
 from analysis.trace.result import JudgedEffect
@@ -31,7 +39,15 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
             "the rig file's stated sensor noise; noise above that value would be taken "
             "for model error, so the evidence for every name is weaker"
         )
-    elif not sources <= {REPEATS, OTHER_STEPS}:
+    if UNSTATED in sources:
+        most = max(train_data.floors, key=lambda f: f.noise / f.stated)
+        times = plain(most.noise / most.stated, 2)
+        out.append(
+            f"nothing repeats, and what the model leaves, up to {times} times the stated sensor "
+            f"noise in {most.equation}, follows no variable of the records: it counts as noise; "
+            "repeat a record to measure the noise"
+        )
+    elif not sources <= {REPEATS, OTHER_STEPS, STATED}:
         where = PERIODS if PERIODS in sources else NEIGHBOURS
         out.append(f"one repeat per step: the noise floor comes from {where} within the record")
     if all(f.source == STATED for f in holdout_data.floors):
@@ -137,6 +153,9 @@ def shared_parameter_notes(winner: Hypothesis, after: Model) -> list[str]:
         elif isinstance(effect, FrictionCurve) and not after.rig.electric:
             name, what = f"Fv{effect.joint + 1}", "viscous friction"
             why = "where the lever arm hardly changes it is a slope of friction over speed too"
+        elif isinstance(effect, BulkModulusCurve):
+            name, what = "b", "bulk modulus of oil without air"
+            why = "only its sum with the curve at the pressures of the records is determined"
         else:
             continue
         if name in after.parameters:

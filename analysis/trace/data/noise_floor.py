@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 
 REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
 OTHER_STEPS = "repeats of other steps"
+UNSTATED = "a residual that follows nothing"
 Group = tuple[int, str]
 NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
 
@@ -79,11 +80,13 @@ def floors(
     rows: Sequence[Mapping[str, Rows]],
     beta: Mapping[str, float],
     others: Sequence[Floor] = (),
+    noise_ratio: Mapping[str, float] | None = None,
 ) -> list[Floor]:
     """Return the split of every equation of every group of records under a model.
 
     `others` are floors of other records of the machine: groups without repeats take the ratio of
-    measured to stated noise from those and from the groups that have repeats.
+    measured to stated noise from those and from the groups that have repeats. `noise_ratio` is that
+    ratio by equation for stated noise that is left.
     """
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
@@ -112,7 +115,8 @@ def floors(
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
             out.append(_unrepeated(group, equation, noise, total, source, sensors))
     scale = _measured_over_stated([*out, *others])
-    return [_scaled(floor, scale) for floor in out]
+    scaled = (_scaled(floor, scale, OTHER_STEPS) for floor in out)
+    return [_scaled(floor, noise_ratio or {}, UNSTATED) for floor in scaled]
 
 
 def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:
@@ -134,12 +138,12 @@ def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:
     }
 
 
-def _scaled(floor: Floor, scale: Mapping[str, float]) -> Floor:
+def _scaled(floor: Floor, scale: Mapping[str, float], source: str) -> Floor:
     """Return a floor by stated noise times the ratio of its equation, others unchanged."""
     if floor.source != STATED or floor.equation not in scale:
         return floor
     noise = floor.stated * scale[floor.equation]
-    return _unrepeated(floor.group, floor.equation, noise, floor.total, OTHER_STEPS, floor.stated)
+    return _unrepeated(floor.group, floor.equation, noise, floor.total, source, floor.stated)
 
 
 def _unrepeated(

@@ -176,16 +176,17 @@ def regression_data(
     beta: Mapping[str, float] | None = None,
     cache: RowCache | None = None,
     others: Sequence[Floor] = (),
+    noise_ratio: Mapping[str, float] | None = None,
 ) -> RegressionData:
     """Return the whitened rows of records under a model (see the module).
 
     Without `beta` the coefficients are fitted to these records; `cache` may hold rows of the same
-    records and filters; `others` are those of `noise_floor.floors`. Raises InputError where filter
-    edges leave no rows.
+    records and filters; `others` and `noise_ratio` are those of `noise_floor.floors`. Raises
+    InputError where filter edges leave no rows.
     """
     every = [model_rows(rig, terms, conditioned) for conditioned in members]
     beta = least_squares(rig, every) if beta is None else beta
-    split = floors(rig, terms, members, every, beta, others)
+    split = floors(rig, terms, members, every, beta, others, noise_ratio)
     averages = averaged_records(rig, members)
     mean_rows = [model_rows(rig, terms, conditioned) for conditioned in averages]
     names = tuple(

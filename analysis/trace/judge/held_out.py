@@ -117,13 +117,15 @@ def errors(
     divided: Collection[Group] = (),
     curves: Sequence[Used] = (),
     others: Sequence[Floor] = (),
+    noise_ratio: Mapping[str, float] | None = None,
 ) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
     `members` are the records, each repeat by itself; of those in `divided` groups only the judging
     rows count, and only rows within the outermost knots of `curves`. The noise floor is that of the
     residual under the model `after`. A record without repeats has a floor by its periods or
-    neighbouring states, for which all its rows are used, or by `others` (`noise_floor.floors`).
+    neighbouring states, for which all its rows are used, or by `others` or `noise_ratio`
+    (`noise_floor.floors`).
     Sines that are taken out of the rows are part of what the model `before` leaves.
     """
     bare = [replace(c, filtering=replace(c.filtering, lines=())) for c in members]
@@ -140,7 +142,7 @@ def errors(
         rows if repeats[c.group] > 1 else every
         for c, rows, every in zip(members, other, whole, strict=True)
     ]
-    split = floors(rig, after.terms, members, compared, after.beta, others)
+    split = floors(rig, after.terms, members, compared, after.beta, others, noise_ratio)
     floor = {(f.group, f.equation): f.noise for f in split}
     first, other = (
         [

@@ -340,7 +340,7 @@ def friction_beside_a_pressure_offset_is_not_taken_for_two_levels(b: Benches) ->
 
     def offset(run: Run) -> Run:
         name = "cap_pressure_2"
-        changed = [{**r.channels, name: r.channels[name] + 5e4} for r in run.records]
+        changed = [{**r.channels, name: r.channels[name] + 8e4} for r in run.records]
         records = zip(run.records, changed, strict=True)
         return replace(run, records=tuple(replace(r, channels=c) for r, c in records))
 
@@ -362,6 +362,28 @@ def a_spring_that_fits_like_an_inclination_is_its_rival(b: Benches) -> None:
     assert (result.verdict, result.tied) == ("confounded", [("joint_spring", "joint 2")])
     said = "with joint_spring at joint 2 in place of base_inclination, W2 would be 24 % smaller"
     assert any(said in note for note in result.notes)
+
+
+def of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first(b: Benches) -> None:
+    """Held-out records too leave less with the spring, by more than its further number costs."""
+    hidden = foreign_bench.Hidden(spring=10.0, spring_rest=-1.3)
+    runs = b.kept("less noise", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    result = b.traced(runs, "base_inclination", "joint_spring")
+    assert [f.name for f in result.effects] == ["joint_spring"]
+    assert result.tied == [("base_inclination", "bench")]
+
+
+def noise_above_the_stated_one_is_noise_where_nothing_repeats(b: Benches) -> None:
+    """The rig file states two thirds of the noise that the sensors have."""
+    quiet = {
+        name: sensor.model_copy(update={"noise": sensor.noise / 1.5})
+        for name, sensor in b.rig.sensors if hasattr(sensor, "noise")
+    }  # fmt: skip
+    stated = b.rig.model_copy(update={"sensors": b.rig.sensors.model_copy(update=quiet)})
+    train, held_out = (
+        replace(run, rig=stated, records=(replace(run.records[0], period=0),)) for run in b.runs()
+    )
+    assert b.traced((train, held_out), "internal_leakage", "coulomb_friction").verdict == "clean"
 
 
 def a_high_return_pressure_is_found_beside_an_underlap(b: Benches) -> None:
@@ -432,6 +454,8 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (equal_levels_by_direction_are_one_level, ("simpler name",)),
+    (of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first, ("tied sets",)),
+    (noise_above_the_stated_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
     (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),
     (a_drop_without_a_name_is_drawn_as_a_curve, ("free forms",)),
@@ -444,6 +468,9 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
 ELSEWHERE: Final = (
     friction_without_a_memory_is_coulomb_friction_too, a_drop_without_a_name_is_drawn_as_a_curve,
 )  # fmt: skip
+# No small bench is known whose answer they change: pairs find effects that hide each other, as a
+# spring and dry friction of a light arm, of which none reduces the residual alone.
+NO_BENCH: Final = {"pairs"}
 
 
 @pytest.mark.parametrize(("story", "broken"), STORIES, ids=[s.__name__ for s, _ in STORIES])
@@ -464,7 +491,7 @@ def test_what_a_gate_is_for_holds_and_is_lost_without_it(
 
 def test_every_rule_and_fault_has_a_story() -> None:
     told = {name for _, broken in STORIES for name in broken}
-    assert set(by_name(RULES + FAULTS)) == told
+    assert set(by_name(RULES + FAULTS)) - told == NO_BENCH
 
 
 def test_an_edge_cannot_overlap_and_be_open_at_the_null(rig: Rig) -> None:

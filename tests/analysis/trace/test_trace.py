@@ -223,6 +223,29 @@ def test_one_repeat_says_what_it_costs(rig: Rig) -> None:
     assert result.verdict != "clean"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("leak", "verdict"), [(0.0, "clean"), (2e-12, "explained")])
+def test_noise_above_the_stated_one_is_no_model_error_where_it_follows_nothing(
+    rig: Rig, leak: float, verdict: str
+) -> None:
+    """Nothing repeats, and the rig file states two thirds of the noise that the sensors have."""
+    quiet = {
+        name: sensor.model_copy(update={"noise": sensor.noise / 1.5})
+        for name, sensor in rig.sensors if hasattr(sensor, "noise")
+    }  # fmt: skip
+    stated = rig.model_copy(update={"sensors": rig.sensors.model_copy(update=quiet)})
+    train, held_out = (
+        replace(run, rig=stated, records=tuple(replace(r, period=0) for r in run.records))
+        for run in (
+            experiment(rig, repeats=1, c_internal=leak),
+            experiment(rig, repeats=1, seed=2, rms=0.02, c_internal=leak),
+        )
+    )
+    result = trace([train], [held_out], look_ahead=False)
+    assert result.verdict == verdict
+    assert any("it counts as noise" in note for note in result.notes) == (verdict == "clean")
+
+
 @pytest.mark.parametrize("kept", [[], ["same"]])
 def test_held_out_records_must_exist_and_be_other_records(
     quiet: tuple[Run, Run], kept: list[str]
