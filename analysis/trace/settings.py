@@ -134,8 +134,6 @@ class TraceSettings:
     no detection limit reaches it)."""
     most_detection_limits: int = 3
     """Largest number of detection limits in the notes."""
-    normal_quantile: float = 1.96
-    """Half-width of a 95 % interval over the standard error (convention)."""
     eigenvalue_ratio: float = 1e-10
     """Smallest eigenvalue of columns over the largest, below which the columns depend on each other
     (arithmetic)."""

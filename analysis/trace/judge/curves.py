@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.terms.base import Used
@@ -37,7 +38,7 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
         W = np.column_stack([line.weights[n] for n in here])
         y = W @ np.array([known[n] for n in here])
         spread = W @ covariance[np.ix_(at, at)] * W
-        half = TRACE.normal_quantile * np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
+        half = IDENTIFY.normal_quantile * np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
         ends = (y - half, y + half)
         if line.reciprocal:
             y, ends = 1.0 / y, (1.0 / ends[1], 1.0 / ends[0])

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
+from analysis.identify.geometry import wider
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
@@ -134,12 +135,13 @@ def estimates(
     """Return an effect's parameters with 95 % intervals, those of the forms (`shift`) included."""
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
     units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
-    more = np.array([shift.get(name, 0.0) for name in errors.names])
-    half = np.hypot(half_width(errors.std, errors.dof), TRACE.normal_quantile * more)
-    std = np.hypot(errors.std, more)
+    half = half_width(errors.std, errors.dof)
     return {
-        name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
-        for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
+        name: wider(
+            Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h))),
+            shift.get(name, 0.0),
+        )
+        for name, v, s, h in zip(errors.names, errors.value, errors.std, half, strict=True)
     }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.identify.settings import IDENTIFY
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
@@ -119,7 +120,7 @@ def _moved_parameter(
         std = float(np.sqrt(max(covariance[k, k], 0.0)))
         change = value / other - 1.0 if c.reciprocal else other / value - 1.0
         large = abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0)
-        if large and abs(other - value) > TRACE.normal_quantile * std:
+        if large and abs(other - value) > IDENTIFY.normal_quantile * std:
             most = c.parameter, float(change)
     return most
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shapes_of
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces, segments
+from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
@@ -196,9 +197,7 @@ def with_form_errors(
         # The rows may hold the reciprocal: relative sizes are the same.
         relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
         grown = abs(old.value) * float(relative)
-        half = float(np.hypot(old.half, TRACE.normal_quantile * grown))
-        std = float(np.hypot(old.std, grown))
-        parameters[name] = replace(old, std=std, ci95=(old.value - half, old.value + half))
+        parameters[name] = wider(old, grown)
         covariance[names.index(name), names.index(name)] += grown**2
     return replace(model, parameters=parameters, covariance=covariance)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.disturbance import FREQUENCY, PeriodicDisturbance
 from analysis.effects.mechanics import torque_limit
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import WAVES, sines_at, without_sines
 from analysis.simulation.model import Estimate
@@ -224,7 +225,7 @@ def _frequency_error(own: Sequence[_LineFit], amplitude: float) -> float:
 
 
 def _estimate(value: float, unit: str, std: float) -> Estimate:
-    half = TRACE.normal_quantile * std
+    half = IDENTIFY.normal_quantile * std
     return Estimate(value, unit, std, (value - half, value + half))
 
 

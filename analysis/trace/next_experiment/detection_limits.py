@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData
@@ -106,7 +107,7 @@ def _largest_multiple(shown: Array, residual: Array) -> float:
     energy = float(shown @ shown)
     if not energy > 0.0:
         return 0.0
-    return float((abs(shown @ residual) + TRACE.normal_quantile * energy**0.5) / energy)
+    return float((abs(shown @ residual) + IDENTIFY.normal_quantile * energy**0.5) / energy)
 
 
 def _parameter_shifts(
