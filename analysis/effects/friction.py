@@ -298,19 +298,21 @@ class StribeckFriction(Friction):
         if self.remembers(shape):
             w = self.deflection(rig, signals, {}, shape) / shape[1]
         else:
-            w = self._level(rig, signals, shape) * self.contact(rig, signals, shape)
+            level = self._level(rig, signals.sd[:, self.joint], shape)
+            w = level * self.contact(rig, signals, shape)
         return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
 
-    def _level(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
-        """Return exp(-(s'/vs)^2) (n,)."""
-        ratio = signals.sd[:, self.joint] / self.shape_of(rig, shape)[0]
+    def _level(self, rig: Rig, speed: Array, shape: Sequence[float]) -> Array:
+        """Return exp(-(s'/vs)^2) (n,) of speeds s' (n,) [m/s]."""
+        ratio = speed / self.shape_of(rig, shape)[0]
         return np.asarray(np.exp(-(ratio**2)))
 
     def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return w d (n,) [m]."""
-        s, level = self.path(signals, ()), self._level(rig, signals, shape)
+        s = self.path(signals, ())
+        level = self._level(rig, signals.sd[:, self.joint], shape)
         return np.asarray(shape[1] * contact_under_load(s, level, 1.0 / shape[1]))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
@@ -343,8 +345,7 @@ class StribeckFriction(Friction):
         top = max((float(np.abs(s.sd[:, i]).max()) for s in signals if s.excited[i]), default=0.0)
         v = np.linspace(0.0, top, SPEEDS + 1)[1:]
         own = self.coefficients(rig)[0]
-        falling = values[own.parameter] * np.exp(-((v / self.shape_of(rig, shape)[0]) ** 2))
-        total = falling * self.over_speed(v, shape)
+        total = values[own.parameter] * self._level(rig, v, shape) * self.over_speed(v, shape)
         for used in terms:
             other = used.term
             if not isinstance(other, Friction) or other == self or other.where != self.where:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.constants import g as standard_gravity
 
 from analysis.effects.base import Array, Effect, beyond
+from analysis.effects.mechanics import torque_limit
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -99,10 +100,8 @@ class Payload(Effect):
 
 def heaviest_payload(rig: Rig) -> float:
     """Return the largest mass [kg] that a joint can lift at its link's end, in mid-stroke."""
-    joints = enumerate(rig.joints)
-    lifted = [
-        rig.largest_force(i) * abs(float(j.geometry(0.0)[1])) / j.link_length for i, j in joints
-    ]
+    # The limit is half of a joint's largest torque.
+    lifted = (2.0 * torque_limit(rig, i) / j.link_length for i, j in enumerate(rig.joints))
     return float(max(lifted) / standard_gravity)
 
 

@@ -30,13 +30,7 @@ from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
-from analysis.trace.finding import (
-    Finding,
-    TraceRows,
-    TraceRuns,
-    trace_rows,
-    unstated_noise,
-)
+from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows, unstated_noise
 from analysis.trace.in_motion import (
     find,
     fitted_in_motion,
@@ -295,15 +289,9 @@ def _traced(
     )
     curves = curves_that_limit(unseen.judging, winner.fit)
     error = held_out.errors(
-        rig,
-        unseen.members,
-        first,
-        last,
-        unseen.divided,
-        curves,
-        train_data.floors,
+        rig, unseen.members, first, last, unseen.divided, curves, train_data.floors,
         records.noise_ratio,
-    )
+    )  # fmt: skip
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
         detection_limits(hypotheses, prepared.candidates, winner, after)

@@ -186,9 +186,10 @@ def unstated_noise(
         own = [f for f in data.floors if f.equation == name]
         powers = (sum(f.total**2 for f in own), sum(f.stated**2 for f in own))
         ratio[name] = float(np.sqrt(powers[0] / max(powers[1], 1e-300)))
+    if max(ratio.values()) > DATA.unstated_ratio:
+        return None
     moves, formulas = clues_to(data, finding.rows.unseen.choosing, winner, ())
-    follows = formulas or any(m.share > DATA.unstated_clue for m in moves)
-    if max(ratio.values()) > DATA.unstated_ratio or follows:
+    if formulas or any(m.share > DATA.unstated_clue for m in moves):
         return None
     above = {name: max(1.0, value) for name, value in ratio.items()}
     records = replace(records, noise_ratio=above)

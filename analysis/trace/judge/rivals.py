@@ -151,8 +151,11 @@ def best_tied_set(
         energy = hypothesis.fit.energy + float(residual @ residual)
         return energy + SEARCH.number_price * hypothesis.size[1]
 
-    best = min(tied_sets(hypotheses, winner, effects), key=priced, default=winner)
-    return best if priced(best) < priced(winner) - SEARCH.number_price else winner
+    tied = [(priced(o), o) for o in tied_sets(hypotheses, winner, effects)]
+    if not tied:
+        return winner
+    cost, best = min(tied, key=lambda pair: pair[0])
+    return best if cost < priced(winner) - SEARCH.number_price else winner
 
 
 def shift_by_tied_rivals(

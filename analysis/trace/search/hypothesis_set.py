@@ -25,6 +25,7 @@ from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
     evidence,
+    signals_of,
     variant_columns,
 )
 from analysis.trace.search import linear_fit
@@ -356,7 +357,7 @@ class HypothesisSet:
 
     @functools.cached_property
     def _signals(self) -> list[Signals]:
-        return [conditioned.signals for conditioned in self.train_data.records]
+        return signals_of(self.train_data)
 
     @functools.cached_property
     def _acting(self) -> dict[Key, set[str]]:

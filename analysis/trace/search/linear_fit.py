@@ -202,23 +202,16 @@ def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
 
 def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[LinearFit]:
     """Return the `count` pairs of different candidates that leave least."""
-    starts: dict[Key, LinearFit] = {}
-    for first in _best_singles(candidates, r):
-        starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
+    # None of a pair need remove enough alone.
+    g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least)
+    starts: dict[Key, int] = {}
+    for i in map(int, np.argsort(-g)[: 6 * SEARCH.pair_starts]):
+        if g[i] > 0:
+            starts.setdefault(candidates.entries[i].variant.key, i)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[: SEARCH.pair_starts]:
-        for pair in sets_with_one_more(candidates, first.members, r)[:3]:
+        for pair in sets_with_one_more(candidates, (first,), r)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
     return sorted(pairs.values(), key=lambda p: p.total)[:count]
-
-
-def _best_singles(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
-    """Return the best single entries, even if none removes enough alone: a pair may."""
-    g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least)
-    return [
-        fit_members(candidates, (int(i),), r)
-        for i in np.argsort(-g)[: 6 * SEARCH.pair_starts]
-        if g[i] > 0
-    ]

@@ -36,19 +36,24 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
         if low == high:
             said.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
             continue
-        if kind in (ch.PISTON, ch.POSITION):
-            ends = rig.sensors.of(kind).range
-            share = (high - low) / (ends[1] - ends[0])
-            if share < EXCHANGE.least_travel:
-                said.append(
-                    f"{name}: moves by {high - low:.3g} {unit}, {100 * share:.2f} % of the range "
-                    "of the rig's sensor; is the unit another?"
-                )
-                continue
+        if still := _hardly_moves(rig, kind, name, high - low):
+            said += still
+            continue
         beyond = _beyond(rig, kind, name, low, high)
         flat = [] if beyond or kind in _DRIVEN else _flat(name, values, unit)
         said += beyond + flat
     return said
+
+
+def _hardly_moves(rig: Rig, kind: str, name: str, travel: float) -> list[str]:
+    ends = rig.sensors.of(kind).range
+    share = travel / (ends[1] - ends[0])
+    if kind not in (ch.PISTON, ch.POSITION) or share >= EXCHANGE.least_travel:
+        return []
+    return [
+        f"{name}: moves by {travel:.3g} {rig.unit_of(name)}, {100 * share:.2f} % of the range of "
+        "the rig's sensor; is the unit another?"
+    ]
 
 
 def _beyond(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:

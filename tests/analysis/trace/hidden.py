@@ -6,14 +6,17 @@ excitation at seven tenths of its size.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rig.model.records import Run
+from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 
+Array = NDArray[np.float64]
 RMS = 0.03
 
 
@@ -38,33 +41,52 @@ def pair_of_runs(rig: Rig, **wrong: float) -> tuple[Run, Run]:
     return experiment(rig, **wrong), experiment(rig, repeats=2, seed=2, rms=0.7 * RMS, **wrong)
 
 
-def hardening(run: Run, force_per_cubed: float) -> Run:
-    """Return the run as if a hardening spring pulled at the piston, by its pressures.
+def with_force(run: Run, force: Callable[[Record], Array]) -> Run:
+    """Return the run as if a force (n,) [N] braked piston 2, by its pressures.
 
-    The force F = k s^3 is carried by both chambers alike, so that the motion stays as it is and the
-    flows hardly change: something that no entry of the catalogue describes.
+    It is carried by both chambers alike, so that the motion stays as it is and the flows hardly
+    change.
     """
     records = []
     for record in run.records:
-        s = np.asarray(record.channels["piston_2"])
-        extra = force_per_cubed * s**3
-        channels = dict(record.channels)
+        extra, channels = force(record), dict(record.channels)
         channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * extra / 7.0e-4
         channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * extra / 5.4e-4
         records.append(replace(record, channels=channels))
     return replace(run, records=tuple(records))
+
+
+def piston_speed(record: Record) -> Array:
+    """Return the smoothed speed (n,) [m/s] of piston 2."""
+    window = np.hanning(41) / np.hanning(41).sum()
+    s = np.convolve(np.pad(record.channels["piston_2"], 20, mode="edge"), window, "valid")
+    return np.asarray(np.gradient(s) * record.sample_rate)
+
+
+def understated(rig: Rig) -> Rig:
+    """Return a rig that states two thirds of the noise of its sensors."""
+    quiet = {
+        name: sensor.model_copy(update={"noise": sensor.noise / 1.5})
+        for name, sensor in rig.sensors if hasattr(sensor, "noise")
+    }  # fmt: skip
+    return rig.model_copy(update={"sensors": rig.sensors.model_copy(update=quiet)})
+
+
+def hardening(run: Run, force_per_cubed: float) -> Run:
+    """Return the run as if a hardening spring F = k s^3 pulled at the piston.
+
+    No entry of the catalogue describes it.
+    """
+    return with_force(run, lambda record: force_per_cubed * record.channels["piston_2"] ** 3)
 
 
 def pushed(run: Run, force: float, blocks: tuple[int, ...], keep: float = 0.3) -> Run:
     """Return the run as if something pushed at piston 2 in the middle of some of three blocks."""
-    records = []
-    for record in run.records:
+
+    def push(record: Record) -> Array:
         t = np.asarray(record.time)
         inside = (t % 1.0 - keep) / (1.0 - 2 * keep)
         here = (inside > 0) & (inside < 1) & np.isin(np.floor(t) % 3, blocks)
-        extra = force * np.where(here, np.sin(np.pi * inside) ** 2, 0.0)
-        channels = dict(record.channels)
-        channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * extra / 7.0e-4
-        channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * extra / 5.4e-4
-        records.append(replace(record, channels=channels))
-    return replace(run, records=tuple(records))
+        return np.asarray(force * np.where(here, np.sin(np.pi * inside) ** 2, 0.0))
+
+    return with_force(run, push)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from analysis.trace.clues.formula import is_balance
 from analysis.trace.data.candidates import catalogue
@@ -14,26 +15,20 @@ from analysis.trace.result import Formula, Trace, to_json
 from rig.cli.text.trace_text import trace_text
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from tests.analysis.trace.hidden import hardening, pair_of_runs
+from tests.analysis.trace.hidden import hardening, pair_of_runs, piston_speed, with_force
 
 # The formula does not hang on what was tried before it; few candidates are quick.
 FEW = ("coulomb_friction", "joint_spring", "torque_offset", "sensor_offset")
-CAP, ROD = 7.0e-4, 5.4e-4  # [m²] of joint 2
 
 
 def dragged(run: Run, k: float) -> Run:
-    """Return the run as if F = k v |v| braked the piston, carried by both chambers alike."""
+    """Return the run as if F = k v |v| braked the piston."""
 
-    def one(record: Record) -> Record:
-        window = np.hanning(41) / np.hanning(41).sum()
-        s = np.convolve(np.pad(record.channels["piston_2"], 20, mode="edge"), window, "valid")
-        v = np.gradient(s) * record.sample_rate
-        force, channels = k * v * np.abs(v), dict(record.channels)
-        channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * force / CAP
-        channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * force / ROD
-        return replace(record, channels=channels)
+    def drag(record: Record) -> NDArray[np.float64]:
+        v = piston_speed(record)
+        return np.asarray(k * v * np.abs(v))
 
-    return replace(run, records=tuple(map(one, run.records)))
+    return with_force(run, drag)
 
 
 @pytest.fixture(scope="module")

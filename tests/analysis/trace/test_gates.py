@@ -29,7 +29,7 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace import foreign_bench, gate_cases
 from tests.analysis.trace.gate_cases import LEAK, Searched, gate, joined, with_residual
-from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs, pushed
+from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs, pushed, understated
 from tests.studies.trace.rules import FAULTS, RULES, by_name, switched_off
 
 Array = NDArray[np.float64]
@@ -375,11 +375,7 @@ def of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first(b: Ben
 
 def noise_above_the_stated_one_is_noise_where_nothing_repeats(b: Benches) -> None:
     """The rig file states two thirds of the noise that the sensors have."""
-    quiet = {
-        name: sensor.model_copy(update={"noise": sensor.noise / 1.5})
-        for name, sensor in b.rig.sensors if hasattr(sensor, "noise")
-    }  # fmt: skip
-    stated = b.rig.model_copy(update={"sensors": b.rig.sensors.model_copy(update=quiet)})
+    stated = understated(b.rig)
     train, held_out = (
         replace(run, rig=stated, records=(replace(run.records[0], period=0),)) for run in b.runs()
     )

@@ -24,6 +24,7 @@ from analysis.trace.search.undeclared_loads import undeclared_load
 from rig.model.records import LOADED, Record, Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH, default_excitations, experiment
+from tests.analysis.trace.hidden import piston_speed, with_force
 
 MASS = 1.5  # [kg] at the tip of two links of 0.5 m
 NAMES = ("payload", "coulomb_friction", "torque_offset", "base_inclination")
@@ -115,18 +116,9 @@ def test_a_load_in_one_repeat_of_a_step_makes_it_a_step_of_its_own(
     assert "step1_heavy_r2" in load.words
 
 
-def rubbing(run: Run, force: float) -> Run:
-    """Return the run as if dry friction [N] braked piston 2, carried by both chambers alike."""
-    window = np.hanning(41) / np.hanning(41).sum()
-    records = []
-    for record in run.records:
-        s = np.convolve(np.pad(record.channels["piston_2"], 20, mode="edge"), window, "valid")
-        extra = force * np.tanh(np.gradient(s) * record.sample_rate / 2e-3)
-        channels = dict(record.channels)
-        channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * extra / 7.0e-4
-        channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * extra / 5.4e-4
-        records.append(replace(record, channels=channels))
-    return replace(run, records=tuple(records))
+def rubbing(run: Run, level: float) -> Run:
+    """Return the run as if dry friction [N] braked piston 2."""
+    return with_force(run, lambda record: level * np.tanh(piston_speed(record) / 2e-3))
 
 
 def test_a_load_is_found_beside_louder_friction(rig: Rig, runs: tuple[Run, Run]) -> None:

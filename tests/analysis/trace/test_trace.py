@@ -23,7 +23,7 @@ from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
-from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
+from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs, understated
 
 BOTH = (
     "coulomb_friction", "stribeck_friction", "torque_offset", "valve_deadband", "spool_offset",
@@ -229,11 +229,7 @@ def test_noise_above_the_stated_one_is_no_model_error_where_it_follows_nothing(
     rig: Rig, leak: float, verdict: str
 ) -> None:
     """Nothing repeats, and the rig file states two thirds of the noise that the sensors have."""
-    quiet = {
-        name: sensor.model_copy(update={"noise": sensor.noise / 1.5})
-        for name, sensor in rig.sensors if hasattr(sensor, "noise")
-    }  # fmt: skip
-    stated = rig.model_copy(update={"sensors": rig.sensors.model_copy(update=quiet)})
+    stated = understated(rig)
     train, held_out = (
         replace(run, rig=stated, records=tuple(replace(r, period=0) for r in run.records))
         for run in (
