@@ -342,7 +342,18 @@ class HypothesisSet:
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
-        return [self.refined(effects) for effects in out.values()]
+        return [self._extended(now, effects) for effects in out.values()]
+
+    def _extended(self, now: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
+        """Return the exact fit of a set that extends `now`, with its shapes as starting points.
+
+        Where an equation keeps more than under `now`, an earlier search of the shapes, which had
+        begun elsewhere, ended in a local minimum.
+        """
+        known = self.refined(effects)
+        band, before = self.noise_band.by_equation, now.excess_energy
+        worse = any(v > before[e] + band[e] for e, v in known.excess_energy.items())
+        return self._refined_anew(effects) if worse else known
 
     def may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
         """Return whether a candidate may have columns in some of the equations (any if none).

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from analysis.trace.search.hypothesis import negative_body
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.hypothesis import energy_above_noise, negative_body
+from analysis.trace.search.refinement import ExactFit, fit_coefficients
 from rig.model.rig import Rig
 from tests.analysis.trace.gate_cases import LEAK, searched
 from tests.analysis.trace.hidden import pair_of_runs
@@ -41,3 +43,20 @@ def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclinati
     found = {u.term.name: u.shape for u in again.effects}
     assert set(found) == {"base_inclination", "internal_leakage"}
     assert found["base_inclination"][0] == pytest.approx(inclination, rel=0.02)
+
+
+def test_an_extension_that_ended_in_a_local_minimum_is_fitted_again(rig: Rig) -> None:
+    """Another start had led the dead band's edges astray; a spring beside it cannot do that."""
+    names = ("valve_deadband", "joint_spring")
+    s = searched(rig, *pair_of_runs(rig, w_ahead=6e-3, w_astern=6e-3, k_spring=30.0), *names)
+    alone, both = s.set_of("valve_deadband"), s.set_of(*names)
+    data, base = s.hypotheses.train_data, s.hypotheses.base
+    astray = [
+        replace(u, shape=tuple(5.0 * x for x in u.shape)) if u.term.name == names[0] else u
+        for u in both.effects
+    ]
+    fit = fit_coefficients(data, (*base, *astray))
+    excess = energy_above_noise(data, fit.residual)
+    s.hypotheses.fitted[both.keys] = replace(both, fit=fit, excess_energy=excess)
+    again = next(o for o in s.hypotheses.extensions(alone) if o.keys == both.keys)
+    assert again.total == pytest.approx(both.total, abs=0.01 * sum(excess.values()))
