@@ -119,7 +119,7 @@ class JointSpring(Effect):
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "the joint's angle"
     quantity: ClassVar[str] = "joint position"
-    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination")
+    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination", "sensor_offset")
     includes: ClassVar[tuple[str, ...]] = ("torque_offset",)  # at a rest angle far away
     separated_by: ClassVar[str] = (
         "slow motion over the whole stroke at two poses of the other joints: gravity "

@@ -45,6 +45,16 @@ def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclinati
     assert found["base_inclination"][0] == pytest.approx(inclination, rel=0.02)
 
 
+def test_an_offset_of_a_pressure_is_tried_for_a_spring(rig: Rig) -> None:
+    """A spring that rests far away is nearly the torque of a rod pressure that is 60 kPa off."""
+    names = ("joint_spring", "sensor_offset", "internal_leakage")
+    s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, offset_rod_pressure=6e4), *names)
+    again = s.hypotheses.exchanged(s.set_of("joint_spring", "internal_leakage"))
+    found = {(u.term.name, u.term.where): u.shape for u in again.effects}
+    assert set(found) == {("sensor_offset", "joint 2 rod"), ("internal_leakage", "joint 2")}
+    assert found["sensor_offset", "joint 2 rod"][0] == pytest.approx(6e4, rel=0.05)
+
+
 def test_an_extension_that_ended_in_a_local_minimum_is_fitted_again(rig: Rig) -> None:
     """Another start had led the dead band's edges astray; a spring beside it cannot do that."""
     names = ("valve_deadband", "joint_spring")
