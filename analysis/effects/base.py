@@ -63,6 +63,13 @@ class Shape:
 # Of a sample that a held command may bend the spool's path: as `identify` accepts, four times its
 # `path_between_samples`.
 BETWEEN_SAMPLES: Final = 0.2
+LONGEST_LAG: Final = 0.1  # [s] of a delay or a time constant of a bench
+LONGEST_SAMPLES: Final = 100  # [samples] of them: a large machine moves and is sampled slowly
+
+
+def longest_lag(rig: Rig) -> float:
+    """Return the longest delay or time constant [s] that an effect of a rig may have."""
+    return max(LONGEST_LAG, LONGEST_SAMPLES / rig.sample_rate)
 
 
 def between_samples(rig: Rig, seconds: float) -> str:

@@ -31,7 +31,7 @@ ATMOSPHERE: Final = 101_325.0  # [Pa]
 DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sensor's error
 MOST_AIR: Final = 0.2
 EXPONENTS: Final = (1.0, 1.4)
-MOST_VOLUME: Final = 10.0  # of the pipes' volume
+MOST_VOLUME: Final = 10.0  # of the oil in pipe and chamber at mid-stroke
 
 
 @dataclass(frozen=True)
@@ -168,10 +168,15 @@ class DeadVolume(Effect):
         return (f"V_dead_{self.joint + 1}_{self.side}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the volume [m^3], up to ten times the pipes'."""
-        cylinder = rig.joints[self.joint].cylinder
-        known = cylinder.cap_pipe_volume if self.side == "cap" else cylinder.rod_pipe_volume
-        grid = (0.1 * known, 0.5 * known, 2.0 * known)
+        """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber."""
+        part = rig.joints[self.joint].cylinder
+        pipe, area = (
+            (part.cap_pipe_volume, part.cap_area)
+            if self.side == "cap"
+            else (part.rod_pipe_volume, part.rod_area)
+        )
+        known = pipe + 0.5 * part.stroke * area
+        grid = (0.05 * known, 0.25 * known, 1.0 * known)
         return (Shape(self.shape_names()[0], "m^3", 0.0, MOST_VOLUME * known, grid, 0.0),)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:

@@ -19,7 +19,15 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect, Shape, between_samples
+from analysis.effects.base import (
+    NO_KERNEL,
+    SENSOR,
+    Array,
+    Effect,
+    Shape,
+    between_samples,
+    longest_lag,
+)
 from analysis.signals.conditioning import Signals
 from analysis.signals.filters import align
 from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
@@ -231,8 +239,9 @@ class ChannelDelay(Late):
         return (f"delay_{self.channel}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the delay [s], up to a tenth of a second."""
-        return (Shape(self.shape_names()[0], "s", 0.0, 0.1, (5e-4, 2e-3, 8e-3, 3e-2), 0.0),)
+        """Return the delay [s]."""
+        grid = (5e-4, 2e-3, 8e-3, 3e-2)
+        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x(t + delay)."""
@@ -263,8 +272,9 @@ class SensorLag(Late):
         return (f"lag_{self.channel}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the time constant [s], up to a tenth of a second."""
-        return (Shape(self.shape_names()[0], "s", 0.0, 0.1, (5e-4, 2e-3, 8e-3, 3e-2), 0.0),)
+        """Return the time constant [s]."""
+        grid = (5e-4, 2e-3, 8e-3, 3e-2)
+        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x + tau dx/dt."""
@@ -400,13 +410,13 @@ class SensorOffset(Sensor):
         return (f"offset_{self.channel}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the offset, within a tenth of the sensor's span."""
+        """Return the offset, within a quarter of the sensor's span."""
         kind = ch.kind_of(self.channel)[0]
         low, high = rig.sensors.of(kind).range
         span = high - low
         grid = (-0.02 * span, -0.004 * span, 0.004 * span, 0.02 * span)
         unit = ch.unit_of(self.channel)
-        return (Shape(self.shape_names()[0], unit, -0.1 * span, 0.1 * span, grid, 0.0),)
+        return (Shape(self.shape_names()[0], unit, -0.25 * span, 0.25 * span, grid, 0.0),)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x - offset; derivatives as they are."""

@@ -14,7 +14,16 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape, between_samples
+from analysis.effects.base import (
+    EDGES,
+    LAG,
+    NULL,
+    Array,
+    Effect,
+    Shape,
+    between_samples,
+    longest_lag,
+)
 from analysis.effects.edges import corner, edge, opened, rounding
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
@@ -225,7 +234,8 @@ class SpoolLag(ValveEffect):
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the time constant [s]."""
-        return (Shape(self.shape_names()[0], "s", 0.0, 0.1, (5e-4, 2e-3, 1e-2, 4e-2), 0.0),)
+        grid = (5e-4, 2e-3, 1e-2, 4e-2)
+        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
 
     def hidden(self, rig: Rig) -> int:
         """Return 1: the opening."""

@@ -368,10 +368,10 @@ REFUSED = [
     ("tank_pressure", "bench", {}, (2.8e6, 0.0)),
     ("entrained_air", "bench", {"alpha_air": -0.01}, ()),
     ("entrained_air", "bench", {"alpha_air": 0.5}, ()),
-    ("dead_volume", "joint 1 cap", {}, (7.9e-4,)),
+    ("dead_volume", "joint 1 cap", {}, (1.3e-3,)),
     ("channel_delay", "joint 1 piston", {}, (0.1,)),
     ("sensor_gain", "joint 1 cap", {}, (1.5,)),
-    ("sensor_offset", "joint 1 cap", {}, (1.01e6,)),
+    ("sensor_offset", "joint 1 cap", {}, (2.6e6,)),
 ]
 
 
@@ -406,6 +406,24 @@ def test_a_large_cylinders_seal_may_give_way_by_more(rig: Rig) -> None:
     said = [effect("coulomb_friction", "joint 2").outside(r, (1.5e-3,)) for r in (rig, grown)]
     assert "presliding_2" in said[0]
     assert said[1] == ""
+
+
+def test_bounds_grow_with_the_machine_and_not_with_its_pipes(rig: Rig) -> None:
+    """An accumulator beside a short hose, a zero set at the stroke's end, a slow machine's lag."""
+    part = rig.joints[0].cylinder.model_copy(update={"cap_pipe_volume": 1e-6})
+    joint = rig.joints[0].model_copy(update={"cylinder": part})
+    hosed = rig.model_copy(update={"joints": (joint, *rig.joints[1:])})
+    (volume,) = effect("dead_volume", "joint 1 cap").shapes(hosed)
+    assert volume.high > 2.0 * part.cap_area * part.stroke
+    (offset,) = effect("sensor_offset", "joint 1 piston").shapes(rig)
+    low, high = rig.sensors.piston.range
+    assert offset.high == pytest.approx(0.25 * (high - low))
+    slow = rig.model_copy(update={"sample_rate": 200.0})
+    for name, where in (
+        ("sensor_lag", "joint 1 rod"), ("channel_delay", "joint 1 rod"), ("spool_lag", "joint 1"),
+    ):  # fmt: skip
+        bounds = [effect(name, where).shapes(r)[0].high for r in (rig, slow)]
+        assert bounds == pytest.approx([0.1, 0.5])
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.2, 1.4])
