@@ -279,6 +279,10 @@ class Effect(Term):
         """Return the shape with missing details at their starting points."""
         return (*shape, *(s.middle for s in self.shapes(rig)[len(shape) :]))
 
+    def starts_in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the shapes, missing details included, from which a search of details begins."""
+        return (self.in_detail(rig, shape),)
+
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return shapes from which a search finds other forms of the same effect."""
         return ()

@@ -43,7 +43,8 @@ from rig.model.rig import Rig
 
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
 PLACES: Final = 6  # knots of s
-GROWS: Final = 0.3  # of the friction at mid-stroke, at the end: where a search begins
+WIDEST: Final = 2.0  # of the growth at which friction vanishes at an end: it vanishes before
+GROWS: Final = (-0.8, -0.3, 0.3, 0.8)  # of the friction at mid-stroke, at the end: first trials
 ALIKE: Final = 0.03  # of gravity that a curve of s cannot fit: below, the records have one pose
 DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its uncertainty
 # Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
@@ -54,12 +55,12 @@ LEVEL: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=np.f
 
 @dataclass(frozen=True)
 class FrictionCurve(Friction):
-    """F_f = (1 + k x) (z f(|s'|) + |z| g(|s'|)): friction over speed, f shared by both directions.
+    """F_f = max(0, 1 + k x) (z f(|s'|) + |z| g(|s'|)): friction over speed by direction.
 
-    z is the contact's state (`contact`), f and g are curves (`curve`); g is the extra
-    friction of extending. On an electric joint the slope of f over the records' speeds is Fv.
-    The growth k over the distance x from mid-stroke is a detail of the form: a bore or a seal that
-    is tighter towards one end.
+    z is the contact's state (`contact`), f and g are curves (`curve`): f is shared by both
+    directions, g is the extra friction of extending. On an electric joint the slope of f over the
+    records' speeds is Fv. The growth k over the distance x from mid-stroke is a detail of the form:
+    a bore or a seal that is tighter towards one end, and free where 1 + k x is below 0.
     """
 
     name: ClassVar[str] = "friction_curve"
@@ -90,7 +91,10 @@ class FrictionCurve(Friction):
         """Return knots [m/s], presliding distance [m], transition speed [m/s] and growth [1/m]."""
         speed = rig.joints[self.joint].limits.speed
         most = 1.0 / self._half(rig)  # the friction vanishes at one end of the stroke
-        growth = Shape(self.shape_names()[-1], "1/m", -most, most, (GROWS * most,), detail=True)
+        bound = WIDEST * most
+        growth = Shape(
+            self.shape_names()[-1], "1/m", -bound, bound, (GROWS[2] * most,), detail=True
+        )
         return (*knot_shapes(self.knot_names(), "m/s", 0.0, speed), *super().shapes(rig), growth)
 
     def _half(self, rig: Rig) -> float:
@@ -102,16 +106,25 @@ class FrictionCurve(Friction):
         """Return the middle of the stroke [m]."""
         return 0.5 * float(sum(rig.joints[self.joint].position_range))
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return the shape with a growth along the stroke."""
+    def starts_in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the shapes with growths along the stroke from which a search begins.
+
+        Viscous friction and the slope of the curve, whose levers differ, imitate a growth: the
+        search from a small one may end there.
+        """
         place = self._speed_place() + 1
         if len(shape) > place:
-            return tuple(shape)
-        return (*shape, *(0.0,) * (place - len(shape)), GROWS / self._half(rig))
+            return (tuple(shape),)
+        whole = (*shape, *(0.0,) * (place - len(shape)))
+        return tuple((*whole, share / self._half(rig)) for share in GROWS)
 
     def _growth(self, shape: Sequence[float]) -> float:
         """Return the growth [1/m] of a shape, 0 where it has none."""
         return shape[-1] if len(shape) == len(self.shape_names()) else 0.0
+
+    def _along(self, rig: Rig, shape: Sequence[float], s: Array) -> Array:
+        """Return the friction at positions s [m] over that at mid-stroke."""
+        return np.maximum(0.0, 1.0 + self._growth(shape) * (s - self._middle(rig)))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State between what shares of its value at mid-stroke the friction changes."""
@@ -119,7 +132,7 @@ class FrictionCurve(Friction):
         places = [f(x.s[:, i]) for x in signals if x.excited[i] for f in (np.min, np.max)]
         if growth == 0.0 or not places:
             return ""
-        ends = sorted(1.0 + growth * (p - self._middle(rig)) for p in (min(places), max(places)))
+        ends = sorted(self._along(rig, shape, np.array([min(places), max(places)])).tolist())
         return (
             f"along the stroke of the records the friction is {ends[0]:.2f} to {ends[1]:.2f} times "
             "that at mid-stroke, which the curve shows"
@@ -149,8 +162,7 @@ class FrictionCurve(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G z and G |z| times the curves' bases."""
         i, given = self.joint, self.shape_of(rig, shape)
-        along = 1.0 + self._growth(given) * (signals.s[:, i] - self._middle(rig))
-        z = along * self.contact(rig, signals, given)
+        z = self._along(rig, given, signals.s[:, i]) * self.contact(rig, signals, given)
         basis = spline(given[:SPEEDS], np.abs(signals.sd[:, i]))
         shared, own = self._names(rig)
         odd = (signals.G[:, i] * z)[:, None] * (basis @ self._shared(rig))
@@ -199,7 +211,7 @@ def _over_speed(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped
         v = x[SD, i]
         state, dz[0] = slide(v, z[0], par[1], 0.0, par[2])
         force = state * curve_at(abs(v), par, 3, 4) + abs(state) * curve_at(abs(v), par, 15, 4)
-        out[TORQUE, i] -= x[G, i] * force * (1.0 + par[27] * (x[S, i] - par[28]))
+        out[TORQUE, i] -= x[G, i] * force * max(0.0, 1.0 + par[27] * (x[S, i] - par[28]))
 
 
 @dataclass(frozen=True)

@@ -284,9 +284,12 @@ class HypothesisSet:
             # No lower bound: a size below that of the grid's first point is fitted exactly later.
             if not 0.0 <= own.get("", 0.0) <= SEARCH.size_ratio:
                 return False
-            for c in entry.variant.effect.coefficients(rig):
+            effect = entry.variant.effect
+            if effect.free:  # its curve may be physical only with the details of its form
+                return True
+            for c in effect.coefficients(rig):
                 own.setdefault(c.parameter, 0.0)
-            return not entry.variant.effect.problem(rig, {**values, **own}, entry.variant.shape)
+            return not effect.problem(rig, {**values, **own}, entry.variant.shape)
 
         def size(entry: VariantColumns) -> int:
             return complexity(rig, [entry.variant.used])[1]

@@ -206,12 +206,16 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         fit = _in_best_form(data, fit, k, steps)
         used = fit.terms[k]
         assert isinstance(used.term, Effect)
-        opened = Used(used.term, used.term.in_detail(data.rig, used.shape))
+        starts = used.term.starts_in_detail(data.rig, used.shape)
+        opened = [Used(used.term, start) for start in starts if start != used.shape]
         asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
         # Half, since the linear prediction is less than what a detail removes.
-        if opened == used or _predicted_gain(data, fit, used, opened) < 0.5 * asked:
-            continue
-        more = _with_searched_shapes(data, _with_term(fit.terms, used, opened), steps)
+        searched = [
+            _with_searched_shapes(data, _with_term(fit.terms, used, start), steps)
+            for start in opened
+            if _predicted_gain(data, fit, used, start) >= 0.5 * asked
+        ]
+        more = min(searched, key=lambda model: model.energy, default=fit)
         if fit.energy - more.energy <= asked:
             continue
         # A form that fitted better without the details need not do so with them.
