@@ -115,8 +115,21 @@ def floors(
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
             out.append(_unrepeated(group, equation, noise, total, source, sensors))
     scale = _measured_over_stated([*out, *others])
-    scaled = (_scaled(floor, scale, OTHER_STEPS) for floor in out)
+    by_repeats = _measured_over_stated([f for f in (*out, *others) if f.source == REPEATS])
+    scaled = (_scaled(_without_aperiodic(f, by_repeats), scale, OTHER_STEPS) for f in out)
     return [_scaled(floor, noise_ratio or {}, UNSTATED) for floor in scaled]
+
+
+def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
+    """Return a floor as stated where its record's periods differ by more than sensors do.
+
+    Where repeats of other steps show the sensors' noise, it is a cause that begins with the record,
+    but is no multiple of its period: a hum that is in step with the record.
+    """
+    noisy = floor.noise > DATA.unrepeated_ratio * floor.stated
+    if floor.source != PERIODS or not noisy or floor.equation not in by_repeats:
+        return floor
+    return _unrepeated(floor.group, floor.equation, floor.stated, floor.total, STATED, floor.stated)
 
 
 def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:

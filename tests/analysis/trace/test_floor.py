@@ -18,6 +18,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import (
     NEIGHBOURS,
     OTHER_STEPS,
+    PERIODS,
     REPEATS,
     STATED,
     Floor,
@@ -27,7 +28,7 @@ from analysis.trace.data.noise_floor import (
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.data.unrepeated import dominant_frequency, unrepeated_notes
 from analysis.trace.settings import DATA
-from rig.model.records import Run
+from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from rig.model.wire.codes import decode_input, encode_input
 from rig.runs.rigs import load_rig
@@ -131,6 +132,30 @@ def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> No
     assert floors_of(other)["other"].source == STATED
     loud = floor_of(to_and_fro(1, 4))  # so loud that it is no noise of the sensors
     assert floors_of(other, others=[loud])["other"].source == STATED
+
+
+def test_a_hum_in_step_with_the_record_is_no_noise_where_repeats_show_the_noise() -> None:
+    """Between two periods of a record it differs, between two repeats it does not."""
+
+    def humming(run: Run) -> Run:
+        def hummed(one: Record) -> Record:
+            time = np.arange(one.samples) / one.sample_rate
+            drive = one.channels["drive_1"] + 0.05 * np.sin(2 * np.pi * 1.37 * time)
+            return replace(one, channels={**one.channels, "drive_1": drive})
+
+        return replace(run, records=tuple(map(hummed, run.records)))
+
+    known = floor_of(humming(to_and_fro(1, 4, times=3.0)))
+    periodic = to_and_fro(3, times=3.0)
+    (whole,) = periodic.records
+    periodic = replace(periodic, records=(replace(whole, period=whole.samples // 3),))
+    alone = floor_of(humming(periodic))
+    assert alone.source == PERIODS
+    assert alone.noise > 3 * known.noise
+    beside = floors_of(humming(periodic), others=[known])[whole.step]
+    assert beside.source == OTHER_STEPS
+    assert beside.noise == pytest.approx(known.noise, rel=0.1)
+    assert floors_of(periodic, others=[known])[whole.step].source == PERIODS
 
 
 def test_the_rounding_of_a_coarse_converter_is_part_of_the_stated_noise() -> None:
