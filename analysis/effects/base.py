@@ -252,6 +252,12 @@ class Effect(Term):
         """State a size at the conditions of the records ('' where its parameter states it)."""
         return ""
 
+    def extrapolated(
+        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
+    ) -> Mapping[str, tuple[float, float]]:
+        """Return the range, by name, of shapes that only the form gives beyond the records."""
+        return {}
+
     def plotted(self) -> str:
         """Name the quantity of `abscissa`; its unit is in `analysis.report.plots.trace_plots`."""
         return self.quantity

@@ -108,6 +108,18 @@ def turbulent_part(dp: float, share: float) -> float:
     return dp / math.cbrt(1.0 + share**3)
 
 
+def extrapolated_drop(rig: Rig, flow: float, dp: float, share: float) -> tuple[float, float]:
+    """Return the range of the drop [Pa] at the pump's whole flow by that at the records' largest.
+
+    Beyond this `flow` [m^3/s] the line may be laminar throughout or turbulent throughout.
+    """
+    ratio = flow / rig.supply.flow
+    if not 0.0 < ratio < 1.0:
+        return dp, dp
+    drop, _ = drop_and_slope(ratio, turbulent_part(dp, share), share)
+    return drop / ratio, drop / ratio**2
+
+
 def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> str:
     """State a line's drop at the largest flow [m^3/s] of the records where that is not the pump's.
 
@@ -215,6 +227,14 @@ class SupplySag(PortEffect):
         """State the drop at the largest flow drawn."""
         dp, share, _ = self.shape_of(rig, shape)
         return line_remark(rig, largest_flow(rig, signals, drawn=True), "dp_supply", dp, share)
+
+    def extrapolated(
+        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
+    ) -> Mapping[str, tuple[float, float]]:
+        """Return the range of the drop at the pump's whole flow."""
+        dp, share, _ = self.shape_of(rig, shape)
+        flow = largest_flow(rig, signals, drawn=True)
+        return {"dp_supply": extrapolated_drop(rig, flow, dp, share)}
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the drop from the supply pressure."""
@@ -346,6 +366,14 @@ class ReturnLine(PortEffect):
         """State the drop at the largest flow returned."""
         dp, share = self.whole(rig, shape)
         return line_remark(rig, largest_flow(rig, signals, drawn=False), "dp_return", dp, share)
+
+    def extrapolated(
+        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
+    ) -> Mapping[str, tuple[float, float]]:
+        """Return the range of the drop at the pump's whole flow."""
+        dp, share = self.whole(rig, shape)
+        flow = largest_flow(rig, signals, drawn=False)
+        return {"dp_return": extrapolated_drop(rig, flow, dp, share)}
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""

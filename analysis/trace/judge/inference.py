@@ -10,7 +10,7 @@ uncorrelated after a tenth of a second.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,17 +132,29 @@ def effect_errors(
 def estimates(
     train_data: RegressionData, used: Used, errors: EffectErrors, shift: Mapping[str, float]
 ) -> dict[str, Estimate]:
-    """Return an effect's parameters with 95 % intervals, those of the forms (`shift`) included."""
-    units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
-    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
+    """Return an effect's parameters with 95 % intervals.
+
+    They include the errors by unknown forms (`shift`), and the range of what only the form gives
+    beyond the records.
+    """
+    rig = train_data.rig
+    units = {c.parameter: c.unit for c in used.term.coefficients(rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(rig, used)}
     half = half_width(errors.std, errors.dof)
-    return {
+    out = {
         name: wider(
             Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h))),
             shift.get(name, 0.0),
         )
         for name, v, s, h in zip(errors.names, errors.value, errors.std, half, strict=True)
     }
+    assert isinstance(used.term, Effect)
+    seen = [conditioned.signals for conditioned in train_data.records]
+    for name, beyond in used.term.extrapolated(rig, seen, used.shape).items():
+        if name in out:
+            low, high = out[name].ci95
+            out[name] = replace(out[name], ci95=(min(low, *beyond), max(high, *beyond)))
+    return out
 
 
 def is_of_unknown_size(

@@ -135,3 +135,21 @@ def test_a_drop_at_a_flow_that_no_record_reaches_is_given_at_the_flow_that_is_re
     litres = 6e4 * 0.6 * rig.supply.flow
     assert f"{litres:.2g} l/min" in said
     assert f"{81.0 * DROP / 15.0 / 1e6:.2g} MPa" in said
+
+
+def test_a_drop_that_no_record_reaches_may_be_that_of_any_line_beyond(
+    rig: Rig, lifting: Signals
+) -> None:
+    """From a fifteenth of the pump's flow, a laminar line grows 15 times, a turbulent one 225."""
+    rated = rig.model_copy(
+        update={"supply": rig.supply.model_copy(update={"flow": 9.0 * rig.supply.flow})}
+    )
+    for shape in ((81.0 * DROP, 3.0, 0.0), (81.0 * DROP, 0.0, 0.0)):
+        seen = lifting.p_s - SupplySag("bench").prepare(rated, lifting, shape).p_s
+        low, high = SupplySag("bench").extrapolated(rated, [lifting], shape)["dp_supply"]
+        assert low == pytest.approx(15.0 * seen.max(), rel=1e-3)
+        assert high == pytest.approx(225.0 * seen.max(), rel=1e-3)
+        assert low <= (1.0 + 1e-3) * shape[0]
+        assert high >= (1.0 - 1e-3) * shape[0]
+    (line,) = ReturnLine("bench").extrapolated(rated, [lifting], (DROP,)).values()
+    assert line[0] < DROP == pytest.approx(line[1])
