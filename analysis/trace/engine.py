@@ -397,7 +397,7 @@ def _final_verdict(
     if joints and not finding.rows.in_motion:
         rows, hypotheses, moving = fitted_in_motion(rig, terms, records, winner, joints)
         if not _judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
-            kept, words = set(), rest_phase_notes(joints, "include")
+            kept, words = set(), rest_phase_notes(joints, included=True)
     return (UNEXPLAINED if kept else finding.verdict), words
 
 

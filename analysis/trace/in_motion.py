@@ -93,7 +93,8 @@ def searched_in_motion(
         moving = moving_filtering({*weighted, *joints})
         rows = trace_rows(rig, terms, records, moving, unweighted)
         found = search_and_judge(rows, candidates, free, seed, lambda _: None)
-        return replace(found, notes=(*rest_phase_notes(rows.in_motion, "leave out"), *found.notes))
+        resting = rest_phase_notes(rows.in_motion, included=False)
+        return replace(found, notes=(*resting, *found.notes))
 
     found = searched(joints)
     acting = joints_with_friction(found.winner, above_noise)
@@ -187,13 +188,14 @@ def fitted_in_motion(
     return rows, hypotheses, hypotheses.refined(winner.effects)
 
 
-def rest_phase_notes(joints: Iterable[int], errors: str) -> list[str]:
+def rest_phase_notes(joints: Iterable[int], included: bool) -> list[str]:
     """Return a note for each joint (0-based) whose samples at rest were not judged.
 
-    `errors` says whether the stated errors "include" or "leave out" these samples.
+    `included`: the stated errors include these samples.
     """
+    errors = "include them" if included else "leave them out"
     return [
         f"{equation('torque', joint)}: judged without the samples at which the joint rests, where "
-        f"dry friction is whatever holds it; the errors {errors} them"
+        f"dry friction is whatever holds it; the errors {errors}"
         for joint in sorted(joints)
     ]

@@ -55,14 +55,16 @@ def remainders(
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
         if winner.effects and e not in listed and visible and share > TRACE.visible_share:
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            out.append(Remainder(e, words + _tolerance_words(share), False))
+            out.append(Remainder(e, words + tolerance_words(share), False))
     return out
 
 
-def _tolerance_words(share: float) -> str:
+def tolerance_words(share: float) -> str:
     """Say why a remaining share of the energy does not speak against the named effects."""
-    if share < 1.0 - TRACE.least_removed:
+    if share <= TRACE.held_out_share:
         return "; within the tolerance for the form of the named effect"
+    if share < 1.0 - TRACE.least_removed:
+        return "; more than the form of a named effect may miss, unlike in held-out records"
     return (
         "; no named effect acts there, and the residual is too close to the noise to name another"
     )

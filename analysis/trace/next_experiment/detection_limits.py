@@ -22,6 +22,7 @@ from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
+from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
@@ -46,14 +47,16 @@ def detection_limits(
 
     `effects` are the candidates; each name is returned once, at the place where it changes most.
     `winner` is the set found and `model` the model identified with it. Another name of a law that
-    acts in the set has the shape with which it was fitted in place of that name. Beside a free form
-    no limit is computed, since its curve absorbs any similar effect.
+    acts in the set has the shape with which it was fitted in place of that name. A special case of
+    an effect of the set is no further effect. Beside a free form no limit is computed, since its
+    curve absorbs any similar effect.
     """
     train_data = hypotheses.train_data
     if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
         return []
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
-    asked = [effect for effect in effects if (effect.name, effect.where) not in winner.keys]
+    held = winner.keys | {(n, u.term.where) for u in winner.effects for n in _included(u)}
+    asked = [effect for effect in effects if (effect.name, effect.where) not in held]
     fitted = _fitted_instead(hypotheses, winner)
     small = [
         explanation
@@ -83,6 +86,12 @@ def detection_limits(
     for limit in sorted(found, key=lambda f: -f.shift):
         once.setdefault(limit.name, limit)
     return list(once.values())
+
+
+def _included(used: Used) -> tuple[str, ...]:
+    """Return the names of the special cases of an effect."""
+    assert isinstance(used.term, Effect)
+    return used.term.includes
 
 
 def _fitted_instead(

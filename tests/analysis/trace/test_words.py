@@ -12,6 +12,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates
 from analysis.trace.judge.unknown_cause import tied_in_held_out
+from analysis.trace.remaining import tolerance_words
 from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import sentence, tolerated_error_notes
@@ -105,6 +106,12 @@ def test_an_error_that_no_effect_lowers_is_no_error_of_a_form(rig: Rig) -> None:
     )
     said = explained(rig, (SPRING,), before, high, notes=("torque_2: 3 % remains",))
     assert tolerated_error_notes(said) == [untouched]
+
+
+def test_a_remainder_is_that_of_a_form_up_to_the_tolerance_of_the_held_out_records() -> None:
+    assert tolerance_words(0.05).endswith("within the tolerance for the form of the named effect")
+    assert "more than the form" in tolerance_words(0.13)
+    assert "no named effect acts there" in tolerance_words(0.9)
 
 
 def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> None:
