@@ -41,7 +41,7 @@ from analysis.identify.estimators.statements import (
 from analysis.identify.estimators.weighted import weighted_least_squares
 from analysis.identify.stacked_rows import RecordRows, repeats_of, with_columns
 from analysis.regression.rows import parameters_of
-from analysis.regression.solve import Solution
+from analysis.regression.solve import MOSTLY_NOISE, Solution
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -191,7 +191,9 @@ def _prepare(
         if not determined:
             continue
         nuisances = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
-        nuisances = [n for n in nuisances if n in columns and n not in determined]
+        # Without their columns, other parameters of the same motion would take their part.
+        noisy = [n for n, why in solution.unidentifiable.items() if why == MOSTLY_NOISE]
+        nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
         prepared = _family(built, family, columns, determined, nuisances)
         if nuisances:
             prepared, stated = _plausible(prepared)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ from analysis.regression.least_squares import factored
 from analysis.regression.settings import REGRESSION
 
 Array = NDArray[np.float64]
+
+MOSTLY_NOISE: Final = "its column in these records is mostly sensor noise"
 Indices = NDArray[np.int64]
 
 
@@ -109,7 +112,7 @@ def solve(
         share = np.diag(bread @ noise[:k, :k])
         for name, part in zip(names, share, strict=True):
             if reject_noise and part > REGRESSION.noise_share:
-                lost.setdefault(name, "its column in these records is mostly sensor noise")
+                lost.setdefault(name, MOSTLY_NOISE)
     rows = sum(c.rows for c in clusters)
     squares = np.sum((y - X @ beta) ** 2) + R[k, k] ** 2
     residual_rms = float(np.sqrt(squares / max(rows, 1)))

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from analysis.identify import reduction
 from analysis.identify.checks import Check
 from analysis.identify.estimators.covariance import by_parts, lack_of_fit, spread
 from analysis.identify.estimators.equations import least_squares, pieces
 from analysis.identify.identify import identify
 from analysis.identify.output_error.fit import output_error
 from analysis.identify.result import Identification, to_json
+from analysis.regression.solve import MOSTLY_NOISE, Solution, solve
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
@@ -245,3 +248,23 @@ def test_coverage_is_counted_with_its_own_uncertainty() -> None:
     assert row.coverage_low < 0.95 < row.coverage_high
     assert row.bias == pytest.approx(z.mean())
     assert cov.overall([row]) == row.coverage
+
+
+def test_a_parameter_that_is_not_stated_keeps_its_part_of_the_motion(
+    multisine_run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise another one takes it: R33 of three joints was eleven times too large."""
+    whole = identify([multisine_run], estimator="ls")
+
+    def without_m2(*given: Any) -> Solution:
+        solution = solve(*given)
+        if "M2" in solution.names:
+            solution.unidentifiable["M2"] = MOSTLY_NOISE
+            solution.value[solution.names.index("M2")] = np.nan
+        return solution
+
+    monkeypatch.setattr(reduction, "solve", without_m2)
+    found = identify([multisine_run], estimator="ls")
+    assert not found.estimates["M2"].identified
+    for name in ("M1", "R12", "Fv2", "W2"):
+        assert found.estimates[name].value == pytest.approx(whole.estimates[name].value, rel=1e-6)
