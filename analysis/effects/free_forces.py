@@ -43,8 +43,8 @@ from rig.model.rig import Rig
 
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
 PLACES: Final = 6  # knots of s
-WIDEST: Final = 2.0  # of the growth at which friction vanishes at an end: it vanishes before
 GROWS: Final = (-0.8, -0.3, 0.3, 0.8)  # of the friction at mid-stroke, at the end: first trials
+MOST_GROWTH: Final = 2.0  # of the same: friction vanishes half way from mid-stroke to an end
 ALIKE: Final = 0.03  # of gravity that a curve of s cannot fit: below, the records have one pose
 DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its uncertainty
 # Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
@@ -91,7 +91,7 @@ class FrictionCurve(Friction):
         """Return knots [m/s], presliding distance [m], transition speed [m/s] and growth [1/m]."""
         speed = rig.joints[self.joint].limits.speed
         most = 1.0 / self._half(rig)  # the friction vanishes at one end of the stroke
-        bound = WIDEST * most
+        bound = MOST_GROWTH * most
         growth = Shape(
             self.shape_names()[-1], "1/m", -bound, bound, (GROWS[2] * most,), detail=True
         )

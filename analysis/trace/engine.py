@@ -310,7 +310,7 @@ def _traced(
         *refitted_notes(winner.fit, last, after),
         *shared_parameter_notes(winner, after),
         *record_condition_notes(train_data, winner),
-        *undetermined_notes(after, undetermined),
+        *undetermined_notes(after, undetermined, finding.rows.in_motion),
         *kept,
         *detection_limit_notes(hidden),
     ]

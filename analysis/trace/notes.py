@@ -9,6 +9,7 @@ from analysis.effects.base import Effect
 from analysis.effects.free_flows import BulkModulusCurve
 from analysis.effects.free_forces import FrictionCurve, PositionForce
 from analysis.simulation.model import Model
+from analysis.terms.base import equation
 from analysis.trace.data.noise_floor import (
     NEIGHBOURS,
     OTHER_STEPS,
@@ -94,14 +95,20 @@ def masked_row_notes(kind: str, data: RegressionData) -> list[str]:
     ]
 
 
-def undetermined_notes(model: Model, known: Collection[str] = ()) -> list[str]:
-    """Name the parameters that the records do not determine, except those `known` already."""
+def undetermined_notes(
+    model: Model, known: Collection[str] = (), in_motion: Collection[int] = ()
+) -> list[str]:
+    """Name the parameters that the records do not determine, except those `known` already.
+
+    `in_motion` are the joints (0-based) whose torque rows are weighted by speed.
+    """
     missing = [n for n, e in model.parameters.items() if not e.identified and n not in known]
     if not missing:
         return []
+    where = f", with {', '.join(equation('torque', i) for i in in_motion)} judged in motion alone,"
     return [
-        f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
-        "the motion that belongs to it may show as a residual"
+        f"the records{where if in_motion else ''} do not determine {', '.join(missing)} (see "
+        "`bramah identify`): the share of the motion that belongs to it may show as a residual"
     ]
 
 

@@ -12,6 +12,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates
 from analysis.trace.judge.unknown_cause import tied_in_held_out
+from analysis.trace.notes import undetermined_notes
 from analysis.trace.remaining import tolerance_words
 from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
@@ -112,6 +113,16 @@ def test_a_remainder_is_that_of_a_form_up_to_the_tolerance_of_the_held_out_recor
     assert tolerance_words(0.05).endswith("within the tolerance for the form of the named effect")
     assert "more than the form" in tolerance_words(0.13)
     assert "no named effect acts there" in tolerance_words(0.9)
+
+
+def test_a_parameter_that_only_motion_alone_leaves_open_says_so(rig: Rig) -> None:
+    model = nominal_model(rig, tuple(map(Used, baseline_of(rig))))
+    lost = Estimate(np.nan, "kg m^2", np.nan, (np.nan, np.nan))
+    model = replace(model, parameters=dict(model.parameters) | {"M2": lost})
+    assert undetermined_notes(model, ["M2"]) == []
+    (always,), (moving,) = undetermined_notes(model), undetermined_notes(model, (), (1,))
+    assert always.startswith("the records do not determine M2 ")
+    assert moving.startswith("the records, with torque_2 judged in motion alone, do not determine")
 
 
 def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> None:
