@@ -202,6 +202,11 @@ class Late(Sensor):
         kinds = ("pressure", "piston", "spool") if len(rig.joints) > 1 else ("pressure",)
         return (*super().all_places(rig), *(f"bench {kind}" for kind in kinds))
 
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the delay or time constant [s]."""
+        grid = (5e-4, 2e-3, 8e-3, 3e-2)
+        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
+
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a shape at its bounds, and a spool delay within its path between samples."""
         spool = "spool" in (self.side, self.shared)
@@ -238,11 +243,6 @@ class ChannelDelay(Late):
         """Name the delay."""
         return (f"delay_{self.channel}",)
 
-    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the delay [s]."""
-        grid = (5e-4, 2e-3, 8e-3, 3e-2)
-        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
-
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x(t + delay)."""
         return align(x, value * rate)
@@ -270,11 +270,6 @@ class SensorLag(Late):
     def shape_names(self) -> tuple[str, ...]:
         """Name the time constant."""
         return (f"lag_{self.channel}",)
-
-    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the time constant [s]."""
-        grid = (5e-4, 2e-3, 8e-3, 3e-2)
-        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x + tau dx/dt."""
