@@ -7,7 +7,8 @@ import pytest
 from analysis.trace.engine import trace
 from analysis.trace.result import DetectionLimit, Trace, to_json
 from rig.model.rig import Rig
-from tests.analysis.trace.hidden import experiment
+from tests.analysis.trace import gate_cases
+from tests.analysis.trace.hidden import experiment, pair_of_runs
 from tests.variants import kept
 
 SMALL = 0.004  # [V] of the spool, rms: the friction of such a motion is near the noise
@@ -67,3 +68,11 @@ def test_the_largest_changes_are_noted_and_all_are_in_the_result(small: Trace) -
     shifts = [d["shift"] for d in to_json(small)["detection_limits"]]
     assert shifts == sorted(shifts, reverse=True)
     assert shifts[-1] >= 0.01
+
+
+def test_a_special_case_of_a_named_effect_is_none_that_could_hide_beside_it(rig: Rig) -> None:
+    """Friction of one level is part of that of two, and would change both without limit."""
+    names = ("asymmetric_friction", "coulomb_friction", "stribeck_friction")
+    result = gate_cases.traced(rig, pair_of_runs(rig, F_ext=70.0, F_ret=40.0), *names)
+    assert [e.name for e in result.effects] == ["asymmetric_friction"]
+    assert [d.name for d in result.detection_limits] == ["stribeck_friction"]
