@@ -108,52 +108,6 @@ def turbulent_part(dp: float, share: float) -> float:
     return dp / math.cbrt(1.0 + share**3)
 
 
-def extrapolated_drop(rig: Rig, flow: float, dp: float, share: float) -> tuple[float, float]:
-    """Return the range of the drop [Pa] at the pump's whole flow by that at the records' largest.
-
-    Beyond this `flow` [m^3/s] the line may be laminar throughout or turbulent throughout.
-    """
-    ratio = flow / rig.supply.flow
-    if not 0.0 < ratio < 1.0:
-        return dp, dp
-    drop, _ = drop_and_slope(ratio, turbulent_part(dp, share), share)
-    return drop / ratio, drop / ratio**2
-
-
-def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> str:
-    """State a line's drop at the largest flow [m^3/s] of the records where that is not the pump's.
-
-    `name` is that of the drop `dp` [Pa] at the pump's whole flow, `share` is r_t.
-    """
-    ratio = flow / rig.supply.flow
-    if not 0.0 < ratio < WHOLE:
-        return ""
-    drop, _ = drop_and_slope(ratio, turbulent_part(dp, share), share)
-    return (
-        f"{name} is the drop at the pump's whole {plain(6e4 * rig.supply.flow, 2)} l/min; at the "
-        f"largest flow of these records, {plain(6e4 * flow, 2)} l/min, it is "
-        f"{plain(drop / 1e6, 2)} MPa"
-    )
-
-
-def grid_at_flow(
-    rig: Rig, effect: Effect, evidence: Evidence, drawn: bool, powers: Sequence[int]
-) -> tuple[tuple[float, ...], ...]:
-    """Return a starting grid scaled to the largest flow of the records.
-
-    `powers` are the exponents with which each shape scales with the pump's flow over that flow.
-    """
-    flow = largest_flow(rig, evidence.signals, drawn)
-    if flow <= 0.0:
-        return ()
-    times = min(max(rig.supply.flow / flow, 1.0), 1.0 / LEAST_FLOW)
-    axes = [
-        [value * times**power for value in shape.grid]
-        for shape, power in zip(effect.shapes(rig), powers, strict=False)
-    ]
-    return tuple(itertools.product(*axes))
-
-
 def largest_flow(rig: Rig, signals: Sequence[Signals], drawn: bool) -> float:
     """Return the largest flow [m^3/s] in records that all valves draw, or return to the tank."""
     return max((float(port_flow(rig, s, drawn).max()) for s in signals), default=0.0)
@@ -177,7 +131,68 @@ def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
 
 
 @dataclass(frozen=True)
-class SupplySag(PortEffect):
+class LineDrop(PortEffect):
+    """A line whose first two shapes are its drop at the pump's whole flow [Pa], and r_t.
+
+    Its flow is `drawn` from the supply, or returned to the tank. `powers` are the exponents with
+    which the shapes searched scale with the pump's flow over the largest of the records.
+    """
+
+    by_data: ClassVar[bool] = True
+    drawn: ClassVar[bool]
+    powers: ClassVar[tuple[int, ...]]
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return a starting grid scaled to the largest flow of the records."""
+        flow = largest_flow(rig, evidence.signals, self.drawn)
+        if flow <= 0.0:
+            return ()
+        times = min(max(rig.supply.flow / flow, 1.0), 1.0 / LEAST_FLOW)
+        axes = [
+            [value * times**power for value in shape.grid]
+            for shape, power in zip(self.shapes(rig), self.powers, strict=False)
+        ]
+        return tuple(itertools.product(*axes))
+
+    def _at_largest_flow(
+        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
+    ) -> tuple[float, float]:
+        """Return the largest flow of records over the pump's, and the drop [Pa] there."""
+        dp, share, *_ = self.whole(rig, shape)
+        ratio = largest_flow(rig, signals, self.drawn) / rig.supply.flow
+        return ratio, drop_and_slope(ratio, turbulent_part(dp, share), share)[0]
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the drop at the largest flow of the records where that is not the pump's."""
+        ratio, drop = self._at_largest_flow(rig, signals, shape)
+        if not 0.0 < ratio < WHOLE:
+            return ""
+        pump = 6e4 * rig.supply.flow
+        return (
+            f"{self.shape_names()[0]} is the drop at the pump's whole {plain(pump, 2)} l/min; at "
+            f"the largest flow of these records, {plain(ratio * pump, 2)} l/min, it is "
+            f"{plain(drop / 1e6, 2)} MPa"
+        )
+
+    def extrapolated(
+        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
+    ) -> Mapping[str, tuple[float, float]]:
+        """Return the range of the drop at the pump's whole flow, of which records show a part.
+
+        Beyond their largest flow the line may be laminar throughout or turbulent throughout.
+        """
+        ratio, drop = self._at_largest_flow(rig, signals, shape)
+        if not 0.0 < ratio < 1.0:
+            return {}
+        return {self.shape_names()[0]: (drop / ratio, drop / ratio**2)}
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the flow drawn or returned [m^3/s]."""
+        return _everywhere(signals, port_flow(rig, signals, self.drawn))
+
+
+@dataclass(frozen=True)
+class SupplySag(LineDrop):
     """The valves see p_s - dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3), r = Q / Q_pump.
 
     dp is the drop at the pump's whole flow. Where the rig measures its supply, this is the line
@@ -192,7 +207,8 @@ class SupplySag(PortEffect):
     mechanism: ClassVar[str] = "supply_curve"
     element: ClassVar[str] = "supply"
     name: ClassVar[str] = "supply_sag"
-    by_data: ClassVar[bool] = True
+    drawn: ClassVar[bool] = True
+    powers: ClassVar[tuple[int, ...]] = (2, -1, -1)
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
     quantity: ClassVar[str] = "flow drawn"
@@ -219,28 +235,11 @@ class SupplySag(PortEffect):
             Shape("V_supply", "m^3", 0.0, most, (0.005 * most, 0.1 * most), resolution=True),
         )
 
-    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return starting drops, shares and volumes at the flow drawn."""
-        return grid_at_flow(rig, self, evidence, drawn=True, powers=(2, -1, -1))
-
-    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State the drop at the largest flow drawn."""
-        dp, share, _ = self.shape_of(rig, shape)
-        return line_remark(rig, largest_flow(rig, signals, drawn=True), "dp_supply", dp, share)
-
-    def extrapolated(
-        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
-    ) -> Mapping[str, tuple[float, float]]:
-        """Return the range of the drop at the pump's whole flow."""
-        dp, share, _ = self.shape_of(rig, shape)
-        flow = largest_flow(rig, signals, drawn=True)
-        return {"dp_supply": extrapolated_drop(rig, flow, dp, share)}
-
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the drop from the supply pressure."""
         dp, share, volume = self.shape_of(rig, shape)
         turbulent = turbulent_part(dp, share)
-        ratio = np.ascontiguousarray(port_flow(rig, signals, drawn=True) / rig.supply.flow)
+        ratio = np.ascontiguousarray(port_flow(rig, signals, self.drawn) / rig.supply.flow)
         capacity = volume / (bulk_modulus(rig) * rig.supply.flow)
         drop = _line(ratio, 1.0 / signals.rate, turbulent, share, capacity)
         return replace(signals, p_s=signals.p_s - drop)
@@ -249,10 +248,6 @@ class SupplySag(PortEffect):
         """Return the line (`packed_line`), C_pp and C_mm of each joint."""
         dp, share, _ = self.shape_of(rig, shape)
         return np.array([*packed_line(rig, dp, share), *edge_gains(rig, values, (0, 3))])
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the flow drawn [m^3/s]."""
-        return _everywhere(signals, port_flow(rig, signals, drawn=True))
 
 
 @dataclass(frozen=True)
@@ -322,7 +317,7 @@ class TankPressure(PortEffect):
 
 
 @dataclass(frozen=True)
-class ReturnLine(PortEffect):
+class ReturnLine(LineDrop):
     """The return pressure is its line's drop, dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3).
 
     r = Q / Q_pump, and dp is the drop at the pump's whole flow. Laminar below the share r_t of the
@@ -331,7 +326,8 @@ class ReturnLine(PortEffect):
     """
 
     name: ClassVar[str] = "return_line"
-    by_data: ClassVar[bool] = True
+    drawn: ClassVar[bool] = False
+    powers: ClassVar[tuple[int, ...]] = (2,)
     mechanism: ClassVar[str] = "return_line"
     element: ClassVar[str] = "tank"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
@@ -358,27 +354,10 @@ class ReturnLine(PortEffect):
             replace(turning("return_laminar", (0.5,)), detail=True),
         )
 
-    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return starting drops at the flow returned."""
-        return grid_at_flow(rig, self, evidence, drawn=False, powers=(2,))
-
-    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State the drop at the largest flow returned."""
-        dp, share = self.whole(rig, shape)
-        return line_remark(rig, largest_flow(rig, signals, drawn=False), "dp_return", dp, share)
-
-    def extrapolated(
-        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
-    ) -> Mapping[str, tuple[float, float]]:
-        """Return the range of the drop at the pump's whole flow."""
-        dp, share = self.whole(rig, shape)
-        flow = largest_flow(rig, signals, drawn=False)
-        return {"dp_return": extrapolated_drop(rig, flow, dp, share)}
-
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""
         dp, share = self.whole(rig, shape)
-        ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow
+        ratio = port_flow(rig, signals, self.drawn) / rig.supply.flow
         drop = turbulent_part(dp, share) * ratio * np.cbrt(ratio**3 + share**3)
         return replace(signals, p_tank=signals.p_tank + drop)
 
@@ -386,10 +365,6 @@ class ReturnLine(PortEffect):
         """Return the line (`packed_line`), C_mp and C_pm of each joint."""
         line = packed_line(rig, *self.whole(rig, shape))
         return np.array([*line, *edge_gains(rig, values, (2, 1))])
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the flow returned [m^3/s]."""
-        return _everywhere(signals, port_flow(rig, signals, drawn=False))
 
 
 def edge_gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -> list[float]:
