@@ -281,13 +281,9 @@ class Effect(Term):
         """Return whether the effect has memory (a hidden state in use) at a shape."""
         return len(shape) > 0
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return the shape with missing details at their starting points."""
-        return (*shape, *(s.middle for s in self.shapes(rig)[len(shape) :]))
-
-    def starts_in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the shapes, missing details included, from which a search of details begins."""
-        return (self.in_detail(rig, shape),)
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the shape with missing details, once for each start of their search."""
+        return ((*shape, *(s.middle for s in self.shapes(rig)[len(shape) :])),)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return shapes from which a search finds other forms of the same effect."""

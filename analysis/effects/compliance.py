@@ -84,9 +84,9 @@ class EntrainedAir(Effect):
         """Return the form with a variable exponent."""
         return () if len(shape) else ((1.2,),)
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape as it is: the exponent belongs to another form."""
-        return tuple(shape)
+        return (tuple(shape),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return - V dp/dt times the softness of each chamber's gas per alpha."""
@@ -169,13 +169,8 @@ class DeadVolume(Effect):
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber."""
-        part = rig.joints[self.joint].cylinder
-        pipe, area = (
-            (part.cap_pipe_volume, part.cap_area)
-            if self.side == "cap"
-            else (part.rod_pipe_volume, part.rod_area)
-        )
-        known = pipe + 0.5 * part.stroke * area
+        cap, rod = map(float, rig.chamber_volumes(self.joint, np.zeros(())))
+        known = cap if self.side == "cap" else rod
         grid = (0.05 * known, 0.25 * known, 1.0 * known)
         return (Shape(self.shape_names()[0], "m^3", 0.0, MOST_VOLUME * known, grid, 0.0),)
 

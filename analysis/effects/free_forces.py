@@ -91,10 +91,8 @@ class FrictionCurve(Friction):
         """Return knots [m/s], presliding distance [m], transition speed [m/s] and growth [1/m]."""
         speed = rig.joints[self.joint].limits.speed
         most = 1.0 / self._half(rig)  # the friction vanishes at one end of the stroke
-        bound = MOST_GROWTH * most
-        growth = Shape(
-            self.shape_names()[-1], "1/m", -bound, bound, (GROWS[2] * most,), detail=True
-        )
+        bound, grid = MOST_GROWTH * most, tuple(share * most for share in GROWS)
+        growth = Shape(self.shape_names()[-1], "1/m", -bound, bound, grid, detail=True)
         return (*knot_shapes(self.knot_names(), "m/s", 0.0, speed), *super().shapes(rig), growth)
 
     def _half(self, rig: Rig) -> float:
@@ -106,7 +104,7 @@ class FrictionCurve(Friction):
         """Return the middle of the stroke [m]."""
         return 0.5 * float(sum(rig.joints[self.joint].position_range))
 
-    def starts_in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shapes with growths along the stroke from which a search begins.
 
         Viscous friction and the slope of the curve, whose levers differ, imitate a growth: the
@@ -116,7 +114,7 @@ class FrictionCurve(Friction):
         if len(shape) > place:
             return (tuple(shape),)
         whole = (*shape, *(0.0,) * (place - len(shape)))
-        return tuple((*whole, share / self._half(rig)) for share in GROWS)
+        return tuple((*whole, growth) for growth in self.shapes(rig)[-1].grid)
 
     def _growth(self, shape: Sequence[float]) -> float:
         """Return the growth [1/m] of a shape, 0 where it has none."""

@@ -97,11 +97,11 @@ class Friction(Effect):
         distances = (presliding(name, bore(rig, self.joint)) for name in self.distance_names())
         return (*distances, *rate, transition(f"transition_{joint}"))
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where the contact has a memory and can stiffen."""
         if self.stiffens and self.remembers(shape) and len(shape) == self.before + 1:
-            return (*shape, STIFFENING)
-        return tuple(shape)
+            return ((*shape, STIFFENING),)
+        return (tuple(shape),)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the contact without memory, of a shape that has one."""

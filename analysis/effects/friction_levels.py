@@ -189,9 +189,9 @@ class PressureDependentFriction(Friction):
         (distance,) = self.shape_of(rig, ())
         return ((distance, 0.0, 0.0, DIFFERENCE_LOAD),)
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where its load is the sum, at constant stiffness."""
-        return tuple(shape) if len(shape) > 3 else super().in_detail(rig, shape)
+        return (tuple(shape),) if len(shape) > 3 else super().in_detail(rig, shape)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the contact without memory or at a constant distance, and the other load."""

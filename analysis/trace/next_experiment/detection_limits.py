@@ -22,7 +22,6 @@ from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
-from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
@@ -30,7 +29,12 @@ from analysis.trace.next_experiment.discrimination import (
     smallest_effect,
 )
 from analysis.trace.result import DetectionLimit
-from analysis.trace.search.hypothesis import Hypothesis, law_of, parameter_values
+from analysis.trace.search.hypothesis import (
+    Hypothesis,
+    is_special_case,
+    law_of,
+    parameter_values,
+)
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased, tangent
 from analysis.trace.settings import TRACE
@@ -52,11 +56,15 @@ def detection_limits(
     curve absorbs any similar effect.
     """
     train_data = hypotheses.train_data
-    if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
+    named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
+    if any(effect.free for effect in named):
         return []
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
-    held = winner.keys | {(n, u.term.where) for u in winner.effects for n in _included(u)}
-    asked = [effect for effect in effects if (effect.name, effect.where) not in held]
+    asked = [
+        effect for effect in effects
+        if (effect.name, effect.where) not in winner.keys
+        and not any(is_special_case(effect, other) for other in named)
+    ]  # fmt: skip
     fitted = _fitted_instead(hypotheses, winner)
     small = [
         explanation
@@ -86,12 +94,6 @@ def detection_limits(
     for limit in sorted(found, key=lambda f: -f.shift):
         once.setdefault(limit.name, limit)
     return list(once.values())
-
-
-def _included(used: Used) -> tuple[str, ...]:
-    """Return the names of the special cases of an effect."""
-    assert isinstance(used.term, Effect)
-    return used.term.includes
 
 
 def _fitted_instead(

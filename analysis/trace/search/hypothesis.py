@@ -53,10 +53,14 @@ def law_of(used: Used) -> Key:
     return used.term.mechanism, used.term.where
 
 
+def is_special_case(effect: Effect, other: Effect) -> bool:
+    """Return whether an effect is a special case of another one at the same place."""
+    return effect.name in other.includes and effect.where == other.where
+
+
 def of_one_law(effect: Effect, other: Effect) -> bool:
     """Return whether one of two effects at the same place includes the other as a special case."""
-    near = effect.name in other.includes or other.name in effect.includes
-    return near and effect.where == other.where
+    return is_special_case(effect, other) or is_special_case(other, effect)
 
 
 @dataclass(frozen=True)

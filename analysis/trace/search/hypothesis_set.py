@@ -34,6 +34,7 @@ from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
     energy_above_noise,
+    is_special_case,
     law_of,
     negative_body,
     noise_band,
@@ -407,7 +408,8 @@ class HypothesisSet:
                     continue
                 fresh = self._started(effect, others)
                 sets.append((*others, fresh))
-                if used.term.name in effect.includes and effect.where == used.term.where:
+                assert isinstance(used.term, Effect)
+                if is_special_case(used.term, effect):
                     # Another effect may only have made up for what the simpler law lacks.
                     sets += [(*(u for u in others if u is not one), fresh) for one in others]
         return sets

@@ -206,7 +206,7 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         fit = _in_best_form(data, fit, k, steps)
         used = fit.terms[k]
         assert isinstance(used.term, Effect)
-        starts = used.term.starts_in_detail(data.rig, used.shape)
+        starts = used.term.in_detail(data.rig, used.shape)
         opened = [Used(used.term, start) for start in starts if start != used.shape]
         asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
         # Half, since the linear prediction is less than what a detail removes.

@@ -186,10 +186,10 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
     for e in effects(rig):
         if isinstance(e, Sensor):
             continue
-        shape = e.in_detail(rig, e.shape_of(rig, ()))
-        if e.name == "supply_sag":
-            shape = (*shape[:2], 0.0)  # the simulation's line follows at once
-        forms += [(e, one) for one in (shape, *e.other_forms(rig, shape))]
+        for start in e.in_detail(rig, e.shape_of(rig, ())):
+            # The simulation's line follows at once.
+            shape = (*start[:2], 0.0) if e.name == "supply_sag" else start
+            forms += [(e, one) for one in (shape, *e.other_forms(rig, shape))]
     for e, shape in forms:
         signals = consistent(rig, state, e, shape) if e.stage == SUPPLY else state
         values, par = packed(e, rig, shape)
