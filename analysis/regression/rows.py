@@ -99,15 +99,25 @@ def default_filtering(record: Record) -> Filtering:
     elif ch.channel(ch.POSITION, 1) in record.channels:
         cutoff = REGRESSION.row_cutoff_electric
     elif record.bandwidth is not None:
-        wanted = REGRESSION.lines_factor * record.bandwidth
-        cutoff = float(np.clip(wanted, REGRESSION.row_cutoff_range[0], cutoff))
+        cutoff = _cutoff(record.bandwidth, REGRESSION.slow_bandwidth, cutoff)
     return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
 
 
 def lines_cutoff(record: Record) -> float:
     """Return the row filter's cutoff [Hz] for a record whose excited lines are known."""
     highest = max(record.lines) * record.sample_rate / record.period
-    return float(np.clip(REGRESSION.lines_factor * highest, *REGRESSION.row_cutoff_range))
+    several = len(record.lines) >= REGRESSION.multisine_lines
+    slow = REGRESSION.slow_lines if several else np.inf
+    return _cutoff(highest, slow, REGRESSION.row_cutoff_range[1])
+
+
+def _cutoff(highest: float, slow: float, most: float) -> float:
+    """Return the row filter's cutoff [Hz] for motion up to `highest` [Hz], at most `most` [Hz].
+
+    The lower limit is `slow` times `highest` where that is less than the usual one.
+    """
+    least = min(REGRESSION.row_cutoff_range[0], slow * highest)
+    return float(np.clip(REGRESSION.lines_factor * highest, least, most))
 
 
 def paper_filtering(record: Record) -> Filtering:

@@ -14,6 +14,7 @@ from analysis.regression.rows import FILTERINGS, Filtering
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter, row_filter, row_step
 from analysis.signals.locks import accelerates
+from analysis.simulation.synthetic import multisine, synthetic_run
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -56,6 +57,17 @@ def test_and_from_the_papers_sine_as_well(sine_run: Run) -> None:
     result = identify([sine_run])
     assert worst(result, MECHANICS_AND_GAINS) < 0.004
     assert worst(result, ("b",)) < 0.01
+
+
+def test_slow_motion_shows_its_inertias_beside_noisy_sensors(rig: Rig) -> None:
+    """Lines up to 0.8 Hz and sensors four times as noisy as stated, one record of each step."""
+    wave = multisine(np.random.default_rng(1), rig.sample_rate, 20.0, 0.8)
+    run = synthetic_run(
+        rig, np.random.default_rng(2), wave, rms=0.004, repeats=1, noise=4.0, seconds=40.0
+    )
+    estimates = identify([run]).estimates
+    assert estimates["M1"].value == pytest.approx(rig.nominal["M1"], rel=0.01)
+    assert estimates["R12"].value == pytest.approx(rig.nominal["R12"], rel=0.05)
 
 
 def test_the_papers_own_filter_is_offered_and_its_bias_is_real(sine_run: Run) -> None:

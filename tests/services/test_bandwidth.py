@@ -10,7 +10,7 @@ import pytest
 
 from analysis.regression.rows import default_filtering
 from analysis.regression.settings import REGRESSION
-from rig.model.records import Record, Run, with_common_bandwidth
+from rig.model.records import BANDWIDTH, Record, Run, with_common_bandwidth
 from rig.model.rig import Rig
 from rig.runs.exchange.bandwidth import motion_bandwidth
 from rig.runs.exchange.importer import import_records
@@ -78,6 +78,20 @@ def test_the_bandwidth_that_a_manifest_states_holds(rig: Rig, tmp_path: Path) ->
 def test_known_lines_need_no_bandwidth(rig: Rig, tmp_path: Path) -> None:
     (record,) = imported(tmp_path, rig, ", period: 5000, lines: [3, 13]", moved(rig, 0.3, 1.3))
     assert record.bandwidth is None
+
+
+def test_slow_motion_of_many_lines_has_a_narrow_filter_and_a_slow_sine_keeps_harmonics(
+    rig: Rig,
+) -> None:
+    """All but the last, which is filtered by its highest line, excite 0.8 Hz at most."""
+    slow = Record("a", "a", (2,), 1, RATE, moved(rig, 0.8), period=10_000, lines=(2, 5, 9, 16))
+    assert cutoff_of(slow) == pytest.approx(1.3 * 3.2, rel=0.05)
+    sine = replace(slow, lines=(16,))
+    assert cutoff_of(sine) == pytest.approx(1.3 * REGRESSION.row_cutoff_range[0], rel=0.05)
+    known = replace(slow, period=0, lines=(), attributes={BANDWIDTH: 0.8})
+    assert cutoff_of(known) == pytest.approx(1.3 * 2.4, rel=0.05)
+    quick = replace(slow, lines=(20, 50, 90, 160))
+    assert cutoff_of(quick) == pytest.approx(1.3 * 12.0, rel=0.05)
 
 
 def test_records_that_are_analysed_together_pass_alike_filters(rig: Rig, tmp_path: Path) -> None:
