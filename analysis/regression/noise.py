@@ -12,7 +12,7 @@ Source: Fuller, Measurement Error Models, section 2.2.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,21 +28,43 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
+_HARMONICS = 50  # of a rounding error as a function of the signal: 99 % of its variance
+
 
 def sensor_variance(sensor: AnySensor) -> float:
     """Return the variance of one sample [SI^2]: stated noise and the converter's rounding."""
+    return float(sensor.noise**2 + _converter_step(sensor) ** 2 / 12.0)
+
+
+def repeated_rounding(sensor: AnySensor) -> float:
+    """Return the variance [SI^2] of the rounding error that is the same in every repeat.
+
+    With noise of standard deviation s before a converter of step q, the mean over repeats of the
+    rounding error of x is a sum of (q / (pi k)) exp(-2 (pi k s / q)^2) sin(2 pi k x / q) (Widrow
+    and Kollar, Quantization Noise, 2008, ch. 4); without noise its variance is q^2 / 12.
+    """
+    step, k = _converter_step(sensor), np.arange(1, _HARMONICS + 1)
+    amplitudes = step / (np.pi * k) * np.exp(-2.0 * (np.pi * k * sensor.noise / step) ** 2)
+    return float(0.5 * amplitudes @ amplitudes)
+
+
+def _converter_step(sensor: AnySensor) -> float:
     low, high = sensor.range
-    rounding = (high - low) / ((1 << sensor.bits) - 1)
-    return float(sensor.noise**2 + rounding**2 / 12.0)
+    return float((high - low) / ((1 << sensor.bits) - 1))
 
 
-def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
-    """Return the record with the sensors' noise of the rig file added once more."""
+def with_added_noise(
+    rig: Rig,
+    record: Record,
+    rng: np.random.Generator,
+    variance: Callable[[AnySensor], float] = sensor_variance,
+) -> Record:
+    """Return the record with noise added, of a variance [SI^2] by sensor of the rig file."""
     channels = dict(record.channels)
     for name in rig.channels:
         if name in channels:
             sensor = rig.sensors.of(ch.kind_of(name)[0])
-            noise = np.sqrt(sensor_variance(sensor)) * rng.standard_normal(record.samples)
+            noise = np.sqrt(variance(sensor)) * rng.standard_normal(record.samples)
             channels[name] = channels[name] + noise
     return replace(record, channels=channels)
 

@@ -160,6 +160,9 @@ class DataSettings:
     least_noise: float = 0.2
     """Smallest noise floor over the noise that the rig file states; a floor measured lower is set
     to it (tuned)."""
+    least_rounding: float = 1e-3
+    """Least share of a sensor's variance by rounding that repeats: below it noise dithers the
+    converter (arithmetic)."""
     unrepeated_ratio: float = 5.0
     """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
     note says that something else acts (tuned: clean benches stay below 2)."""

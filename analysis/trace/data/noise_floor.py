@@ -12,12 +12,13 @@ not state, and a note says so.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
-and a clean bench would never be `clean`.
+and a clean bench would never be `clean`. What coarse converters round alike in every repeat is
+noise too, as far as the rig file's converters explain it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,11 +26,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.noise import with_added_noise
+from analysis.regression.noise import repeated_rounding, sensor_variance, with_added_noise
 from analysis.regression.rows import Rows, in_common
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.settings import DATA
+from rig.model import channels as ch
+from rig.model.parts import AnySensor
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -94,6 +97,7 @@ def floors(
     out = []
     for group, indices in groups.items():
         stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
+        rounded = _repeated_rounding(rig, terms, members[indices[0]], rows[indices[0]], beta)
         for equation in rows[indices[0]]:
             parts = [rows[i][equation] for i in indices if equation in rows[i]]
             residual = [row_residual(r, beta) for r in parts]
@@ -103,7 +107,9 @@ def floors(
             table, source = stacked_repeats(members[indices[0]], parts, residual)
             if table is not None:
                 noise, repeatable = noise_and_repeatable(table)
-                noise = max(noise, DATA.least_noise * sensors)
+                alike = min(repeatable, rounded[equation])
+                noise = max(float(np.hypot(noise, alike)), DATA.least_noise * sensors)
+                repeatable = float(np.sqrt(repeatable**2 - alike**2))
                 out.append(
                     Floor(group, equation, noise, repeatable, total, len(table), source, sensors)
                 )
@@ -251,15 +257,32 @@ def stated_noise(
     conditioned: ConditionedRecord,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
+    variance: Callable[[AnySensor], float] = sensor_variance,
 ) -> dict[str, float]:
-    """Return the rms that the rig's stated sensor noise alone puts into each residual."""
+    """Return the rms that noise of the rig's sensors alone puts into each residual.
+
+    `variance` [SI^2] is that of a sample of each sensor, by default all of its stated noise.
+    """
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
-    again = model_rows(
-        rig, terms, conditioned.condition_alike(rig, with_added_noise(rig, conditioned.record, rng))
-    )
+    noisy = with_added_noise(rig, conditioned.record, rng, variance)
+    again = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
     out = {}
     for name, before in rows.items():
         a, b = in_common(before, again[name])
         change = row_residual(again[name], beta)[b] - row_residual(before, beta)[a]
         out[name] = float(np.sqrt(np.mean(change**2))) if len(change) else NO_ROWS
     return out
+
+
+def _repeated_rounding(
+    rig: Rig,
+    terms: Sequence[Used],
+    conditioned: ConditionedRecord,
+    rows: Mapping[str, Rows],
+    beta: Mapping[str, float],
+) -> dict[str, float]:
+    """Return the rms of the rounding that all repeats share, in each residual."""
+    sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+    if all(repeated_rounding(s) < DATA.least_rounding * sensor_variance(s) for s in sensors):
+        return dict.fromkeys(rows, 0.0)
+    return stated_noise(rig, terms, conditioned, rows, beta, repeated_rounding)
