@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.regression.conditioned import ConditionedRecord
@@ -38,11 +39,13 @@ from analysis.trace.result import (
 )
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.hypothesis import Hypothesis, within_band
-from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import DATA, TRACE
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
 
 ONLY_HELD_OUT_MISSED = (
     "the training records are met to within the noise, the held-out ones are not: train on "
@@ -170,22 +173,23 @@ def _training_rows(
 def unstated_noise(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, finding: Finding
 ) -> tuple[TraceRuns, TraceRows] | None:
-    """Return runs and rows whose noise floors are what the baseline leaves, where nothing repeats.
+    """Return runs and rows whose noise floors are what `finding` leaves, where nothing repeats.
 
     The stated noise may lack what a sensor has at low frequencies. None where an equation's noise
-    was measured, where it leaves more than `DATA.unstated_ratio` times the stated noise, or where
-    an effect or a variable of the records removes a part of that from held-out records.
+    was measured, where more than `DATA.unstated_ratio` times the stated noise is left, where a
+    variable of the records removes a part of that from held-out records, or an effect that the
+    gates refuse.
     """
-    data, winner = finding.rows.train, finding.winner
+    data = finding.rows.train
     measured = any(f.source != STATED for f in data.floors)
-    removed = any(map(gates.removes, finding.effects))
-    if finding.verdict != UNEXPLAINED or winner.effects or removed or measured:
+    refused = any(map(gates.removes, gates.refused_effects(finding.effects)))
+    if finding.verdict != UNEXPLAINED or refused or measured:
         return None
-    ratio = {}
-    for name in {f.equation for f in data.floors}:
-        own = [f for f in data.floors if f.equation == name]
-        powers = (sum(f.total**2 for f in own), sum(f.stated**2 for f in own))
-        ratio[name] = float(np.sqrt(powers[0] / max(powers[1], 1e-300)))
+    winner = _with_tied_effects(finding)
+    power: dict[str, list[Array]] = {}
+    for s in data.segments:  # whitened by the stated noise
+        power.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
+    ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in power.items()}
     if max(ratio.values()) > DATA.unstated_ratio:
         return None
     moves, formulas = clues_to(data, finding.rows.unseen.choosing, winner, ())
@@ -194,6 +198,15 @@ def unstated_noise(
     above = {name: max(1.0, value) for name, value in ratio.items()}
     records = replace(records, noise_ratio=above)
     return records, trace_rows(rig, terms, records)
+
+
+def _with_tied_effects(finding: Finding) -> Hypothesis:
+    """Return the set of a finding with effects that only a tied rival keeps from being named."""
+    passing = [effect_of(f.name, f.at) for f in finding.effects if gates.passes_gates(f)]
+    if len(passing) == len(finding.winner.effects):
+        return finding.winner
+    rig = finding.rows.train.rig
+    return finding.hypotheses.refined([Used(e, e.shape_of(rig, ())) for e in passing])
 
 
 def _without_masked_steps(train_data: RegressionData) -> RegressionData:

@@ -63,10 +63,10 @@ def piston_speed(record: Record) -> Array:
     return np.asarray(np.gradient(s) * record.sample_rate)
 
 
-def understated(rig: Rig) -> Rig:
-    """Return a rig that states two thirds of the noise of its sensors."""
+def understated(rig: Rig, times: float = 1.5) -> Rig:
+    """Return a rig whose sensors have `times` the noise that it states."""
     quiet = {
-        name: sensor.model_copy(update={"noise": sensor.noise / 1.5})
+        name: sensor.model_copy(update={"noise": sensor.noise / times})
         for name, sensor in rig.sensors if hasattr(sensor, "noise")
     }  # fmt: skip
     return rig.model_copy(update={"sensors": rig.sensors.model_copy(update=quiet)})
