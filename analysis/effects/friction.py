@@ -55,6 +55,7 @@ from rig.model.rig import Rig
 
 BREAKAWAY: Final = 0.1  # of the sliding level: less is the form of the contact, not a breakaway
 FALLEN: Final = 1 / 3  # of the breakaway, up to the records' top speed: less is one level's form
+SLOWEST_FALL: Final = 0.5  # Stribeck over top speed: above it the fall is a line within 7 % rms
 SPEEDS: Final = 200  # points of the curve over speed in which a fall is looked for
 LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it is negligible: prevents division by zero
 
@@ -339,10 +340,16 @@ class StribeckFriction(Friction):
     ) -> str:  # fmt: skip
         """Say so where the joint's dry friction hardly falls up to the records' top speed.
 
-        Two contacts of different transition speeds give any smooth curve that only rises.
+        Two contacts of different transition speeds give any smooth curve that only rises, and a
+        fall over most of the speeds is that of a level beside another viscous friction.
         """
         i = self.joint
         top = max((float(np.abs(s.sd[:, i]).max()) for s in signals if s.excited[i]), default=0.0)
+        if shape[0] > SLOWEST_FALL * top:
+            return (
+                f"Stribeck speed {shape[0]:.3g} m/s, over {SLOWEST_FALL:.0%} of the records' top "
+                f"speed {top:.3g} m/s: viscous friction makes up for such a fall"
+            )
         v = np.linspace(0.0, top, SPEEDS + 1)[1:]
         own = self.coefficients(rig)[0]
         total = values[own.parameter] * self._level(rig, v, shape) * self.over_speed(v, shape)

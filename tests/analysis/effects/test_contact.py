@@ -105,3 +105,20 @@ def test_a_breakaway_is_seen_where_friction_falls_within_the_speeds_of_the_recor
         v / width
     )
     assert (curve.max() - curve[-1] > force / 3) == falls
+
+
+def test_a_fall_over_most_of_the_speeds_is_no_breakaway(rig: Rig, multisine_run: Run) -> None:
+    """A level and a share of the viscous friction make the same curve within 7 % of the force."""
+    conditioned = (condition(rig, record) for record in multisine_run.records)
+    signals = [s for s in conditioned if s.excited[1]][:1]
+    top = float(np.abs(signals[0].sd[:, 1]).max())
+    v = np.linspace(1e-4, top, 500)
+    lines = np.column_stack([np.ones_like(v), v])
+    effect = StribeckFriction("joint 2")
+    for share, shown in ((0.2, True), (0.55, False), (0.8, False)):
+        shape = (share * top, 0.0, 1e-4)
+        said = effect.not_shown(rig, {"Fs2": 400.0}, shape, [Used(effect, shape)], signals)
+        assert ("viscous friction makes up" in said) != shown
+        curve = np.exp(-((v / shape[0]) ** 2))
+        left = curve - lines @ np.linalg.lstsq(lines, curve)[0]
+        assert (np.std(left) > 0.07) == shown
