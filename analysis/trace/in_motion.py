@@ -22,6 +22,7 @@ from analysis.trace.finding import (
 from analysis.trace.judge import gates, removal
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.unlocked import judged_line
+from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -195,7 +196,7 @@ def rest_phase_notes(joints: Iterable[int], included: bool) -> list[str]:
     """
     errors = "include them" if included else "leave them out"
     return [
-        f"{equation('torque', joint)}: judged without the samples at which the joint rests, where "
-        f"dry friction is whatever holds it; the errors {errors}"
+        f"{equation('torque', joint)}: {WITHOUT_RESTS}, where dry friction is whatever holds it; "
+        f"the errors {errors}"
         for joint in sorted(joints)
     ]

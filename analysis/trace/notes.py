@@ -26,6 +26,8 @@ from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from rig.model.units import plain
 
+# Begins what a note says of a torque whose rests are not judged; the sentence refers to it.
+WITHOUT_RESTS: Final = "judged without the samples at which the joint rests"
 WHY_MASKED: Final = "a pressure lies outside 0 to the supply's, or samples were clipped or lost"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from analysis.simulation.model import Estimate
 from analysis.terms import make
 from analysis.trace.clues.formula import surest_formula
+from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Curve, JudgedEffect, Trace
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
@@ -62,9 +63,12 @@ def sentence(result: Trace) -> str:
     if not named and result.unexplained_fraction == 0.0:
         return f"{prefix}{_held_out_only(result)}"
     clue = ", ".join(d.text for d in result.depends_on[:2])
+    share = f"{plain(100 * result.unexplained_fraction, 2)} % of the repeatable residual energy"
+    remains = f"{share} remains unexplained"
+    if result.unexplained_fraction <= TRACE.held_out_share:
+        remains = f"{share} remains in the training records, more in the held-out ones"
     return (
-        f"{prefix}{100 * result.unexplained_fraction:.0f} % of the repeatable residual energy "
-        "remains unexplained"
+        f"{prefix}{remains}"
         + (f"; it depends on {clue}" if clue else "")
         + _symmetry(result)
         + _formula(result)
@@ -152,10 +156,15 @@ def _tolerated(result: Trace) -> list[str]:
     if result.verdict not in (EXPLAINED, CONFOUNDED) or not above:
         return []
     e = above[0]
+    share = result.remaining_share(e)
+    why = f"the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %"
+    if any(note.startswith(f"{e}: {WITHOUT_RESTS}") for note in result.notes):
+        why = "it includes the samples at which the joint rests, which are not judged"
+    elif share > TRACE.held_out_share:
+        why = "in the records that choose, the error is within the band of an explanation"
     return [
         f"What is left in {e}, {result.after[e] / result.noise_floor[e]:.1f} times the noise "
-        f"floor, is {plain(100 * result.remaining_share(e), 2)} % of the energy that was above "
-        f"the noise: the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %."
+        f"floor, is {plain(100 * share, 2)} % of the energy that was above the noise: {why}."
     ]
 
 

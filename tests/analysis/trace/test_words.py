@@ -10,11 +10,12 @@ import numpy as np
 from analysis.simulation.model import Estimate, nominal_model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
+from analysis.trace.in_motion import rest_phase_notes
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates
 from analysis.trace.judge.unknown_cause import tied_in_held_out
 from analysis.trace.notes import undetermined_notes
 from analysis.trace.remaining import tolerance_words
-from analysis.trace.result import EXPLAINED, Gate, JudgedEffect, Rival, Trace
+from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.rig import Rig
@@ -93,6 +94,32 @@ def test_an_error_above_the_noise_is_said_to_be_within_the_form(rig: Rig) -> Non
     assert "left in torque_2, 3.3 times the noise floor, is 0.27 % of the energy" in text
     assert "may miss 5 %" in text
     assert "may miss" not in told(rig, (SPRING,))
+
+
+def test_an_error_that_includes_rests_or_other_rows_does_not_contradict_the_tolerance(
+    rig: Rig,
+) -> None:
+    """A quarter of the energy is left, five times what a form may miss."""
+    before, after = BEFORE | {"torque_2": 4 * FLOOR["torque_2"]}, AFTER
+    after = after | {"torque_2": 2.2 * FLOOR["torque_2"]}
+    rests = rest_phase_notes([1], included=True)
+    for notes, reason in (
+        ((), "in the records that choose, the error is within the band"),
+        (rests, "it includes the samples at which the joint rests, which are not judged"),
+    ):
+        text = told(rig, (SPRING,), before, after, notes=tuple(notes))
+        assert f"26 % of the energy that was above the noise: {reason}" in text
+        assert "may miss" not in text
+
+
+def test_what_only_held_out_records_keep_is_not_said_to_be_nothing(rig: Rig) -> None:
+    result = replace(explained(rig, (SPRING,)), verdict=UNEXPLAINED, unexplained_fraction=0.004)
+    assert (
+        "0.4 % of the repeatable residual energy remains in the training records, more in the "
+        "held-out ones"
+    ) in sentence(result)
+    most = replace(result, unexplained_fraction=1.0)
+    assert "100 % of the repeatable residual energy remains unexplained" in sentence(most)
 
 
 def test_an_error_that_no_effect_lowers_is_no_error_of_a_form(rig: Rig) -> None:
