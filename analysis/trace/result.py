@@ -198,8 +198,9 @@ class FreeCurves:
 class DetectionLimit:
     """The largest size of an effect that would leave no residual above the noise.
 
-    `size` [unit] is that of the effect's number `quantity`. An effect of this size would change
-    `parameter` by `shift`, a share of its value.
+    `size` [unit] is the difference of the effect's number `quantity` from its `neutral` value. An
+    effect of this size would change `parameter` by `shift`, a share of its value. Not `possible`:
+    no machine has an effect of this size, so that none is excluded.
     """
 
     name: str
@@ -208,8 +209,10 @@ class DetectionLimit:
     quantity: str
     size: float
     unit: str
+    neutral: float
     parameter: str
     shift: float
+    possible: bool
 
 
 @dataclass(frozen=True)

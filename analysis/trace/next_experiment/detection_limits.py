@@ -39,6 +39,7 @@ from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased, tangent
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
+from rig.model.rig import Rig
 from rig.model.units import plain, typeset
 
 Array = NDArray[np.float64]
@@ -52,7 +53,8 @@ def detection_limits(
     `effects` are the candidates; each name is returned once, at the place where it changes most.
     `winner` is the set found and `model` the model identified with it. Another name of a law that
     acts in the set has the shape with which it was fitted in place of that name. A special case of
-    an effect of the set is no further effect. Beside a free form no limit is computed, since its
+    an effect of the set is no further effect, and no effect is larger than what changes a parameter
+    by all of its value. Beside a free form no limit is computed, since its
     curve absorbs any similar effect.
     """
     train_data = hypotheses.train_data
@@ -85,11 +87,16 @@ def detection_limits(
         moved = dict(zip(names, times * taken[:, k], strict=True))
         shifts = _parameter_shifts(rows.train_data, moved, known)
         most = max(shifts, key=lambda name: shifts[name], default="")
+        if most and shifts[most] > 1.0:  # the parameter would be 0 or of the other sign
+            times, shifts = times / shifts[most], {most: 1.0}
         if most and shifts[most] >= TRACE.noted_shift:
             key, size = explanation.keys[0], _effect_size(rows.train_data, explanation, times)
+            possible = is_possible(train_data.rig, model, explanation, times)
             found.append(
-                DetectionLimit(key["name"], key["where"], key["at"], *size, most, shifts[most])
-            )
+                DetectionLimit(
+                    key["name"], key["where"], key["at"], *size, most, shifts[most], possible
+                )
+            )  # fmt: skip
     once: dict[str, DetectionLimit] = {}
     for limit in sorted(found, key=lambda f: -f.shift):
         once.setdefault(limit.name, limit)
@@ -145,23 +152,55 @@ def _parameter_shifts(
 
 def _effect_size(
     data: RegressionData, explanation: Explanation, times: float
-) -> tuple[str, float, str]:
-    """Return name, value and unit of the number that says how large an effect is."""
+) -> tuple[str, float, str, float]:
+    """Return name, size and unit of the number that says how large an effect is, and its neutral.
+
+    The size is the difference from the neutral value, 1 of a gain.
+    """
     (used,) = explanation.effects
     for c in used.term.coefficients(data.rig):
         if explanation.beta.get(c.parameter):
-            return c.parameter, abs(explanation.beta[c.parameter]) * times, c.unit
+            return c.parameter, abs(explanation.beta[c.parameter]) * times, c.unit, 0.0
     shapes = shapes_of(data.rig, used)
     k = next(k for k, s in enumerate(shapes) if used.shape[k] != (s.neutral or 0.0))
     neutral = shapes[k].neutral or 0.0
-    return shapes[k].parameter, abs(used.shape[k] - neutral) * times, shapes[k].unit
+    return shapes[k].parameter, abs(used.shape[k] - neutral) * times, shapes[k].unit, neutral
+
+
+def is_possible(rig: Rig, model: Model, explanation: Explanation, times: float) -> bool:
+    """Return whether an effect of `times` its smallest size is physical, as the smallest one is."""
+    (used,) = explanation.effects
+    effect = used.term
+    assert isinstance(effect, Effect)
+    known = {name: e.value for name, e in model.parameters.items() if e.identified}
+
+    def problem(times: float) -> str:
+        shape = list(used.shape)
+        for k, s in enumerate(shapes_of(rig, used)[: len(effect.least_shapes())]):
+            neutral = s.neutral or 0.0
+            shape[k] = neutral + times * (shape[k] - neutral)
+        values = known | {name: times * value for name, value in explanation.beta.items()}
+        return effect.problem(rig, values, shape)
+
+    return not problem(times) or bool(problem(1.0))
 
 
 def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:
     """Return a sentence for each of the largest limits."""
     return [
-        f"not excluded by these records: {d.name} at {place_in_words(d.at)} up to {d.quantity} = "
-        f"{f'{plain(d.size, 2)} {typeset(d.unit)}'.strip()}, which would change {d.parameter} by "
-        f"{plain(100 * d.shift, 2)} % without a residual above the noise"
+        f"not excluded by these records: {d.name} at {place_in_words(d.at)} {_up_to(d)} "
+        "without a residual above the noise"
         for d in limits[: TRACE.most_detection_limits]
     ]
+
+
+def _up_to(limit: DetectionLimit) -> str:
+    if not limit.possible:
+        return f"of any possible size, which would change {limit.parameter}"
+    size = f"{plain(limit.size, 2)} {typeset(limit.unit)}".strip()
+    if limit.neutral:
+        size = f"{limit.neutral:g} ± {size}"
+    return (
+        f"up to {limit.quantity} = {size}, which would change {limit.parameter} by "
+        f"{plain(100 * limit.shift, 2)} %"
+    )

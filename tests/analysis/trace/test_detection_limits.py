@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from analysis.terms import make
 from analysis.trace.engine import trace
+from analysis.trace.next_experiment.detection_limits import detection_limit_notes, is_possible
+from analysis.trace.next_experiment.discrimination import smallest_effect
 from analysis.trace.result import DetectionLimit, Trace, to_json
 from rig.model.rig import Rig
 from tests.analysis.trace import gate_cases
@@ -76,3 +79,31 @@ def test_a_special_case_of_a_named_effect_is_none_that_could_hide_beside_it(rig:
     result = gate_cases.traced(rig, pair_of_runs(rig, F_ext=70.0, F_ret=40.0), *names)
     assert [e.name for e in result.effects] == ["asymmetric_friction"]
     assert [d.name for d in result.detection_limits] == ["stribeck_friction"]
+
+
+def test_a_limit_is_stated_as_the_number_that_a_reader_knows(rig: Rig) -> None:
+    """A gain is near 1; a size that no machine has excludes nothing."""
+    gain = ("sensor_gain", "joint 1", "joint 1 rod", "gain_rod_pressure_1", 0.02, "", 1.0)
+    torque = ("torque_offset", "joint 1", "joint 1", "T_offset_1", 2.4e5, "N*m", 0.0)
+    notes = detection_limit_notes(
+        [DetectionLimit(*gain, "W1", 0.03, True), DetectionLimit(*torque, "W1", 5.3, False)]
+    )
+    begin, end = "not excluded by these records: ", " without a residual above the noise"
+    assert notes == [
+        f"{begin}sensor_gain at joint 1, rod up to gain_rod_pressure_1 = 1 ± 0.02, which would "
+        f"change W1 by 3 %{end}",
+        f"{begin}torque_offset at joint 1 of any possible size, which would change W1{end}",
+    ]
+
+
+def test_no_limit_above_the_sizes_that_are_physical_is_called_possible(small: Trace) -> None:
+    """Half of the drive's torque is the most that an offset may have."""
+    effects = {f"{d.name} {d.at}": d for d in small.detection_limits}
+    assert all(d.possible for d in effects.values() if d.shift < 0.5)
+    offset = make("torque_offset", "joint 1")
+    (parameter,) = (c.parameter for c in offset.coefficients(small.model_after.rig))
+    explanation = smallest_effect(offset, small.model_after.rig)
+    assert explanation is not None
+    for times, possible in ((1.0, True), (1e6, False)):
+        assert parameter in explanation.beta
+        assert is_possible(small.model_after.rig, small.model_after, explanation, times) == possible
