@@ -20,7 +20,7 @@ from analysis.regression.solve import MOSTLY_NOISE, Solution, solve
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.records import Run
+from rig.model.records import Record, Run
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.straight_line import line
@@ -74,6 +74,18 @@ def test_ten_times_the_noise_biases_least_squares_and_the_check_says_so(
     assert inside(noisy, "M2")
     low, high = noisy.estimates["M2"].ci95
     assert high - low > 2 * error(noisy, "M2") * TRUTH["M2"]
+
+
+def test_repeats_of_unequal_length_without_a_period_are_as_good_as_others(noisy_run: Run) -> None:
+    """Each later repeat is a tenth shorter: instruments use the part that all of a step have."""
+
+    def cut(r: Record) -> Record:
+        n = round(r.samples * (1.1 - 0.1 * r.repeat))
+        return replace(r, period=0, channels={k: v[:n] for k, v in r.channels.items()})
+
+    found = identify([replace(noisy_run, records=tuple(map(cut, noisy_run.records)))])
+    assert found.model.provenance["estimator"] == "iv"
+    assert inside(found, "M2")
 
 
 def test_instruments_are_not_biased_and_the_tool_prefers_them_unasked(

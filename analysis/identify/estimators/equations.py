@@ -75,32 +75,44 @@ class EquationFit:
         return [b.y - b.X @ self.beta for b in self.blocks]
 
 
-def segments(time: Array, period: float) -> Indices:
+def segments(time: Array, period: float, shared: tuple[float, float] | None = None) -> Indices:
     """Return the part of the excitation's period that each row (m,) lies in.
 
-    Without a period [s] (0) the record itself is divided. Rows of the same part of later periods
-    belong together, because an error of the model repeats with the excitation.
+    Without a period [s] (0) the time from the first to the last row is divided, or that which the
+    repeats have in common, `shared` [s]: rows outside belong to its first and last part. Rows of
+    the same part of later periods belong together, because an error of the model repeats with the
+    excitation.
     """
-    span = period if period > 0 else float(time[-1] - time[0]) + 1e-9 if len(time) else 1.0
+    begin, span = 0.0, period
+    if period <= 0:
+        begin, end = shared or ((time[0], time[-1]) if len(time) else (0.0, 1.0))
+        span = float(end - begin) + 1e-9
     count = int(np.clip(span / IDENTIFY.shortest_segment, 1, IDENTIFY.period_segments))
-    place = (time - (0.0 if period > 0 else time[0] if len(time) else 0.0)) / span
-    return np.asarray(np.floor((place % 1.0) * count), dtype=np.int64)
+    place = (time - begin) / span
+    part = np.floor((place % 1.0 if period > 0 else place) * count)
+    return np.asarray(np.clip(part, 0, count - 1), dtype=np.int64)
 
 
 def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> list[RepeatBlock]:
     """Return the blocks of one family with the columns `kept`."""
+    every = [(record_rows, rows) for record_rows in built for rows in record_rows.family(family)]
+    shared: dict[tuple[int, str, str], tuple[float, float]] = {}
+    for record_rows, rows in every:
+        key, (begin, end) = (*record_rows.group, rows.equation), (rows.time[0], rows.time[-1])
+        known = shared.get(key, (begin, end))
+        shared[key] = max(begin, known[0]), max(min(end, known[1]), begin)
     blocks = []
-    for record_rows in built:
-        record = record_rows.record
-        for rows in record_rows.family(family):
-            blocks.append(
-                RepeatBlock(
-                    *record_rows.group, record.repeat, record.name, rows.equation,
-                    rows.matrix[:, list(kept)], rows.rhs, rows.time,
-                    segments(rows.time, record.period / record.sample_rate),
-                    np.zeros(len(rows.rhs), dtype=np.int64),
-                )
-            )  # fmt: skip
+    for record_rows, rows in every:
+        record, group = record_rows.record, record_rows.group
+        period = record.period / record.sample_rate
+        blocks.append(
+            RepeatBlock(
+                *group, record.repeat, record.name, rows.equation,
+                rows.matrix[:, list(kept)], rows.rhs, rows.time,
+                segments(rows.time, period, shared[*group, rows.equation]),
+                np.zeros(len(rows.rhs), dtype=np.int64),
+            )
+        )  # fmt: skip
     return blocks
 
 
