@@ -30,6 +30,7 @@ from analysis.identify.estimators.robust import robust
 from analysis.identify.estimators.shifts import (
     including,
     largest_move,
+    predicted_shift,
     shifts_of,
     significant_shift,
 )
@@ -147,6 +148,8 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         shift = np.zeros(p.parameters)
         if estimator == "ls" and tests:
             shift = significant_shift(tests[p.family], p)
+        elif estimator == "ls":
+            shift = predicted_shift(solutions[p.family], p)
         total = including(total, shift)
         new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":

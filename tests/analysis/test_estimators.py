@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -74,6 +75,29 @@ def test_ten_times_the_noise_biases_least_squares_and_the_check_says_so(
     assert inside(noisy, "M2")
     low, high = noisy.estimates["M2"].ci95
     assert high - low > 2 * error(noisy, "M2") * TRUTH["M2"]
+
+
+def test_the_interval_of_one_repeat_holds_the_bias_that_stated_noise_predicts(
+    noisy_run: Run,
+) -> None:
+    """Without repeats no instruments show the bias."""
+    once = tuple(r for r in noisy_run.records if r.repeat == 1)
+
+    def stating(times: float) -> Identification:
+        stated = {
+            name: sensor.model_copy(update={"noise": times * sensor.noise})
+            for name, sensor in noisy_run.rig.sensors if hasattr(sensor, "noise")
+        }  # fmt: skip
+        sensors = noisy_run.rig.sensors.model_copy(update=stated)
+        rig = noisy_run.rig.model_copy(update={"sensors": sensors})
+        return identify([Run(rig, once)], reject_noise=False)
+
+    none, found = stating(0.1), stating(5.0)
+    assert found.model.provenance["estimator"] == "ls"
+    (said,) = re.findall(r"biases M2 most, by ([\d.]+) %", check(found, "noise bias").detail)
+    before, after = none.estimates["M2"], found.estimates["M2"]
+    added = np.sqrt(after.std**2 - before.std**2)
+    assert added / after.value == pytest.approx(0.01 * float(said), rel=0.05)
 
 
 def test_repeats_of_unequal_length_without_a_period_are_as_good_as_others(noisy_run: Run) -> None:

@@ -18,7 +18,7 @@ from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.estimators.equations import EquationFit, FamilyBlocks
 from analysis.identify.estimators.instruments import Hausman
 from analysis.identify.settings import IDENTIFY
-from analysis.regression.solve import half_width
+from analysis.regression.solve import Solution, half_width
 
 Array = NDArray[np.float64]
 
@@ -106,6 +106,16 @@ def shifts_of(
 def significant_shift(test: Hausman, p: FamilyBlocks) -> Array:
     """Return least squares minus instruments (k,) of the parameters, 0 where insignificant."""
     return np.where(test.certain, test.difference, 0.0)[: p.parameters]
+
+
+def predicted_shift(solution: Solution, p: FamilyBlocks) -> Array:
+    """Return the bias (k,) of the parameters that the stated sensor noise predicts.
+
+    It stands for the shift against instruments where no repeats give any.
+    """
+    bias = dict(zip(solution.names, solution.noise_bias, strict=True))
+    predicted: Array = np.array([bias[name] for name in p.names[: p.parameters]])
+    return np.where(np.isfinite(predicted), predicted, 0.0)
 
 
 def including(error: CovarianceParts, shift: Array) -> CovarianceParts:
