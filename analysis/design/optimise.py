@@ -27,7 +27,7 @@ from analysis.design.predict import StepInformation, coefficients, covariance, i
 from analysis.design.settings import DESIGN
 from analysis.design.twin_records import Played, TwinStep, play
 from analysis.regression.rows import parameters_of
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -119,7 +119,7 @@ class _Search:
 
     def __init__(self, rig: Rig, criterion: str, rng: np.random.Generator) -> None:
         self.rig, self.criterion, self.rng = rig, criterion, rng
-        self.terms = tuple(Used(term) for term in baseline())
+        self.terms = tuple(Used(term) for term in baseline_of(rig))
         nominal = coefficients(rig, self.terms)
         self.names = {f: parameters_of(rig, self.terms, f) for f in FAMILIES}
         self.scale = {f: np.array([nominal[n] for n in names]) for f, names in self.names.items()}

@@ -31,7 +31,7 @@ from analysis.regression.rows import Filtering, Rows, default_filtering, paramet
 from analysis.regression.solve import RowCluster, half_width, solve, triangle
 from analysis.signals.conditioning import condition
 from analysis.simulation.model import finite, nominal_model
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, family_of, inverted
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -106,7 +106,7 @@ def predict(
     `progress` receives after each step the share of them that is done. Raises InputError for a rig
     without nominal values and for steps the twin cannot follow.
     """
-    used = tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline_of(rig))
     played, parts = [], []
     for number, step in enumerate(steps, start=1):
         played.append(play(rig, step))

@@ -18,7 +18,7 @@ from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import square
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -36,7 +36,7 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
     `moved` is what `analysis.simulation.twin.simulate_commands` returns or a stretch of it, arrays
     (n, N); `locked` the joints (1-based) that were held.
     """
-    used = tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline_of(rig))
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
     n = len(moved["piston"])
     channels: dict[str, Array] = {}
@@ -59,7 +59,7 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
 
 def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determinacy]:
     """Return, by family, what the rows of these steps determine together."""
-    used = tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline_of(rig))
     out = {}
     for family in FAMILIES:
         names = parameters_of(rig, used, family)

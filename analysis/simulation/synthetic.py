@@ -13,7 +13,7 @@ from analysis.simulation.model import Model, nominal_model
 from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import DrivingInput, Simulation, simulate
 from analysis.simulation.twin import holding_state
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.records import Record, Run
@@ -78,7 +78,7 @@ def synthetic_run(
 
     rate = rig.sample_rate
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
-    model = nominal_model(rig, tuple(Used(term) for term in baseline()))
+    model = nominal_model(rig, tuple(Used(term) for term in baseline_of(rig)))
     lead, n = round(SIMULATION.lead * rate), round(seconds * rate)
     records = []
     for step, locked in lock_steps(len(rig.joints)):

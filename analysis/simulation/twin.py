@@ -16,7 +16,7 @@ from scipy.linalg import expm
 
 from analysis.simulation.model import Model, nominal_model
 from analysis.simulation.simulate import DrivingInput, State, simulate
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.parts import Valve
@@ -65,7 +65,9 @@ def holding_state(rig: Rig, model: Model, piston: Array) -> State:
     N = len(rig.joints)
     q = np.array([float(j.linkage.angle(p)) for j, p in zip(rig.joints, piston, strict=True)])
     theta, values = np.cumsum(q), model.values
-    pull = np.array([values[f"W{i + 1}"] * rig.gravity * np.sin(theta[i]) for i in range(N)])
+    pull = np.array(
+        [values.get(f"W{i + 1}", 0.0) * rig.gravity * np.sin(theta[i]) for i in range(N)]
+    )
     torque = np.cumsum(pull[::-1])[::-1]
     cap, rod = np.empty(N), np.empty(N)
     for i, joint in enumerate(rig.joints):
@@ -101,7 +103,7 @@ def simulate_commands(
     held = np.array([i in locked for i in range(N)])
     place = np.array([locked.get(i, float(start[i])) for i in range(N)])
     if model is None:
-        model = nominal_model(rig, tuple(Used(term) for term in baseline()))
+        model = nominal_model(rig, tuple(Used(term) for term in baseline_of(rig)))
     state = holding_state(rig, model, place)
     n, rate = len(commands), rig.sample_rate
     spool = np.column_stack(

@@ -46,9 +46,9 @@ def make(name: str, where: str = "bench") -> Term:
 
 
 def baseline_of(rig: Rig) -> tuple[Term, ...]:
-    """Return the terms that every model of the rig has."""
+    """Return the terms that every model of the rig has: no gravity in a horizontal plane."""
     if not isinstance(rig, ElectricRig):
-        return baseline()
+        return tuple(term for term in baseline() if term.name != "gravity" or rig.gravity > 0)
     weight = INCLINED if rig.inclination == UNKNOWN else "gravity"
     pulled = not rig.prismatic and rig.gravity > 0
     return tuple(make(name) for name in (*ELECTRIC, *((weight,) if pulled else ())))

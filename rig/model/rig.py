@@ -48,7 +48,7 @@ class Rig(Part):
 
     name: Name
     description: str = ""
-    gravity: Acceleration = Field(default=9.8, gt=0)
+    gravity: Acceleration = Field(default=9.8, ge=0)
     sample_rate: Frequency = Field(gt=0, le=MAX_SAMPLE_RATE)
     supply: Supply
     oil: Oil

@@ -59,6 +59,17 @@ def test_and_from_the_papers_sine_as_well(sine_run: Run) -> None:
     assert worst(result, ("b",)) < 0.01
 
 
+def test_joints_in_a_horizontal_plane_have_no_weight_to_identify(rig: Rig) -> None:
+    flat = rig.model_copy(update={"gravity": 0.0})
+    wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)
+    run = synthetic_run(flat, np.random.default_rng(2), wave, rms=0.025, repeats=2)
+    result = identify([run])
+    assert set(result.estimates) == {n for n in parameter_names(2) if not n.startswith("W")}
+    for name, found in result.estimates.items():
+        assert found.value == pytest.approx(rig.nominal[name], rel=0.01), name
+    assert all(c.ok for c in result.checks if c.name.startswith(("identifiable", "base")))
+
+
 def test_slow_motion_shows_its_inertias_beside_noisy_sensors(rig: Rig) -> None:
     """Lines up to 0.8 Hz and sensors four times as noisy as stated, one record of each step."""
     wave = multisine(np.random.default_rng(1), rig.sample_rate, 20.0, 0.8)

@@ -72,6 +72,11 @@ def test_a_limit_that_could_not_protect_is_refused(old: str, new: str, expected:
     assert expected in refused(old, new)
 
 
+def test_a_bench_in_a_horizontal_plane_has_no_gravity() -> None:
+    text = TEXT.replace("gravity: 9.8 m/s^2", "gravity: 0 m/s^2")
+    assert parse_model(Rig, text, "bench.yaml").gravity == 0.0
+
+
 def test_limits_of_the_whole_bench_are_optional_and_have_units() -> None:
     text = TEXT.replace("wire:", "limits: {oil_temperature: [283.15 K, 60 degC]}\nwire:", 1)
     bench = parse_model(Rig, text, "bench.yaml")

@@ -18,7 +18,7 @@ from analysis.report.identification.tables import FitTable, worst_fit
 from analysis.report.plots.interval_plots import relative_half_width
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
-from rig.model.parameters import parameter_names
+from analysis.terms import baseline_of
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -142,7 +142,7 @@ def sentences(
     """Return a summary of the identification and its validation in sentences."""
     records = records_of(runs)
     joints = len(rig.joints)
-    expected = tuple(identification.estimates) if rig.electric else parameter_names(joints)
+    expected = [c.parameter for term in baseline_of(rig) for c in term.coefficients(rig)]
     kind = "electric joint" if rig.electric else "hydraulic joint"
     identified = [e for n, e in identification.estimates.items() if e.identified and n in expected]
     steps = len({(i, r.step) for i, run in enumerate(runs) for r in run.records})
