@@ -23,6 +23,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 from rig.model.tolerances import widest
+from rig.model.units import plain
 from rig.runs.stream import RunHead
 
 Array = NDArray[np.float64]
@@ -146,7 +147,7 @@ def clipping(
                 "clipped sensor",
                 part < IDENTIFY.clipped_share,
                 f"record {record_name!r}, channel {name!r}: {count} samples "
-                f"({100 * part:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
+                f"({plain(100 * part, 2)} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
                 "masked (the worst record of its step)",
             )
         )

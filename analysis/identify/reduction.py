@@ -279,12 +279,23 @@ def solve_reductions(
             clusters, noise = clusters_of(reductions, family), noise_of(reductions, family)
             if not clusters:
                 raise InputError(
-                    f"no rows of the {family} equations remain: the records are too short for the "
-                    "filters, or all their samples are masked; take longer records"
+                    f"no rows of the {family} equations remain: {_why_no_rows(rig, reductions)}"
                 )
             linear = solve(names, clusters, noise, reject_noise)
             out[family] = reduced(rig, terms, linear, clusters, noise, reject_noise)
     return out
+
+
+def _why_no_rows(rig: Rig, reductions: Sequence[RecordReduction]) -> str:
+    """Return the likely cause of records without rows, and what to do."""
+    clipping = ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions])
+    clipped = next((check.detail for check in clipping if not check.ok), "")
+    if clipped:
+        return f"{clipped}; check the sensor, its range in the rig file, and its unit in the data"
+    return (
+        "the records are too short for the filters, or all their samples are masked; take longer "
+        "records"
+    )
 
 
 def record_checks(

@@ -347,6 +347,15 @@ def test_a_run_without_records_is_refused(multisine_run: Run) -> None:
         identify([replace(multisine_run, records=())])
 
 
+def test_a_piston_in_the_wrong_unit_is_named_where_no_rows_are_left(multisine_run: Run) -> None:
+    records = tuple(
+        changed(r, piston_1=1e3 * r.channels["piston_1"], piston_2=1e3 * r.channels["piston_2"])
+        for r in multisine_run.records
+    )
+    with pytest.raises(InputError, match=r"channel 'piston_\d': .* check the sensor, its range"):
+        identify([replace(multisine_run, records=records)])
+
+
 def test_records_shorter_than_the_filter_are_refused(multisine_run: Run) -> None:
     record = multisine_run.records[0]
     short = replace(record, channels={k: v[:50] for k, v in record.channels.items()})

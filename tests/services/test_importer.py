@@ -352,9 +352,14 @@ PRESSURE = 4e6 + 1e6 * WAVE
         ("supply_pressure", np.full(4000, 7e6), "every sample is 7e+06 Pa"),
         ("piston_2", 5e-5 * WAVE, "moves by 0.00013 m, 0.16 % of the range of the rig's"),
         ("cap_pressure_2", np.round(np.minimum(PRESSURE, 4.8e6) / 200) * 200, "its top"),
+        (
+            "cap_pressure_2",
+            np.where((np.arange(4000) < 900) | (np.arange(4000) > 1500), PRESSURE, PRESSURE[900]),
+            "samples 900 to 1500 are all",
+        ),
     ],
 )
-def test_a_dead_or_clipped_sensor_is_noticed_with_a_sentence(
+def test_a_dead_stuck_or_clipped_sensor_is_noticed_with_a_sentence(
     tmp_path: Path, channel: str, values: np.ndarray, said: str
 ) -> None:
     report = bring(tmp_path, ONE, a__csv=csv(data=moving(**{channel: values})))

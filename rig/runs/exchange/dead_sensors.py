@@ -1,4 +1,4 @@
-"""Sensors without information in a foreign record: constant, out of range, or clipped.
+"""Sensors without information in a foreign record: constant, stuck, out of range, or clipped.
 
 The range of the converter is unknown, so clipping is detected by shape: the density of samples of
 a smooth signal has an inverse square root singularity at a peak, so that few samples within two
@@ -22,7 +22,7 @@ _DRIVEN = (ch.SPOOL, ch.DRIVE)  # channels that a waveform or its limit may keep
 
 
 def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
-    """Return a sentence for each constant, clipped or hardly moving channel (n,); else [].
+    """Return a sentence for each constant, stuck, clipped or hardly moving channel (n,); else [].
 
     Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
     """
@@ -42,7 +42,23 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
         beyond = _beyond(rig, kind, name, low, high)
         flat = [] if beyond or kind in _DRIVEN else _flat(name, values, unit)
         said += beyond + flat
+        if joint is not None and kind in (ch.CAP, ch.ROD) and not beyond + flat:
+            said += _stuck(rig, name, values, channels[ch.channel(ch.PISTON, joint)])
     return said
+
+
+def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
+    """Say so where a pressure keeps one exact value while its piston moves."""
+    changes = np.flatnonzero(np.diff(values)) + 1
+    begins, ends = np.r_[0, changes], np.r_[changes, len(values)]
+    k = int(np.argmax(ends - begins))
+    during = slice(int(begins[k]), int(ends[k]))
+    if np.ptp(piston[during]) < EXCHANGE.stuck_travel * np.ptp(piston):
+        return []
+    return [
+        f"{name}: samples {during.start} to {during.stop - 1} are all {values[during.start]:g} "
+        f"{rig.unit_of(name)} while the piston moves; did the sensor or its converter hang?"
+    ]
 
 
 def _hardly_moves(rig: Rig, kind: str, name: str, travel: float) -> list[str]:

@@ -25,12 +25,13 @@ class ExchangeSettings:
     highest: float = 30.0
     bandwidth_seconds: float = 6.0
 
-    # Clipped and constant sensors.
+    # Clipped, stuck and constant sensors.
     levels: int = 500  # of resolution within the range; a coarser channel has flat tops anyway
     near: float = 0.02  # of the channel's range, counted from its extreme
     share: float = 0.5  # of the samples near an extreme with its exact value; a parabola: a third
     least: int = 10  # samples at one value before it is reported
     end: float = 1e-3  # of a sensor's range, from its end
+    stuck_travel: float = 0.2  # of the piston's travel, while a pressure keeps one exact value
     least_travel: float = 2e-3  # of a position sensor's range: a joint that is free moves more
 
 
