@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.checks import Check
+from analysis.identify.checks import Check, is_hold
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.bootstrap import bootstrap
 from analysis.identify.estimators.covariance import CovarianceParts, spread
@@ -100,7 +100,8 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     InputError for an estimator that needs repeats where a step has only one.
     """
     refuse_unknown(job.estimator)
-    counted = repeats_of((rows.conditioned.run, rows.record) for rows in job.built)
+    moving = (rows for rows in job.built if not is_hold(job.rig, rows.record))
+    counted = repeats_of((rows.conditioned.run, rows.record) for rows in moving)
     prepared, checks = _prepare(job, solutions)
     single = sorted(
         {step for (_, step), n in counted.items() if n < 2}.union(
