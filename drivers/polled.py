@@ -220,7 +220,7 @@ class PolledDriver:
         """Return why the driver has zeroed the outputs, None if it has not."""
         self._require_open()
         if self._streaming:
-            self._heed_silence()
+            self._trip_on_silence()
         return self._cause
 
     def reset(self) -> None:
@@ -240,7 +240,7 @@ class PolledDriver:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
         self._require_open()
         if self._streaming:
-            self._heed_silence()
+            self._trip_on_silence()
         laws = possible_laws(laws, self._rig)
         if self._cause is not None and any(law.limit > 0.0 for law in laws):
             raise DeviceError(f"tripped: {self._cause}; find the cause, then reset it")
@@ -300,10 +300,10 @@ class PolledDriver:
 
     def _serve(self) -> None:
         """Wait for the next tick; read, evaluate the laws, write; keep the rows that result."""
-        self._heed_silence()
+        self._trip_on_silence()
         tick = self._wait()
         values, at = self._take()
-        self._heed_silence()
+        self._trip_on_silence()
         held, self._volts = self._volts, self._laws.volts(tick, values[self._positions])
         self._put(self._volts)
         lateness = at - tick
@@ -387,7 +387,7 @@ class PolledDriver:
         self._safely(lambda: self._device.write(volts.copy()))
         self._written = self._clock()
 
-    def _heed_silence(self) -> None:
+    def _trip_on_silence(self) -> None:
         """Zero and trip if the outputs were not written for longer than the watchdog allows."""
         silence = self._clock() - self._written
         if silence <= self._silence_allowed:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.output_error.hidden_states import Shot
+from analysis.identify.output_error.hidden_states import ShootingEstimate
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.spectral_lines import SpectralLines
@@ -140,7 +140,7 @@ class JudgedEffect:
     rivals: tuple[Rival, ...]
     gates: tuple[Gate, ...]
     variable: str = ""
-    shot: Shot | None = None
+    shot: ShootingEstimate | None = None
     mechanism: str = ""
     free: bool = False
     curves: tuple[Curve, ...] = ()
@@ -395,7 +395,7 @@ def _free_run(curves: FreeCurves) -> dict[str, Any]:
     return {"record": curves.record, "time": numbers(curves.time), "channels": channels}
 
 
-def _shot(shot: Shot) -> dict[str, Any]:
+def _shot(shot: ShootingEstimate) -> dict[str, Any]:
     return {
         "parameters": {n: estimate_json(e) for n, e in shot.shapes.items()},
         "windows": shot.windows, "settled": shot.settled, "taken": shot.taken,

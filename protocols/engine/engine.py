@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from drivers.base import DeviceError, DeviceLost
-from protocols.engine.desk import Desk
 from protocols.engine.plan_runner import PlanRunner
+from protocols.engine.run_inputs import RunInputs
 from protocols.engine.session import BenchSession
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded
 from protocols.files.plan import Plan
@@ -32,19 +32,19 @@ def run(
     rig: Rig,
     bench: BenchSession,
     on_phase: OnPhase | None = None,
-    desk: Desk | None = None,
+    inputs: RunInputs | None = None,
 ) -> None:
     """Run every step of a plan; the records are in the bench's recorder when it returns.
 
     `on_phase` is called with every phase: "place", "lock", "warm-up", "centre", "record", "stop",
-    "done" and those of the other steps; `desk` connects people and estimates. Raises
+    "done" and those of the other steps; `inputs` connects people and estimates. Raises
     ProtocolAborted (or its LockFailed) if the bench fails a requirement of a step, and the bench's
     own exceptions; in every case the outputs were put to zero first.
     """
-    runner = PlanRunner(plan, rig, bench, on_phase or _nobody, desk or Desk())
+    runner = PlanRunner(plan, rig, bench, on_phase or _nobody, inputs or RunInputs())
     machine = runner.machine
     machine.listen(runner.note_state)
-    bench.listen(runner.desk.control.accept)
+    bench.listen(runner.inputs.control.accept)
     machine.to(EngineState.IDLE, "the plan is proved")
     try:
         _all(plan, runner)

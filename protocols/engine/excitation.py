@@ -20,7 +20,7 @@ from rig.runs.recorder import RecordMeta
 log = logging.getLogger(__name__)
 
 
-class ExcitationDesk(Protocol):
+class ExcitationEngine(Protocol):
     """The engine's interface for an excitation."""
 
     @property
@@ -43,7 +43,7 @@ class ExcitationRun:
         session: Session,
         place: Place,
         step: StepPlan,
-        desk: ExcitationDesk,
+        engine: ExcitationEngine,
         first: int = 1,
         attributes: Mapping[str, str] | None = None,
     ) -> None:
@@ -52,7 +52,7 @@ class ExcitationRun:
         self.place = place
         self.step = step
         self.taken = 0  # complete records
-        self._desk = desk
+        self._engine = engine
         self._first = first
         self._more = dict(attributes or {})
         self.locks: list[JointLock] = []
@@ -60,7 +60,7 @@ class ExcitationRun:
     def report_phase(self, phase: str, message: str, repeat: int = 0) -> None:
         """Report a phase."""
         log.info("%s: %s %s", self.step.name, phase, message)
-        self._desk.report_phase(self.step.name, phase, repeat, self.step.repeats, message)
+        self._engine.report_phase(self.step.name, phase, repeat, self.step.repeats, message)
 
     def run(self) -> bool:
         """Take the missing records; return False where a person requested a stop."""
@@ -76,7 +76,7 @@ class ExcitationRun:
         excitation = self._start()
         excitation.hold()
         began, good = self.session.now, done()
-        while not good and not self._desk.interrupted:
+        while not good and not self._engine.interrupted:
             if self.session.now - began >= most * self.session.rate:
                 break
             excitation.keep_on(ENGINE.look_seconds)
@@ -86,12 +86,12 @@ class ExcitationRun:
 
     def _start(self) -> Playback:
         """Place, lock and let the waveforms grow."""
-        self._desk.machine.to(EngineState.HOMING, self.step.name)
+        self._engine.machine.to(EngineState.HOMING, self.step.name)
         self.session.bench.guard(self._roles(moving=True))
         nulls = self._place()
         self.locks = self._lock()
         self.session.bench.guard(self._roles())
-        self._desk.machine.to(EngineState.EXCITING, self.step.name)
+        self._engine.machine.to(EngineState.EXCITING, self.step.name)
         excitation = Playback(self.session, self.step, self.place, self.locks)
         self.report_phase("warm-up", "waveforms grow under the position loop")
         excitation.warm_up(nulls)
@@ -100,7 +100,7 @@ class ExcitationRun:
     def _stop(self, excitation: Playback) -> None:
         self.report_phase("stop", "waveforms shrink, valves close")
         excitation.stop()
-        self._desk.machine.to(EngineState.IDLE, f"{self.step.name}: valves closed")
+        self._engine.machine.to(EngineState.IDLE, f"{self.step.name}: valves closed")
         self.locks = []
         self.session.bench.guard(self._roles(moving=True))
 
@@ -134,7 +134,7 @@ class ExcitationRun:
         for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
             self.report_phase("lock", f"joint {part.joint + 1} {_lock_text(part)}")
             locks.append(lock(self.session, part, self.place, hold))
-            self._desk.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
+            self._engine.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
         return locks
 
     def _records(self, excitation: Playback) -> bool:
@@ -145,7 +145,7 @@ class ExcitationRun:
             if self._record(excitation, repeat):
                 self.taken += 1
                 if self.taken < self.step.repeats:
-                    if self._desk.interrupted:
+                    if self._engine.interrupted:
                         return False
                     if self._relock(excitation):
                         excitation.settle_bias()
@@ -156,7 +156,7 @@ class ExcitationRun:
                     f"{self.step.name}: record {repeat} was about to leave the piston limits "
                     f"{disturbed} times; lower the amplitude, or find out what makes it drift"
                 )
-            if self._desk.interrupted:
+            if self._engine.interrupted:
                 return False
             self.report_phase("centre", f"record {repeat} was disturbed and is taken again", repeat)
             excitation.settle_bias()

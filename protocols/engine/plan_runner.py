@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from protocols.engine.desk import Desk
 from protocols.engine.excitation import ExcitationRun
 from protocols.engine.locking import Hold, lock, move, placement
+from protocols.engine.run_inputs import RunInputs
 from protocols.engine.session import BenchSession, Session
 from protocols.engine.settings import ENGINE
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded, StateMachine
@@ -35,14 +35,14 @@ class PlanRunner:
     """One run of a plan: its session, its state, steps done and remaining."""
 
     def __init__(
-        self, plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase, desk: Desk
+        self, plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase, inputs: RunInputs
     ) -> None:
         self.bench = bench
-        self.desk = desk
+        self.inputs = inputs
         self.records = 0  # complete ones
         keep = max((s.record + 2 * s.period for s in plan.excitations), default=0)
         keep += round(ENGINE.spare_seconds * rig.sample_rate)
-        self.session = Session(bench, rig, keep, desk.machine, self._heed)
+        self.session = Session(bench, rig, keep, inputs.machine, self._obey_requests)
         self._place = plan.place
         self._parts = len(plan.sequence)
         self._on_phase = on_phase
@@ -60,12 +60,12 @@ class PlanRunner:
     @property
     def machine(self) -> StateMachine:
         """The state of the run."""
-        return self.desk.machine
+        return self.inputs.machine
 
     @property
     def interrupted(self) -> bool:
         """Whether a person asked for a pause, or to skip the step."""
-        return self.desk.control.requests.pause or self.desk.control.requests.skip
+        return self.inputs.control.requests.pause or self.inputs.control.requests.skip
 
     @property
     def elapsed(self) -> float:
@@ -216,7 +216,7 @@ class PlanRunner:
         Raises RunEnded where there is neither.
         """
         self.rest_now("a question")
-        control = self.desk.control
+        control = self.inputs.control
         control.answers, control.requests.answer = question.answers, None
         self.machine.to(EngineState.PROMPTING, question.text)
         self.bench.status(prompt=question.text, answers=list(question.answers))
@@ -232,14 +232,14 @@ class PlanRunner:
         return answer
 
     def _answer(self, question: Question) -> tuple[str, str]:
-        limit = self.desk.longest_pause if self.desk.attended else question.timeout
+        limit = self.inputs.longest_pause if self.inputs.attended else question.timeout
         began = self.elapsed
         while self.elapsed - began < limit:
             self.session.wait(ENGINE.look_seconds)
-            answer = self.desk.control.requests.answer
+            answer = self.inputs.control.requests.answer
             if answer is not None:
                 return answer, "from the screen"
-            typed = None if self.desk.terminal is None else self.desk.terminal()
+            typed = None if self.inputs.terminal is None else self.inputs.terminal()
             if typed is not None:
                 if typed.strip() in question.answers:
                     return typed.strip(), "at the terminal"
@@ -247,7 +247,7 @@ class PlanRunner:
                 self.report_phase(
                     "prompt", "prompt", 0, 0, f"{typed.strip()!r} is no answer: {expected}"
                 )
-        if question.default is None or self.desk.attended:
+        if question.default is None or self.inputs.attended:
             raise RunEnded(f"{question.text!r} was not answered within {limit:g} s")
         return question.default, f"the default, after {limit:g} s"
 
@@ -270,7 +270,7 @@ class PlanRunner:
     def _await_estimates(self) -> None:
         """Wait, in wall time, until the parallel estimator has the last record."""
         until = time.monotonic() + ENGINE.estimate_seconds
-        while not self.desk.estimates.complete(self._last_record):
+        while not self.inputs.estimates.complete(self._last_record):
             if time.monotonic() > until:
                 log.warning("the estimator does not keep up; its last estimates count")
                 return
@@ -304,14 +304,14 @@ class PlanRunner:
         self.session.forget()
         self._origin = None
 
-    def _heed(self) -> None:
-        if self.desk.control.requests.abort:
+    def _obey_requests(self) -> None:
+        if self.inputs.control.requests.abort:
             self.bench.zero_outputs()
-            raise OperatorStop(self.desk.control.requests.abort)
+            raise OperatorStop(self.inputs.control.requests.abort)
 
     def _safe_point(self) -> None:
         """Pause here if a person requested it; raises RunEnded if nobody resumes."""
-        requests = self.desk.control.requests
+        requests = self.inputs.control.requests
         if not requests.pause:
             return
         self.rest_now("a pause was asked for")
@@ -320,16 +320,16 @@ class PlanRunner:
         self.report_phase("pause", "paused", 0, 0, "outputs at zero until someone resumes")
         began = self.elapsed
         while not requests.resume and not requests.skip:
-            if self.elapsed - began > self.desk.longest_pause:
+            if self.elapsed - began > self.inputs.longest_pause:
                 raise RunEnded(
-                    f"paused for longer than {self.desk.longest_pause:g} s; the run is over"
+                    f"paused for longer than {self.inputs.longest_pause:g} s; the run is over"
                 )
             self.session.wait(ENGINE.look_seconds)
         requests.resume = False
         self.machine.to(EngineState.IDLE, "resumed; places and locks are made anew")
 
     def _skipped(self, name: str) -> bool:
-        requests = self.desk.control.requests
+        requests = self.inputs.control.requests
         if not requests.skip:
             return False
         requests.skip = False
@@ -343,9 +343,9 @@ class PlanRunner:
         began = self.elapsed
         self.session.wait(min(ENGINE.look_seconds, seconds))
         while done is None or not done():
-            if self.desk.control.requests.skip:
+            if self.inputs.control.requests.skip:
                 return True
-            if self.desk.control.requests.pause and self.machine.state is EngineState.IDLE:
+            if self.inputs.control.requests.pause and self.machine.state is EngineState.IDLE:
                 self._safe_point()
             left = seconds - (self.elapsed - began)
             if left <= 0.5 / self.session.rate:
@@ -367,7 +367,7 @@ class PlanRunner:
         return condition.readings(self._values(condition, self.elapsed))
 
     def _values(self, condition: Condition, began: float) -> Mapping[str, float]:
-        values: dict[str, float] = {**self.desk.estimates.values(), ELAPSED: self.elapsed - began}
+        values: dict[str, float] = {**self.inputs.estimates.values(), ELAPSED: self.elapsed - began}
         first = max(0, self.session.now - round(ENGINE.look_seconds * self.session.rate))
         for name in condition.names:
             if name in self.session.rig.recorded:

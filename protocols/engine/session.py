@@ -92,12 +92,12 @@ class Session:
     """Holds the laws in force and the recent samples; every wait is in device time."""
 
     def __init__(
-        self, bench: BenchSession, rig: Rig, keep: int, machine: StateMachine, heed: Watch
+        self, bench: BenchSession, rig: Rig, keep: int, machine: StateMachine, before_block: Watch
     ) -> None:
-        """Keep the last `keep` samples; `heed` is called before each block."""
+        """Keep the last `keep` samples; `before_block` is called before each block."""
         self.bench = bench
         self._machine = machine
-        self._heed = heed
+        self._before_block = before_block
         self.rig = rig
         self.rate = rig.sample_rate
         self.joints = len(rig.joints)
@@ -131,7 +131,7 @@ class Session:
     def until(self, tick: int, watch: Watch | None = None) -> None:
         """Read blocks up to sample `tick` - 1; `watch` is called after each."""
         while self.now < tick:
-            self._heed()
+            self._before_block()
             more = tick - self.now > self.bench.info.block_samples
             block = self.bench.exchange(more)
             if block.tick > self.now:

@@ -40,7 +40,7 @@ class EngineState(StrEnum):
 
 
 _ENDS = frozenset({EngineState.TRIPPED, EngineState.SAFE})
-WAYS: Final[Mapping[EngineState, frozenset[EngineState]]] = {
+TRANSITIONS: Final[Mapping[EngineState, frozenset[EngineState]]] = {
     EngineState.IDLE: frozenset(
         {EngineState.CHECKING, EngineState.HOMING, EngineState.PAUSED, EngineState.PROMPTING}
     )
@@ -83,7 +83,7 @@ class StateMachine:
         """Change the state; raises RuntimeError for an invalid transition."""
         if state is self._state:
             return
-        if state not in WAYS[self._state]:
+        if state not in TRANSITIONS[self._state]:
             raise RuntimeError(f"no way from state {self._state} to {state} ({why})")
         before, self._state = self._state, state
         log.info("%s -> %s: %s", before, state, why)

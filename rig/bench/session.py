@@ -154,7 +154,7 @@ class Bench:
         until = self._clock() + wait
         self.status(device=LOST)
         while self._clock() < until:
-            self._heed()
+            self._obey_requests()
             self._display.repeat()
             time.sleep(min(0.1, max(0.0, until - self._clock())))
         self.info = self._connect()
@@ -254,7 +254,7 @@ class Bench:
         values = np.asarray(wave, dtype=np.float64)
         if values.ndim != 1 or len(values) == 0 or not np.isfinite(values).all():
             raise ValueError("expected a waveform of shape (n,), n > 0, of finite numbers")
-        self._heed()
+        self._obey_requests()
         self._outputs.safely(lambda: self._driver.upload(joint, values))
 
     def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
@@ -264,7 +264,7 @@ class Bench:
         number of laws, or for values that are not finite.
         """
         bounded = self._outputs.bounded(laws)
-        self._heed()
+        self._obey_requests()
         return self._outputs.apply(bounded, restart=restart)
 
     # Samples
@@ -300,7 +300,7 @@ class Bench:
         if trip is not None:
             self._report(trip)
             raise trip
-        self._heed()
+        self._obey_requests()
         return block
 
     def _note_alarms(self, trip: Violation | None) -> None:
@@ -362,7 +362,7 @@ class Bench:
         with suppress(RecordingFailed):  # the trip is the error to report
             self.event("trip", trip.tick, message=str(trip), **about)
 
-    def _heed(self) -> None:
+    def _obey_requests(self) -> None:
         """Do what screens command; raise a requested stop or a latched trip."""
         for command in self._display.commands(self._judge):
             if command.word == STOP:

@@ -179,7 +179,7 @@ class Runner:
 
     def _loop(self) -> str:
         while True:
-            self._heed()
+            self._obey_stop()
             self._identify_due()
             paused = self._queue.paused
             if paused and not self._serve:
@@ -195,7 +195,7 @@ class Runner:
                 return ENDED
             self._pause(self._settings.wait_poll)
 
-    def _heed(self) -> None:
+    def _obey_stop(self) -> None:
         if self._stop.reason is not None:
             raise OperatorStop(self._stop.reason)
 
@@ -325,7 +325,7 @@ class Runner:
             raise _Ending(3, f"item {item.id} tripped: {outcome.reason}")
         if self._lost >= self._settings.lost_in_a_row:
             raise _Ending(4, f"the device was lost {self._lost} times in a row: {outcome.reason}")
-        self._heed()
+        self._obey_stop()
 
     def _make_safe(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
         """Zero the outputs of a bench whose process died; the watchdog has probably done so."""

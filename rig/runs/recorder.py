@@ -29,7 +29,7 @@ from rig.runs.runstate import (
     utc_now,
     write_state,
 )
-from rig.runs.salvage.rebuild import set_aside
+from rig.runs.salvage.rebuild import move_aside
 from rig.runs.sections import Written
 
 log = logging.getLogger(__name__)
@@ -277,7 +277,7 @@ def finalise(
         raise RecordingFailed(f"{folder}: state cannot be written: {error.strerror}") from error
     if written.damaged_blocks:
         journal.close()
-        set_aside(journal.path)
+        move_aside(journal.path)
     else:
         journal.delete()
     return written

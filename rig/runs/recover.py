@@ -15,7 +15,7 @@ from rig.model.trips import RecordingFailed
 from rig.runs import runstate, store
 from rig.runs.journal import Journal
 from rig.runs.recorder import finalise
-from rig.runs.salvage.rebuild import CUT_OFF, find_damage, rebuild, set_aside
+from rig.runs.salvage.rebuild import CUT_OFF, find_damage, move_aside, rebuild
 from rig.runs.sections import Written
 
 log = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ def _from_damaged(folder: Path, rig: Rig, state_before: str, damage: str) -> Rec
         written = finalise(journal, folder, rig.name, state)
     finally:
         journal.close()
-    kept = set_aside(path)
+    kept = move_aside(path)
     seconds = rebuilt.lost / rig.sample_rate
     loss = f"lost: {rebuilt.lost} samples ({seconds:.3f} s)" if rebuilt.lost else "no loss is known"
     # A full disk cuts the last write off; every block before it is there.

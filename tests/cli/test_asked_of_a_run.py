@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from protocols.engine.states import WAYS, EngineState
+from protocols.engine.states import TRANSITIONS, EngineState
 from rig.bench.screens.commands import Command
 from rig.bench.screens.sockets import Attachment
 from rig.runs.runstate import read_events
@@ -116,7 +116,7 @@ def test_pause_resume_skip_answer_and_abort_on_a_run_of_another_process(tmp_path
     events = read_events(run)
     seen = [state for state, _ in states(events)]
     for before, after in itertools.pairwise([EngineState.IDLE, *seen]):
-        assert after in WAYS[before]
+        assert after in TRANSITIONS[before]
     paused = seen.index(EngineState.PAUSED)
     # From a pause back to motion only through places and locks.
     assert seen[paused + 1 : paused + 5] == [

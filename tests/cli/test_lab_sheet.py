@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from protocols.engine.states import ENERGISED, WAYS, EngineState
+from protocols.engine.states import ENERGISED, TRANSITIONS, EngineState
 from rig.model.records import Record
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
@@ -107,7 +107,7 @@ def test_nothing_is_measured_before_the_oil_is_warm(evening: Path) -> None:
 def test_the_states_it_went_through_are_those_of_the_sheet(evening: Path) -> None:
     seen = [state for state, _ in states(read_events(evening / "run"))]
     for before, after in itertools.pairwise([EngineState.IDLE, *seen]):
-        assert after in WAYS[before]
+        assert after in TRANSITIONS[before]
     sine = [EngineState.HOMING, EngineState.LOCKED, EngineState.EXCITING, EngineState.IDLE]
     assert seen == [
         EngineState.CHECKING, EngineState.IDLE, EngineState.PROMPTING, EngineState.IDLE,

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import pytest
 
 from drivers.base import DeviceLost, OutputLaw
-from protocols.engine.desk import Desk
 from protocols.engine.engine import run
+from protocols.engine.run_inputs import RunInputs
 from protocols.engine.session import Session
 from protocols.engine.states import (
     ENERGISED,
-    WAYS,
+    TRANSITIONS,
     EngineState,
     ProtocolAborted,
     RunEnded,
@@ -45,11 +45,11 @@ def rig() -> Rig:
 class Attended:
     """A run on the little bench, and what a person does at its phases."""
 
-    def __init__(self, rig: Rig, body: str, **desk: object) -> None:
+    def __init__(self, rig: Rig, body: str, **inputs: object) -> None:
         self.rig = rig
         self.plan: Plan = resolve(read_protocol(HEAD + body, "sheet.yaml"), rig)
         self.bench = LittleBench(rig, default_cylinders())
-        self.desk = Desk(**desk)  # type: ignore[arg-type]
+        self.inputs = RunInputs(**inputs)  # type: ignore[arg-type]
         self.phases: list[tuple[str, str, int]] = []
         self.acts: dict[tuple[str, int], Callable[[], None]] = {}
 
@@ -57,7 +57,7 @@ class Attended:
         self.acts[phase, repeat] = act
 
     def says(self, word: str, value: str = "") -> str | None:
-        return self.desk.control.accept(Command(word, value, "a person", 1))
+        return self.inputs.control.accept(Command(word, value, "a person", 1))
 
     def run(self) -> None:
         def phase(step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
@@ -66,7 +66,7 @@ class Attended:
             if act is not None:
                 act()
 
-        run(self.plan, self.rig, self.bench, phase, self.desk)
+        run(self.plan, self.rig, self.bench, phase, self.inputs)
 
     @property
     def states(self) -> list[str]:
@@ -84,9 +84,11 @@ def test_every_run_ends_safe_and_only_homing_leads_from_rest_to_motion(rig: Rig)
     sheet.run()
     assert sheet.states == ["homing", "locked", "exciting", "idle", "safe"]
     assert sheet.at_rest()
-    starts = {state for state, ways in WAYS.items() if ways & ENERGISED and state not in ENERGISED}
+    starts = {
+        state for state, ways in TRANSITIONS.items() if ways & ENERGISED and state not in ENERGISED
+    }
     assert starts == {EngineState.IDLE}
-    assert WAYS[EngineState.IDLE] & ENERGISED == {EngineState.HOMING}
+    assert TRANSITIONS[EngineState.IDLE] & ENERGISED == {EngineState.HOMING}
 
 
 def test_a_session_at_rest_refuses_every_law(rig: Rig) -> None:

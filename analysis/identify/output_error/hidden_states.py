@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Shot:
+class ShootingEstimate:
     """Shapes of one effect estimated by multiple shooting: estimates by name, number of windows.
 
     `before` and `after` are the window errors on other records with the rows' shapes and with these
@@ -82,7 +82,7 @@ def completed(runs: Sequence[Run], model: Model) -> Model | None:
     return replace(model, parameters={**model.parameters, **values})
 
 
-def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
+def shot(runs: Sequence[Run], model: Model, effect: Effect) -> ShootingEstimate | None:
     """Estimate an effect's shapes by multiple shooting; None where no window can be simulated."""
     bounds = {s.parameter: s for s in _shapes(model, effect)}
     try:  # perhaps every window has a lost sample or a sensor at the end of its range
@@ -103,7 +103,7 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
         value, std = float(search.value[k]), float(np.sqrt(search.spread.covariance[k, k]))
         ends = (value - float(half[k]), value + float(half[k]))
         shapes[name] = Estimate(value, shape.unit, std, ends)
-    return Shot(effect.name, effect.where, shapes, len(windows.placed), search.check.ok)
+    return ShootingEstimate(effect.name, effect.where, shapes, len(windows.placed), search.check.ok)
 
 
 def window_error(runs: Sequence[Run], model: Model, effect: Effect) -> float:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from analysis.effects.base import Effect, shape_values
 from analysis.identify.output_error.hidden_states import (
-    Shot,
+    ShootingEstimate,
     completed,
     hidden_effects,
     shot,
@@ -41,7 +41,7 @@ class ShootingResult:
     """The set with the shapes chosen, and the shapes of every effect by shooting."""
 
     winner: Hypothesis
-    shots: tuple[Shot, ...]
+    shots: tuple[ShootingEstimate, ...]
 
 
 def shoot_hidden_states(
@@ -90,7 +90,7 @@ def shoot_hidden_states(
 
 
 def _with_shapes_of(
-    rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot
+    rig: Rig, terms: Sequence[Used], effect: Effect, shot: ShootingEstimate
 ) -> tuple[Used, ...]:
     """Return the terms with the shapes from shooting; shapes that it did not search are kept."""
     found = {name: estimate.value for name, estimate in shot.shapes.items()}
@@ -100,7 +100,7 @@ def _with_shapes_of(
     )
 
 
-def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:
+def with_shots(judged: JudgedEffect, shots: Sequence[ShootingEstimate]) -> JudgedEffect:
     """Return an effect with the shapes from shooting, or with intervals that include them."""
     for result in shots:
         if (result.name, result.where) == (judged.name, judged.where):

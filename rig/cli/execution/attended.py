@@ -31,7 +31,7 @@ def _read_answer() -> str | None:
 
 
 class TrackedEstimates:
-    """The tracker's estimates for a protocol's conditions (`protocols.engine.desk.Estimates`)."""
+    """The tracker's estimates for a protocol's conditions (see `run_inputs.Estimates`)."""
 
     def __init__(self, tracking: Tracking) -> None:
         self._tracking = tracking

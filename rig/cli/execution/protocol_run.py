@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers import make_driver
 from protocols.engine import engine
-from protocols.engine.desk import Desk
+from protocols.engine.run_inputs import RunInputs
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
@@ -123,8 +123,8 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol and return its run folder; raises the error that ended it, outputs at zero."""
     rig, plan = _plan(job)
     refuse_occupied(job.out)
-    desk_machine = StateMachine()
-    desk_machine.to(EngineState.CHECKING, plan.protocol.name)
+    run_machine = StateMachine()
+    run_machine.to(EngineState.CHECKING, plan.protocol.name)
     say(plan_text(plan))
     require_space(plan, rig, job.out)
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")
@@ -153,13 +153,13 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         proof.keep(job.out)
         report = _PhaseReport(bench, say)
         bench.describe([PlanLine(part.name, part.title, part.seconds) for part in plan.sequence])
-        desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
+        inputs = RunInputs(machine=run_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
             followed = tracking  # for mypy: not None in the closure
             tracking.subscribe(report.note, lambda text: report.tracked(text, followed))
             bench.observers.add(tracking)
-            desk = replace(desk, estimates=TrackedEstimates(tracking))
-        engine.run(plan, rig, bench, report.phase, desk)
+            inputs = replace(inputs, estimates=TrackedEstimates(tracking))
+        engine.run(plan, rig, bench, report.phase, inputs)
     return job.out
 
 

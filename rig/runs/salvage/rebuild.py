@@ -253,7 +253,7 @@ def _account(
     )
 
 
-def set_aside(path: Path) -> Path:
+def move_aside(path: Path) -> Path:
     """Rename a damaged journal and its log to an unused name; return the name."""
     number, target = 1, path.with_name(f"{DAMAGED}.sqlite")
     while target.exists() or target.with_name(target.name + "-wal").exists():

@@ -27,7 +27,7 @@ from tests.studies.machines.electric_plant import Arm, draw_arm, records
 RIG = "electric-2dof"
 FRICTION = ("coulomb_friction",)
 # How a table's columns come about: steps, effects, whether the base is taken to be level.
-WAYS: dict[str, tuple[tuple[str, ...], tuple[str, ...], bool]] = {
+VARIANTS: dict[str, tuple[tuple[str, ...], tuple[str, ...], bool]] = {
     "level base": (("both",), FRICTION, True),
     "no dry friction": (("both",), (), False),
     "both at once": (("both",), FRICTION, False),
@@ -52,26 +52,28 @@ def electric_rig() -> ElectricRig:
     return rig
 
 
-def arm_story(seed: int, slope: float | None, ways: Sequence[str] = tuple(WAYS)) -> ArmStory:
-    """Draw an arm, record it, identify it in every way, judge the full one on new motion."""
+def arm_story(
+    seed: int, slope: float | None, variants: Sequence[str] = tuple(VARIANTS)
+) -> ArmStory:
+    """Draw an arm, record it, identify it in every variant, judge the full one on new motion."""
     rig, rng = electric_rig(), np.random.default_rng(seed)
     arm = draw_arm(rng, slope)
-    steps = {step for way in ways for step in WAYS[way][0]}
+    steps = {step for variant in variants for step in VARIANTS[variant][0]}
     order: tuple[str, ...] = ("both", "one", "two")
     runs = {s: records(rig, arm, rng, step=s) for s in order if s in steps}
     found = {}
-    for way in ways:
-        chosen, effects, level = WAYS[way]
+    for variant in variants:
+        chosen, effects, level = VARIANTS[variant]
         bench = rig.model_copy(update={"inclination": 0.0}) if level else rig
         taken = [replace(runs[step], rig=bench) for step in chosen]
-        found[way] = identify(taken, terms=[Used(t) for t in with_effects(bench, effects)])
+        found[variant] = identify(taken, terms=[Used(t) for t in with_effects(bench, effects)])
     test = records(rig, arm, rng, repeats=1)
     return ArmStory(arm, runs, found, validate(found["both at once"].model, [test]))
 
 
 @dataclass(frozen=True)
 class SlopeTable:
-    """Errors (seeds,) of each parameter by way; relative, of the slope in rad."""
+    """Errors (seeds,) of each parameter by variant; relative, of the slope in rad."""
 
     seeds: tuple[int, ...]
     errors: dict[str, dict[str, list[float]]]
@@ -79,27 +81,27 @@ class SlopeTable:
 
 def survey(seeds: Sequence[int], progress: Callable[[str], None]) -> SlopeTable:
     """Repeat the story on unseen arms and slopes."""
-    errors: dict[str, dict[str, list[float]]] = {way: {} for way in WAYS}
+    errors: dict[str, dict[str, list[float]]] = {variant: {} for variant in VARIANTS}
     for seed in seeds:
         progress(f"arm {seed}")
         story = arm_story(seed, None)
         truth = story.arm.truth()
-        for way, result in story.found.items():
+        for variant, result in story.found.items():
             for name, estimate in result.estimates.items():
                 off = estimate.value - truth[name]
                 relative = off if name == INCLINATION else off / truth[name]
-                errors[way].setdefault(name, []).append(relative)
+                errors[variant].setdefault(name, []).append(relative)
     return SlopeTable(tuple(seeds), errors)
 
 
 def survey_text(found: SlopeTable) -> str:
-    """Return root mean square errors, a row per parameter and a column per way."""
+    """Return root mean square errors, a row per parameter and a column per variant."""
     names = list(found.errors["both at once"])
     rows = []
     for name in names:
         row = [name]
-        for way in found.errors:
-            errors = found.errors[way].get(name)
+        for variant in found.errors:
+            errors = found.errors[variant].get(name)
             if errors is None:
                 row.append("—")
                 continue

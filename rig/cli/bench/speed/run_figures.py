@@ -23,7 +23,7 @@ from drivers.modbus_frames import READ_HOLDING, WRITE_AND_READ, WRITE_MANY, WRIT
 from drivers.modbus_tcp import ModbusTcpDriver, TcpSettings
 from drivers.modbus_transport import TcpConnection
 from protocols.engine import engine
-from protocols.engine.desk import Desk
+from protocols.engine.run_inputs import RunInputs
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
@@ -172,7 +172,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
             before = len(requests)
 
             def work() -> int:
-                engine.run(plan, reached, bench, lambda *_: None, Desk(machine=machine))
+                engine.run(plan, reached, bench, lambda *_: None, RunInputs(machine=machine))
                 return (bench.tick - first.tick) // len(first.data)
 
             cost, blocks = _cost(work)

@@ -110,7 +110,7 @@ class RunControl:
 
 
 @dataclass(frozen=True)
-class Desk:
+class RunInputs:
     """Inputs of a run besides the bench.
 
     `terminal` returns a line that a person typed, None for none; without a terminal the run is
