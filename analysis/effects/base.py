@@ -134,6 +134,9 @@ class Effect(Term):
     cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
     [SI] of the smallest size of interest on a bench of some kW at some MPa.
 
+    `exact` marks effects by definition, a gain, an offset, a delay or a mass: no error of a form
+    accounts for what they leave.
+
     `mechanism` is the physical law, `element` the part of the machine: base, load, supply, tank, or
     of its joint the joint, piston, valve, chamber or sensor. `free` marks a mechanism without a
     named form, whose curve is estimated from the data (see `curve`): tried only where no named
@@ -158,6 +161,7 @@ class Effect(Term):
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False
     rescales: ClassVar[bool] = False
+    exact: ClassVar[bool] = False
 
     @property
     def place(self) -> str:

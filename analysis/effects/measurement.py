@@ -227,6 +227,7 @@ class ChannelDelay(Late):
     """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
 
     name: ClassVar[str] = "channel_delay"
+    exact: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     variable: ClassVar[str] = "the channel's rate"
     confounders: ClassVar[tuple[str, ...]] = (
@@ -282,6 +283,7 @@ class SensorCrosstalk(Sensor):
 
     rescales: ClassVar[bool] = True
     name: ClassVar[str] = "sensor_crosstalk"
+    exact: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (0.01,)
     variable: ClassVar[str] = "the other chamber's pressure"
     confounders: ClassVar[tuple[str, ...]] = (
@@ -336,6 +338,7 @@ class SensorGain(Sensor):
 
     rescales: ClassVar[bool] = True
     name: ClassVar[str] = "sensor_gain"
+    exact: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (1.01,)
     variable: ClassVar[str] = "the channel itself"
     confounders: ClassVar[tuple[str, ...]] = (
@@ -374,6 +377,7 @@ class SensorOffset(Sensor):
     """
 
     name: ClassVar[str] = "sensor_offset"
+    exact: ClassVar[bool] = True
     variable: ClassVar[str] = "nothing: it is constant"
     confounders: ClassVar[tuple[str, ...]] = (
         "torque_offset",

@@ -44,6 +44,7 @@ class BaseInclination(Effect):
     mechanism: ClassVar[str] = "gravity"
     element: ClassVar[str] = "base"
     name: ClassVar[str] = "base_inclination"
+    exact: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (0.017,)  # [rad]
     prepares: ClassVar[bool] = True
     family: ClassVar[str] = "mechanics"
@@ -198,6 +199,7 @@ class TorqueOffset(Effect):
 
     mechanism: ClassVar[str] = "position_force"
     name: ClassVar[str] = "torque_offset"
+    exact: ClassVar[bool] = True
     least: ClassVar[tuple[float, ...]] = (2.0,)  # [N m]
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "nothing: it is constant"

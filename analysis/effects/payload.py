@@ -43,6 +43,7 @@ class Payload(Effect):
     mechanism: ClassVar[str] = "gravity"
     element: ClassVar[str] = "load"
     name: ClassVar[str] = "payload"
+    exact: ClassVar[bool] = True
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "gravity and inertia alike"
     quantity: ClassVar[str] = "absolute angle"

@@ -166,6 +166,7 @@ class SpoolOffset(ValveEffect):
     """
 
     name: ClassVar[str] = "spool_offset"
+    exact: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [V]
     stage: ClassVar[int] = NULL
     variable: ClassVar[str] = "the spool's sign"

@@ -9,6 +9,7 @@ import numpy as np
 from analysis.simulation.model import Estimate
 from analysis.terms import make
 from analysis.trace.clues.formula import surest_formula
+from analysis.trace.judge.gates import form_share
 from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Curve, JudgedEffect, Trace
 from analysis.trace.settings import TRACE
@@ -160,7 +161,7 @@ def _tolerated(result: Trace) -> list[str]:
     why = f"the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %"
     if any(note.startswith(f"{e}: {WITHOUT_RESTS}") for note in result.notes):
         why = "it includes the samples at which the joint rests, which are not judged"
-    elif share > TRACE.held_out_share:
+    elif share > form_share([make(e.name, e.at) for e in result.effects]):
         why = "in the records that choose, the error is within the band of an explanation"
     return [
         f"What is left in {e}, {result.after[e] / result.noise_floor[e]:.1f} times the noise "

@@ -8,13 +8,13 @@ other effect.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
-from analysis.terms.base import Used
+from analysis.terms.base import Term, Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference, removal, rivals
 from analysis.trace.judge.curves import curves_of
@@ -193,17 +193,25 @@ def held_out_above_band(
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the band in held-out rows, and in words how much.
 
-    The band is an rms of `TRACE.held_out_band` noise floors or `TRACE.held_out_share` of the energy
-    above noise that the model `before` leaves, whichever is larger.
+    The band is an rms of `TRACE.held_out_band` noise floors or, where an effect has a form that may
+    miss (`Effect.exact`), `TRACE.held_out_share` of the energy above noise that the model `before`
+    leaves, whichever is larger.
     """
+    share = form_share(used.term for used in after.terms)
     left = held_out_residual(holdout_data, after)
     start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
     now = energy_above_noise(holdout_data, left)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in removal.error_over_floor(holdout_data, left).items()
-        if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
+        if r > TRACE.held_out_band and now[e] > share * start[e]
     ]
+
+
+def form_share(terms: Iterable[Term]) -> float:
+    """Return the share of the energy above noise that the forms of a set's effects may miss."""
+    effects = [term for term in terms if isinstance(term, Effect)]
+    return 0.0 if effects and all(effect.exact for effect in effects) else TRACE.held_out_share
 
 
 def _noise_samples(train_data: RegressionData, residual: Array) -> Array:

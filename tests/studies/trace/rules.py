@@ -150,6 +150,8 @@ RULES: Final = (
          ((linear_fit, "best_pairs", lambda *_: []),)),
     Rule("tied sets", "of sets that cannot be separated, the one found first is named",
          ((finding, "_with_best_tied_set", lambda found, *_: found),)),
+    Rule("exact forms", "the form of a gain, an offset or a mass may miss as much as any other",
+         ((gates, "form_share", lambda _: TRACE.held_out_share),)),
     Rule("unstated noise", "where nothing repeats, the noise is the stated one",
          ((engine, "unstated_noise", lambda *_: None),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
