@@ -50,21 +50,26 @@ def remainders(
     ]
     listed = {r.equation for r in out}
     counts = hypotheses.train_data.row_counts
+    allowed = gates.form_share(used.term for used in winner.effects)
     for e, energy in winner.excess_energy.items():
         share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
         if winner.effects and e not in listed and visible and share > TRACE.visible_share:
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            out.append(Remainder(e, words + tolerance_words(share), False))
+            out.append(Remainder(e, words + tolerance_words(share, allowed), False))
     return out
 
 
-def tolerance_words(share: float) -> str:
-    """Say why a remaining share of the energy does not speak against the named effects."""
-    if share <= TRACE.held_out_share:
+def tolerance_words(share: float, allowed: float) -> str:
+    """Say why a remaining share of the energy does not speak against the named effects.
+
+    `allowed` is the share that their forms may miss (`gates.form_share`).
+    """
+    if share <= allowed:
         return "; within the tolerance for the form of the named effect"
     if share < 1.0 - TRACE.least_removed:
-        return "; more than the form of a named effect may miss, unlike in held-out records"
+        missed = "the form of a named effect may miss" if allowed else "noise"
+        return f"; more than {missed}, unlike in held-out records"
     return (
         "; no named effect acts there, and the residual is too close to the noise to name another"
     )

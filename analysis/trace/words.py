@@ -161,12 +161,16 @@ def _tolerated(result: Trace) -> list[str]:
     why = f"the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %"
     if any(note.startswith(f"{e}: {WITHOUT_RESTS}") for note in result.notes):
         why = "it includes the samples at which the joint rests, which are not judged"
-    elif share > form_share([make(e.name, e.at) for e in result.effects]):
+    elif share > _form_share(result):
         why = "in the records that choose, the error is within the band of an explanation"
     return [
         f"What is left in {e}, {result.after[e] / result.noise_floor[e]:.1f} times the noise "
         f"floor, is {plain(100 * share, 2)} % of the energy that was above the noise: {why}."
     ]
+
+
+def _form_share(result: Trace) -> float:
+    return form_share(make(effect.name, effect.at) for effect in result.effects)
 
 
 def tolerated_error_notes(result: Trace) -> list[str]:
@@ -181,12 +185,14 @@ def tolerated_error_notes(result: Trace) -> list[str]:
         if any(note.startswith(f"{e}:") for note in result.notes):
             continue
         share = result.remaining_share(e)
-        why = (
-            f"{plain(100 * share, 2)} % of the baseline's energy above noise, within the tolerance "
-            "for the form of the named effect"
-            if share < 1.0
-            else "no less than under the baseline: no named effect acts in it"
-        )
+        why = "no less than under the baseline: no named effect acts in it"
+        if share < 1.0:
+            why = f"{plain(100 * share, 2)} % of the baseline's energy above noise, "
+            why += (
+                "within the tolerance for the form of the named effect"
+                if share <= _form_share(result)
+                else "within the band in the records that choose"
+            )
         times = result.after[e] / result.noise_floor[e]
         out.append(f"{e}: held-out error {times:.2f} times the noise floor, {why}")
     return out

@@ -110,6 +110,9 @@ def test_an_error_that_includes_rests_or_other_rows_does_not_contradict_the_tole
         text = told(rig, (SPRING,), before, after, notes=tuple(notes))
         assert f"26 % of the energy that was above the noise: {reason}" in text
         assert "may miss" not in text
+    (note,) = tolerated_error_notes(explained(rig, (SPRING,), before, after))
+    assert note.endswith("26 % of the baseline's energy above noise, within the band in the "
+                         "records that choose")  # fmt: skip
 
 
 def test_what_only_held_out_records_keep_is_not_said_to_be_nothing(rig: Rig) -> None:
@@ -137,9 +140,11 @@ def test_an_error_that_no_effect_lowers_is_no_error_of_a_form(rig: Rig) -> None:
 
 
 def test_a_remainder_is_that_of_a_form_up_to_the_tolerance_of_the_held_out_records() -> None:
-    assert tolerance_words(0.05).endswith("within the tolerance for the form of the named effect")
-    assert "more than the form" in tolerance_words(0.13)
-    assert "no named effect acts there" in tolerance_words(0.9)
+    of_form = "within the tolerance for the form of the named effect"
+    assert tolerance_words(0.05, 0.05).endswith(of_form)
+    assert "more than the form" in tolerance_words(0.13, 0.05)
+    assert tolerance_words(0.02, 0.0).endswith("more than noise, unlike in held-out records")
+    assert "no named effect acts there" in tolerance_words(0.9, 0.05)
 
 
 def test_a_parameter_that_only_motion_alone_leaves_open_says_so(rig: Rig) -> None:
