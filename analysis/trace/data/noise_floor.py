@@ -12,8 +12,8 @@ not state, and a note says so.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
-and a clean bench would never be `clean`. What coarse converters round alike in every repeat is
-noise too, as far as the rig file's converters explain it.
+and a clean bench would never be `clean`. The rounding error of a coarse converter that is the
+same in every repeat counts as noise too, up to its size by the rig file.
 """
 
 from __future__ import annotations
@@ -94,10 +94,14 @@ def floors(
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
         groups.setdefault(conditioned.group, []).append(index)
-    out = []
+    out, coarse = [], _has_coarse_converters(rig)
     for group, indices in groups.items():
         stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
-        rounded = _repeated_rounding(rig, terms, members[indices[0]], rows[indices[0]], beta)
+        rounding = (
+            stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta, repeated_rounding)
+            if coarse
+            else {}
+        )
         for equation in rows[indices[0]]:
             parts = [rows[i][equation] for i in indices if equation in rows[i]]
             residual = [row_residual(r, beta) for r in parts]
@@ -107,9 +111,9 @@ def floors(
             table, source = stacked_repeats(members[indices[0]], parts, residual)
             if table is not None:
                 noise, repeatable = noise_and_repeatable(table)
-                alike = min(repeatable, rounded[equation])
-                noise = max(float(np.hypot(noise, alike)), DATA.least_noise * sensors)
-                repeatable = float(np.sqrt(repeatable**2 - alike**2))
+                rounded = min(repeatable, rounding.get(equation, 0.0))
+                noise = max(float(np.hypot(noise, rounded)), DATA.least_noise * sensors)
+                repeatable = float(np.sqrt(repeatable**2 - rounded**2))
                 out.append(
                     Floor(group, equation, noise, repeatable, total, len(table), source, sensors)
                 )
@@ -274,15 +278,7 @@ def stated_noise(
     return out
 
 
-def _repeated_rounding(
-    rig: Rig,
-    terms: Sequence[Used],
-    conditioned: ConditionedRecord,
-    rows: Mapping[str, Rows],
-    beta: Mapping[str, float],
-) -> dict[str, float]:
-    """Return the rms of the rounding that all repeats share, in each residual."""
+def _has_coarse_converters(rig: Rig) -> bool:
+    """Return whether the rounding error of a sensor's converter is much the same in all repeats."""
     sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
-    if all(repeated_rounding(s) < DATA.least_rounding * sensor_variance(s) for s in sensors):
-        return dict.fromkeys(rows, 0.0)
-    return stated_noise(rig, terms, conditioned, rows, beta, repeated_rounding)
+    return any(repeated_rounding(s) >= DATA.least_rounding * sensor_variance(s) for s in sensors)
