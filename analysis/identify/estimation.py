@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.checks import Check, is_hold
+from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.bootstrap import bootstrap
 from analysis.identify.estimators.covariance import CovarianceParts, spread
@@ -40,7 +40,7 @@ from analysis.identify.estimators.statements import (
     outlier_statement,
 )
 from analysis.identify.estimators.weighted import weighted_least_squares
-from analysis.identify.stacked_rows import RecordRows, repeats_of, with_columns
+from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, with_columns
 from analysis.regression.rows import parameters_of
 from analysis.regression.solve import MOSTLY_NOISE, Solution
 from analysis.terms.base import Used
@@ -100,8 +100,9 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     InputError for an estimator that needs repeats where a step has only one.
     """
     refuse_unknown(job.estimator)
-    moving = (rows for rows in job.built if not is_hold(job.rig, rows.record))
-    counted = repeats_of((rows.conditioned.run, rows.record) for rows in moving)
+    counted = repeats_in_motion(
+        job.rig, ((rows.conditioned.run, rows.record) for rows in job.built)
+    )
     prepared, checks = _prepare(job, solutions)
     single = sorted(
         {step for (_, step), n in counted.items() if n < 2}.union(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
 from analysis.identify.settings import IDENTIFY
-from analysis.identify.stacked_rows import RecordRows, repeats_of
+from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, repeats_of
 from analysis.regression.chunks import InMemory, Source, divisible, source_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import record_moments
@@ -306,9 +306,8 @@ def record_checks(
     `rows` counts the rows that the solution used, by family.
     """
     heads = [reduction.head for reduction in reductions]
-    moving = [(part.run, part.head) for part in reductions if not ck.is_hold(rig, part.head)]
     return [
-        ck.repeats(repeats_of(moving)),
+        ck.repeats(repeats_in_motion(rig, ((part.run, part.head) for part in reductions))),
         ck.joints_excited(rig, heads),
         *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
         *ck.leak_down(rig, heads),

@@ -109,3 +109,10 @@ def repeats_of(records: Iterable[tuple[int, Record | RecordHead]]) -> dict[tuple
     for run, record in records:
         seen.setdefault((run, record.step), set()).add(record.repeat)
     return {key: len(repeats) for key, repeats in seen.items()}
+
+
+def repeats_in_motion(
+    rig: Rig, records: Iterable[tuple[int, Record | RecordHead]]
+) -> dict[tuple[int, str], int]:
+    """Count the repeats as `repeats_of`, without holds, which have no equations of motion."""
+    return repeats_of((run, record) for run, record in records if not ck.is_hold(rig, record))

@@ -25,6 +25,7 @@ from rig.model.records import Record, Run
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.straight_line import line
+from tests.analysis.trace.hidden import understated
 from tests.studies.estimators import coverage as cov
 
 
@@ -84,12 +85,7 @@ def test_the_interval_of_one_repeat_holds_the_bias_that_stated_noise_predicts(
     once = tuple(r for r in noisy_run.records if r.repeat == 1)
 
     def stating(times: float) -> Identification:
-        stated = {
-            name: sensor.model_copy(update={"noise": times * sensor.noise})
-            for name, sensor in noisy_run.rig.sensors if hasattr(sensor, "noise")
-        }  # fmt: skip
-        sensors = noisy_run.rig.sensors.model_copy(update=stated)
-        rig = noisy_run.rig.model_copy(update={"sensors": sensors})
+        rig = understated(noisy_run.rig, 1.0 / times)
         return identify([Run(rig, once)], reject_noise=False)
 
     none, found = stating(0.1), stating(5.0)
