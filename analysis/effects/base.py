@@ -134,8 +134,8 @@ class Effect(Term):
     cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
     [SI] of the smallest size of interest on a bench of some kW at some MPa.
 
-    `exact` marks effects by definition, a gain, an offset, a delay or a mass: no error of a form
-    accounts for what they leave.
+    `exact` marks effects whose equation is a definition (a gain, an offset, a delay, a mass): a
+    residual that they leave is not due to an error of their form.
 
     `mechanism` is the physical law, `element` the part of the machine: base, load, supply, tank, or
     of its joint the joint, piston, valve, chamber or sensor. `free` marks a mechanism without a

@@ -54,8 +54,8 @@ def detection_limits(
     `winner` is the set found and `model` the model identified with it. Another name of a law that
     acts in the set has the shape with which it was fitted in place of that name. A special case of
     an effect of the set is no further effect, and no effect is larger than what changes a parameter
-    by all of its value. Beside a free form no limit is computed, since its
-    curve absorbs any similar effect.
+    by all of its value. Beside a free form no limit is computed, since its curve absorbs any
+    similar effect.
     """
     train_data = hypotheses.train_data
     named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
