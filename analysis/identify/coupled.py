@@ -12,7 +12,13 @@ import numpy as np
 from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
-from analysis.identify.estimation import UNBIASED, EstimationJob, Refinement, refine
+from analysis.identify.estimation import (
+    OUTPUT_ERROR,
+    UNBIASED,
+    EstimationJob,
+    Refinement,
+    refine,
+)
 from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows, widened
 from analysis.identify.reduction import (
     RecordReduction,
@@ -59,7 +65,7 @@ def coupled(
     estimator = _fitting_estimator(rig, used, estimator, bootstrap)
 
     def refined(solutions: Mapping[str, Solution]) -> Refinement:
-        if rig.electric:
+        if rig.electric and estimator == OUTPUT_ERROR:
             from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
 
             fitted, check = free_run_fit(rig, runs, used, solutions)
@@ -146,21 +152,15 @@ def _statements(
 def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
     """Return the estimator for a model, or raise InputError where it does not apply.
 
-    Electric rigs have plain least squares and output error only. Parameters that are not linear in
-    the rows (`Term.reduction`) have plain least squares only.
+    Parameters that are not linear in the rows (`Term.reduction`) have plain least squares only.
     """
     reducing = [use.term.name for use in used if use.term.reduction(rig) is not None]
-    if estimator == PLAIN or not (rig.electric or reducing):
-        return estimator
-    if estimator == "output-error" and not reducing and not bootstrap:
+    if estimator == PLAIN or not reducing:
         return estimator
     if estimator not in ("ls", "auto") or bootstrap:
         asked = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
-        why = (
-            f"is for hydraulic rigs; {rig.name!r} is electric"
-            if rig.electric
-            else f"does not go with {' '.join(reducing)}, not linear in the rows"
+        raise InputError(
+            f"{asked} does not go with {' '.join(reducing)}, not linear in the rows: take ls "
+            "without a bootstrap"
         )
-        also = " or output-error" if rig.electric and not reducing else ""
-        raise InputError(f"{asked} {why}: take ls{also} without a bootstrap")
     return PLAIN

@@ -50,7 +50,8 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-ESTIMATORS = ("ls", "wls", "iv", "robust", "output-error", "auto")
+OUTPUT_ERROR = "output-error"
+ESTIMATORS = ("ls", "wls", "iv", "robust", OUTPUT_ERROR, "auto")
 NEED_REPEATS = ("wls", "iv")
 # Output error is not among them: the measured spool that drives it is noisy as well, and at ten
 # times the stated noise it is the most biased of all (docs/estimators.md).
@@ -119,7 +120,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     tests = {} if single else {p.family: hausman(p.blocks) for p in prepared}
     estimator = job.estimator
     fits = {p.family: _solve(p, "ls" if estimator == "auto" else estimator) for p in prepared
-             if estimator != "output-error"}  # fmt: skip
+             if estimator != OUTPUT_ERROR}  # fmt: skip
     if not single:
         plain = fits if estimator in ("ls", "auto") else None
         reference = plain or {p.family: _solve(p, "ls") for p in prepared}
@@ -134,7 +135,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         checks.append(statement)
     elif estimator == "auto":
         estimator = "ls"
-    if estimator == "output-error":
+    if estimator == OUTPUT_ERROR:
         from analysis.identify.output_error.fit import output_error  # noqa: PLC0415 - compiles
 
         start = {p.family: _solve(p, "ls") for p in prepared}

@@ -118,6 +118,30 @@ def test_mechanics_and_slope_are_identified_together(
     assert judged.units == {"position_1": "rad", "position_2": "rad"}
 
 
+def test_noise_that_the_rig_file_does_not_state_biases_least_squares_and_is_seen(
+    robot: ElectricRig, arm: plant.Arm
+) -> None:
+    """The encoders are 30 times noisier than stated; the base's slope is known."""
+    known = robot.model_copy(update={"inclination": arm.slope})
+    encoder = known.sensors.position
+    noisy = encoder.model_copy(update={"noise": 30 * encoder.noise})
+    machine = known.model_copy(
+        update={"sensors": known.sensors.model_copy(update={"position": noisy})}
+    )
+    measured = plant.records(machine, arm, np.random.default_rng(6), repeats=4)
+    run, truth = Run(known, measured.records), arm.truth()
+    plain = identify([run], terms=used(known, *FRICTION), estimator="ls")
+    found = identify([run], terms=used(known, *FRICTION))
+    assert plain.estimates["M1"].value == pytest.approx(truth["M1"], rel=0.15)
+    assert plain.estimates["M1"].value < 0.95 * truth["M1"]
+    assert found.model.provenance["estimator"] == "iv"
+    for name in ("M1", "R12", "W1", "W2"):
+        assert found.estimates[name].value == pytest.approx(truth[name], rel=0.006), name
+    for name in ("M1", "W1", "W2"):
+        low, high = plain.estimates[name].ci95
+        assert low < truth[name] < high, name
+
+
 def test_taking_the_base_for_level_spoils_the_mechanics(
     robot: ElectricRig, arm: plant.Arm, run: Run
 ) -> None:

@@ -69,7 +69,5 @@ def test_what_cannot_be_simulated_is_refused_in_words(runs: tuple[Run, Run]) -> 
     away = record(train.rig, Carriage(), one_way, np.random.default_rng(5), "away")
     with pytest.raises(InputError, match=r"does not determine .*offset1"):
         fitted(Run(train.rig, (away,)), "output-error")
-    with pytest.raises(InputError, match="take ls or output-error"):
-        fitted(train, "iv")
     with pytest.raises(InputError, match="does not go with --estimator output-error"):
         fitted(train, "output-error", bootstrap=200)
