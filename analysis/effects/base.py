@@ -171,6 +171,10 @@ class Effect(Term):
             return "bench"
         return " ".join(words[:2]) if words[-1] in ("piston", "spool") else self.where
 
+    def variable_on(self, rig: Rig) -> str:
+        """Return what the effect follows, in words; electric joints have no piston."""
+        return self.variable.replace("piston", "joint") if rig.electric else self.variable
+
     @property
     def joint(self) -> int:
         """Its joint, 0-based; raises InputError where `where` names none."""

@@ -18,6 +18,7 @@ is spread normally with the standard deviation w / sqrt 2,
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -25,9 +26,8 @@ from numba import njit
 from scipy.special import erf
 
 from analysis.effects.base import Array, Shape
+from rig.model.rig import Rig
 
-PRESLIDING: Final = (5e-6, 40e-6, 150e-6)  # [m] seals give a few hundredths of a millimetre
-PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
 SHEAR: Final = 0.02  # of the bore: a third of a seal's section, which is a fifteenth of the bore
 STIFFENING: Final = 30.0  # [s/m] where a search begins
 STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] a smaller one is below a tenth at 0.1 m/s: negligible
@@ -37,17 +37,51 @@ FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing t
 # On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
 # 1 mm/s does not (2 %).
 TRANSITION: Final = 1e-4
-TRANSITION_BOUNDS: Final = (TRANSITION, 2e-2)  # [m/s] wider is viscous friction
-TRANSITION_START: Final = 1e-3  # [m/s] where a search begins
 
 
-def presliding(name: str, bore: float) -> Shape:
-    """Return the presliding distance's shape [m]; it may be below the sensors' resolution.
+@dataclass(frozen=True)
+class ContactRange:
+    """What a contact's shapes may be: presliding distances [unit] and transition speeds [unit/s].
 
-    A seal's section grows with the cylinder's `bore` [m], and with it its shear travel.
+    `distances` are the points of a search, `speed` where a search begins. A wider transition than
+    the upper bound is viscous friction.
     """
-    low, high = PRESLIDING_BOUNDS
-    return Shape(name, "m", low, max(high, SHEAR * bore), PRESLIDING, resolution=True)
+
+    unit: str
+    distances: tuple[float, ...]
+    distance_bounds: tuple[float, float]
+    speed: float
+    speed_bounds: tuple[float, float]
+
+
+# Seals give a few hundredths of a millimetre; belts, cables and gears a few milliradians.
+LINEAR: Final = ContactRange("m", (5e-6, 40e-6, 150e-6), (2e-6, 5e-4), 1e-3, (TRANSITION, 2e-2))
+ROTARY: Final = ContactRange("rad", (5e-5, 5e-4, 3e-3), (2e-6, 2e-2), 1e-2, (TRANSITION, 0.2))
+
+
+def contact_range(rig: Rig, joint: int) -> ContactRange:
+    """Return the range of a joint's contact (0-based): that of an angle on a revolute drive.
+
+    A seal's section grows with the cylinder's bore, and with it its shear travel.
+    """
+    at = rig.joints[joint]
+    if path_unit(rig, joint) == ROTARY.unit:
+        return ROTARY
+    if rig.electric:
+        return LINEAR
+    low, high = LINEAR.distance_bounds
+    bore = 2.0 * math.sqrt(at.cylinder.cap_area / math.pi)
+    return replace(LINEAR, distance_bounds=(low, max(high, SHEAR * bore)))
+
+
+def path_unit(rig: Rig, joint: int) -> str:
+    """Return the unit of a joint's path of friction: m, or rad of a revolute drive."""
+    return str(getattr(rig.joints[joint], "position_unit", "m"))
+
+
+def presliding(name: str, among: ContactRange) -> Shape:
+    """Return the presliding distance's shape; it may be below the sensors' resolution."""
+    return Shape(name, among.unit, *among.distance_bounds, among.distances, resolution=True)
 
 
 def stiffening(name: str) -> Shape:
@@ -55,10 +89,10 @@ def stiffening(name: str) -> Shape:
     return Shape(name, "s/m", *STIFFENING_BOUNDS, (STIFFENING,), resolution=True, detail=True)
 
 
-def transition(name: str) -> Shape:
-    """Return a transition speed's shape [m/s] of a contact without memory."""
-    bounds = TRANSITION_BOUNDS
-    return Shape(name, "m/s", *bounds, (TRANSITION_START,), resolution=True, detail=True)
+def transition(name: str, among: ContactRange) -> Shape:
+    """Return the transition speed's shape of a contact without memory."""
+    unit, bounds = f"{among.unit}/s", among.speed_bounds
+    return Shape(name, unit, *bounds, (among.speed,), resolution=True, detail=True)
 
 
 def memoryless(v: Array, speed: float) -> Array:

@@ -12,7 +12,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
-from analysis.effects.contact import PRESLIDING, slide
+from analysis.effects.contact import contact_range, path_unit, slide
 from analysis.effects.curve import (
     LAST,
     curve_at,
@@ -92,8 +92,10 @@ class FrictionCurve(Friction):
         speed = rig.joints[self.joint].limits.speed
         most = 1.0 / self._half(rig)  # the friction vanishes at one end of the stroke
         bound, grid = MOST_GROWTH * most, tuple(share * most for share in GROWS)
-        growth = Shape(self.shape_names()[-1], "1/m", -bound, bound, grid, detail=True)
-        return (*knot_shapes(self.knot_names(), "m/s", 0.0, speed), *super().shapes(rig), growth)
+        unit = path_unit(rig, self.joint)
+        growth = Shape(self.shape_names()[-1], f"1/{unit}", -bound, bound, grid, detail=True)
+        knots = knot_shapes(self.knot_names(), f"{unit}/s", 0.0, speed)
+        return (*knots, *super().shapes(rig), growth)
 
     def _half(self, rig: Rig) -> float:
         """Return half of the stroke [m]."""
@@ -140,7 +142,8 @@ class FrictionCurve(Friction):
         """Return knots at quantiles of the joint's speed, each with some presliding distances."""
         speed = evidence.of_joint(self.joint, lambda x: np.abs(x.sd[:, self.joint]))
         knots = spread_knots(speed, (0.0, 0.35, 0.75, LAST), low=0.0)
-        return tuple((*map(float, knots), d) for d in PRESLIDING) if len(knots) else ()
+        distances = contact_range(rig, self.joint).distances
+        return tuple((*map(float, knots), d) for d in distances) if len(knots) else ()
 
     @staticmethod
     def _shared(rig: Rig) -> Array:
@@ -188,7 +191,7 @@ class FrictionCurve(Friction):
         weights |= dict(zip(own, basis.T, strict=True))
         weights[f"Fv{self.joint + 1}"] = v / lever**2
         unit = force_unit(rig, self.joint)
-        return (Branch("friction over speed", v, weights, "m/s", unit),)
+        return (Branch("friction over speed", v, weights, f"{path_unit(rig, self.joint)}/s", unit),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject driving friction, and more than half of the cylinder's force."""
@@ -250,7 +253,7 @@ class PositionForce(Effect):
         even = np.linspace(low, high, PLACES)
         gauge = zip(names[PLACES:], shortest_wave(even), strict=True)
         fixed = tuple(Shape(name, "", -1.0, 1.0, (float(v),), fixed=True) for name, v in gauge)
-        return (*knot_shapes(names[:PLACES], "m", low, high), *fixed)
+        return (*knot_shapes(names[:PLACES], path_unit(rig, self.joint), low, high), *fixed)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the piston's position, and the gauge of these records."""
@@ -312,7 +315,7 @@ class PositionForce(Effect):
         at = shown(shape[:PLACES])
         weights = dict(zip(self._names(), self._basis(shape, at).T, strict=True))
         unit = force_unit(rig, self.joint)
-        return (Branch("force over position", at, weights, "m", unit),)
+        return (Branch("force over position", at, weights, path_unit(rig, self.joint), unit),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject more than half of the cylinder's force."""

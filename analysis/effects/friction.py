@@ -28,10 +28,11 @@ from analysis.effects.contact import (
     FASTEST,
     STIFFENING,
     TRANSITION,
-    TRANSITION_START,
+    contact_range,
     contact_state,
     contact_under_load,
     memoryless,
+    path_unit,
     presliding,
     slide,
     stiffening,
@@ -95,8 +96,9 @@ class Friction(Effect):
         """
         joint = self.joint + 1
         rate = (stiffening(f"stiffening_{joint}"),) if self.stiffens else ()
-        distances = (presliding(name, bore(rig, self.joint)) for name in self.distance_names())
-        return (*distances, *rate, transition(f"transition_{joint}"))
+        among = contact_range(rig, self.joint)
+        distances = (presliding(name, among) for name in self.distance_names())
+        return (*distances, *rate, transition(f"transition_{joint}", among))
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where the contact has a memory and can stiffen."""
@@ -110,7 +112,14 @@ class Friction(Effect):
             return ()
         place = self._speed_place()
         none = (0.0,) * (place - self.before)
-        return ((*shape[: self.before], *none, TRANSITION_START, *shape[place + 1 :]),)
+        return (
+            (
+                *shape[: self.before],
+                *none,
+                contact_range(rig, self.joint).speed,
+                *shape[place + 1 :],
+            ),
+        )
 
     def _speed_place(self) -> int:
         """Return the place of the transition speed in a shape, the last of the contact's own."""
@@ -189,11 +198,6 @@ class Friction(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's speed [m/s]."""
         return {equation("torque", self.joint): signals.sd[:, self.joint]}
-
-
-def bore(rig: Rig, joint: int) -> float:
-    """Return the bore of a joint's cylinder [m], 0 of an electric joint."""
-    return 0.0 if rig.electric else 2.0 * math.sqrt(rig.joints[joint].cylinder.cap_area / math.pi)
 
 
 def force_limit(rig: Rig, joint: int) -> float:
@@ -291,7 +295,13 @@ class StribeckFriction(Friction):
         """Return the Stribeck speed [m/s], presliding distance [m] and transition speed [m/s]."""
         speed = rig.joints[self.joint].limits.speed
         grid = (0.01 * speed, 0.03 * speed, 0.1 * speed)
-        own = Shape(self.shape_names()[0], "m/s", 2e-3 * speed, 0.4 * speed, grid)
+        own = Shape(
+            self.shape_names()[0],
+            f"{path_unit(rig, self.joint)}/s",
+            2e-3 * speed,
+            0.4 * speed,
+            grid,
+        )
         return (own, *super().shapes(rig))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -343,12 +353,12 @@ class StribeckFriction(Friction):
         Two contacts of different transition speeds give any smooth curve that only rises, and a
         fall over most of the speeds is that of a level beside another viscous friction.
         """
-        i = self.joint
+        i, unit = self.joint, f"{path_unit(rig, self.joint)}/s"
         top = max((float(np.abs(s.sd[:, i]).max()) for s in signals if s.excited[i]), default=0.0)
         if shape[0] > SLOWEST_FALL * top:
             return (
-                f"Stribeck speed {shape[0]:.3g} m/s, over {SLOWEST_FALL:.0%} of the records' top "
-                f"speed {top:.3g} m/s: viscous friction makes up for such a fall"
+                f"Stribeck speed {shape[0]:.3g} {unit}, over {SLOWEST_FALL:.0%} of the records' "
+                f"top speed {top:.3g} {unit}: viscous friction makes up for such a fall"
             )
         v = np.linspace(0.0, top, SPEEDS + 1)[1:]
         own = self.coefficients(rig)[0]
@@ -364,8 +374,9 @@ class StribeckFriction(Friction):
         if fall >= FALLEN * values[own.parameter]:
             return ""
         return (
-            f"up to {top:.3g} m/s, the top speed of the records, dry friction falls by {fall:.3g} "
-            f"{own.unit}: that is no breakaway of {own.parameter} = {values[own.parameter]:.3g}"
+            f"up to {top:.3g} {unit}, the top speed of the records, dry friction falls by "
+            f"{fall:.3g} {own.unit}: that is no breakaway of {own.parameter} = "
+            f"{values[own.parameter]:.3g}"
         )
 
 

@@ -134,7 +134,7 @@ def judge_effects(
                 removed,
                 (*inseparable, *others),
                 gates,
-                used.term.variable,
+                used.term.variable_on(train_data.rig),
                 mechanism=used.term.mechanism,
                 free=used.term.free,
                 curves=curves_of(train_data, winner.fit, used),

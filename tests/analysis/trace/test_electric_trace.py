@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from analysis.effects.base import Effect
 from analysis.effects.friction_levels import AsymmetricFriction
+from analysis.terms import make
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
@@ -109,6 +111,36 @@ def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> No
     arm = {e.name for e in catalogue(load_rig("electric-2dof"))}
     assert "payload" in arm
     assert "base_inclination" not in arm  # that rig's inclination is a parameter already
+
+
+def test_a_revolute_joint_rubs_along_an_angle() -> None:
+    """Belts and gears give by milliradians before they slip, a seal by a few hundredths of a mm."""
+    arm, carriage = load_rig("electric-2dof"), load_rig("emps")
+    for name in ("coulomb_friction", "friction_curve"):
+        units = {s.unit for s in make_effect(name).shapes(arm)}
+        assert units <= {"rad", "rad/s", "s/m", "1/rad"}
+        assert {s.unit for s in make_effect(name).shapes(carriage)} <= {"m", "m/s", "s/m", "1/m"}
+    assert make_effect("coulomb_friction").outside(arm, (3e-3,)) == ""
+    assert "m lies at the edge" in make_effect("coulomb_friction").outside(carriage, (3e-3,))
+    assert make_effect("coulomb_friction").variable_on(arm) == "the sign of the joint's velocity"
+
+
+def make_effect(name: str) -> Effect:
+    effect = make(name, "joint 1")
+    assert isinstance(effect, Effect)
+    return effect
+
+
+def test_an_electric_rig_has_no_flows_to_trace_alone(
+    two_hidden: tuple[Run, Run], tmp_path: Path
+) -> None:
+    train, unseen = (
+        str(write_run(tmp_path / name, run)) for name, run in zip("ab", two_hidden, strict=True)
+    )
+    words = ["trace", train, "--holdout", unseen, "--equations", "flow"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code != 0
+    assert "is electric and has no flow equations" in str(done.exception)
 
 
 @pytest.mark.slow
