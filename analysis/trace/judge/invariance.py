@@ -70,8 +70,9 @@ def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
     if all(floor.count > 1 for floor in train_data.floors):
         return None
     numbers = flip_blocks(train_data)
+    between = int(numbers.max()) + 1
     for k, s in enumerate(train_data.segments):
-        numbers[s.where] += (int(numbers.max()) + 1) * k
+        numbers[s.where] += between * k
     return numbers
 
 
