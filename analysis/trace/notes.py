@@ -60,7 +60,7 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
     if scaled:
         out.append(
             f"one repeat of {' '.join(scaled)}: the noise floor is the rig file's stated sensor "
-            "noise times the ratio that repeats of other steps show"
+            "noise times the ratio that other steps show"
         )
     return [
         *out,

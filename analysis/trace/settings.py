@@ -166,9 +166,9 @@ class DataSettings:
     unrepeated_ratio: float = 5.0
     """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
     note says that something else acts (tuned: clean benches stay below 2)."""
-    unstated_ratio: float = 2.0
-    """What the baseline leaves over the stated noise, up to which it counts as noise where nothing
-    repeats and it follows no variable of the records (convention)."""
+    unstated_ratio: float = 2.5
+    """What the model leaves over the stated noise, up to which it counts as noise where nothing
+    repeats and it follows no variable of the records (convention: twice, and its scatter)."""
     unstated_clue: float = 0.25
     """Share of that energy which a variable removes from held-out records, from which it does not
     count as noise: noise in the regressors itself makes 0.1 (tuned)."""

@@ -7,8 +7,8 @@ there are no periods either, but the motion comes back to states x where it was 
  noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
 (a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
 rig's stated sensor noise, put through the same rows, is used, times the ratio of measured to stated
-noise in steps that are repeated. Without any such step it lacks every noise that the rig file does
-not state, and a note says so.
+noise in other steps: in repeats and periods, else between neighbours. Without these it lacks every
+noise that the rig file does not state, and a note says so.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
@@ -18,7 +18,7 @@ same in every repeat counts as noise too, up to its size by the rig file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
-OTHER_STEPS = "repeats of other steps"
+OTHER_STEPS = "noise of other steps"
 UNSTATED = "a residual that follows nothing"
 Group = tuple[int, str]
 NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
@@ -88,8 +88,8 @@ def floors(
     """Return the split of every equation of every group of records under a model.
 
     `others` are floors of other records of the machine: groups without repeats take the ratio of
-    measured to stated noise from those and from the groups that have repeats. `noise_ratio` is that
-    ratio by equation for stated noise that is left.
+    measured to stated noise from those and from the groups whose noise was measured. `noise_ratio`
+    is that ratio by equation for stated noise that is left.
     """
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
@@ -124,8 +124,9 @@ def floors(
                 if near is not None:
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
             out.append(_unrepeated(group, equation, noise, total, source, sensors))
-    scale = _measured_over_stated([*out, *others])
-    by_repeats = _measured_over_stated([f for f in (*out, *others) if f.source == REPEATS])
+    by_repeats = _measured_over_stated([*out, *others], (REPEATS,))
+    scale = _measured_over_stated([*out, *others], (NEIGHBOURS,))
+    scale |= _measured_over_stated([*out, *others], (REPEATS, PERIODS))
     scaled = (_scaled(_without_aperiodic(f, by_repeats), scale, OTHER_STEPS) for f in out)
     return [_scaled(floor, noise_ratio or {}, UNSTATED) for floor in scaled]
 
@@ -142,8 +143,8 @@ def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
     return _unrepeated(floor.group, floor.equation, floor.stated, floor.total, STATED, floor.stated)
 
 
-def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:
-    """Return by equation the rms ratio of noise measured in repeats or periods to stated noise.
+def _measured_over_stated(split: Sequence[Floor], sources: Collection[str]) -> dict[str, float]:
+    """Return by equation the rms ratio of noise measured from `sources` to stated noise.
 
     Each group counts by the degrees of freedom of its repeats. Above `DATA.unrepeated_ratio` it is
     no noise of the sensors, but a cause that does not follow the excitation.
@@ -152,9 +153,9 @@ def _measured_over_stated(split: Sequence[Floor]) -> dict[str, float]:
     weights: dict[str, list[int]] = {}
     for floor in split:
         most = DATA.unrepeated_ratio * floor.stated
-        if floor.source in (REPEATS, PERIODS) and floor.stated > NO_ROWS and floor.noise <= most:
+        if floor.source in sources and floor.stated > NO_ROWS and floor.noise <= most:
             ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
-            weights.setdefault(floor.equation, []).append(floor.count - 1)
+            weights.setdefault(floor.equation, []).append(max(1, floor.count - 1))
     return {
         e: float(np.sqrt(np.average(np.square(measured), weights=weights[e])))
         for e, measured in ratios.items()

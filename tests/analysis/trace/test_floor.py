@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ from analysis.trace.data.noise_floor import (
 )
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.data.unrepeated import dominant_frequency, unrepeated_notes
+from analysis.trace.judge import invariance
 from analysis.trace.settings import DATA
 from rig.model import channels as ch
 from rig.model.records import Record, Run
@@ -134,6 +137,34 @@ def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> No
     assert floors_of(other)["other"].source == STATED
     loud = floor_of(to_and_fro(1, 4))  # so loud that it is no noise of the sensors
     assert floors_of(other, others=[loud])["other"].source == STATED
+
+
+def test_noise_that_a_motion_shows_by_coming_back_holds_for_another_step() -> None:
+    back, once = to_and_fro(3, times=3.0), to_and_fro(1, times=3.0)
+    other = replace(once, records=tuple(replace(r, step="other") for r in once.records))
+    together = floors_of(back, other)
+    assert (together["moves"].source, together["other"].source) == (NEIGHBOURS, OTHER_STEPS)
+    ratios = [floor.noise / floor.stated for floor in together.values()]
+    assert ratios[0] == pytest.approx(ratios[1])
+    # Repeats know it better than neighbours do.
+    known = floor_of(to_and_fro(1, 4, times=3.0))
+    beside = floors_of(back, other, others=[known])["other"]
+    assert beside.noise / beside.stated == pytest.approx(known.noise / known.stated)
+
+
+def test_blocks_of_many_equations_and_steps_are_numbered_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As of three joints with one repeat of each step, where nothing measures the noise."""
+    blocks, count = 4, 60
+    segments = [SimpleNamespace(where=slice(k * blocks, (k + 1) * blocks)) for k in range(count)]
+    stated = SimpleNamespace(count=1)
+    data: Any = SimpleNamespace(floors=[stated], segments=segments)
+    numbers = np.tile(np.arange(blocks), count)
+    monkeypatch.setattr(invariance, "flip_blocks", lambda _: numbers)
+    found = invariance._blocks_as_noise(data)
+    assert found is not None
+    assert len(set(found.tolist())) == blocks * count
 
 
 def test_a_hum_in_step_with_the_record_is_no_noise_where_repeats_show_the_noise() -> None:
