@@ -43,7 +43,7 @@ from analysis.trace.judge.curves import (
     curves_that_limit,
     rows_within_curves,
 )
-from analysis.trace.judge.rivals import shift_by_tied_rivals
+from analysis.trace.judge.rivals import spread_by_tied_rivals
 from analysis.trace.judge.scatter import form_shift, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
@@ -221,7 +221,7 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     """Identify the model with the effects found, hidden states by multiple shooting."""
     runs, before, rows = prepared.records.train, prepared.baseline, finding.rows
     winner = finding.winner
-    by_rivals = shift_by_tied_rivals(finding.hypotheses, winner, finding.named)
+    by_rivals = spread_by_tied_rivals(finding.hypotheses, winner, finding.named)
     after, from_tolerances = _identified_with_effects(runs, winner, before, rows, by_rivals)
     shooting = shoot_hidden_states(
         runs, prepared.rows.unseen.choosing_runs, after, rows.train, rows.unseen.choosing, winner

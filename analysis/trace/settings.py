@@ -132,6 +132,9 @@ class TraceSettings:
     """Relative change of a parameter from which it matters: by an effect at its detection limit, by
     the fit to held-out rows, or by a rival in place of a named effect (tuned: with good excitation
     no detection limit reaches it)."""
+    open_share: float = 0.02
+    """Half-width of a parameter's 95 % interval over its value from which another name of the same
+    law leaves the parameter open, and so is a rival (the error that parameters may keep)."""
     most_detection_limits: int = 3
     """Largest number of detection limits in the notes."""
     eigenvalue_ratio: float = 1e-10

@@ -106,23 +106,33 @@ def _moved_parameter(
     It changes by at least `TRACE.noted_shift` and lies outside the rival's 95 % interval: the
     stated intervals would be wrong if the rival were true. None where no parameter does. Those of
     the baseline's term of the same `law` are left out (viscous friction beside dry `friction`,
-    whose forms differ by a slope too); '' leaves out none.
+    whose forms differ by a slope too), and for the others it is enough that the rival's interval
+    is wider than `TRACE.open_share`: its end farther from the named set's value gives the change.
+    '' leaves out none.
     """
-    names, covariance = noise_covariance(train_data, rival.fit)
+    deviations = _deviations(train_data, rival)
     most: tuple[str, float] | None = None
     rig = train_data.rig
     others = [term for term in baseline_of(rig) if not law or not term.name.endswith(law)]
     for c in (c for term in others for c in term.coefficients(rig)):
         value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
-        if not value or not other or c.parameter not in names:
+        if not value or not other or c.parameter not in deviations:
             continue
-        k = names.index(c.parameter)
-        std = float(np.sqrt(max(covariance[k, k], 0.0)))
+        half_width = IDENTIFY.normal_quantile * deviations[c.parameter]
+        if law and half_width > TRACE.open_share * abs(value):
+            other += math.copysign(half_width, other - value)
+        elif abs(other - value) <= half_width:
+            continue
         change = value / other - 1.0 if c.reciprocal else other / value - 1.0
-        large = abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0)
-        if large and abs(other - value) > IDENTIFY.normal_quantile * std:
+        if abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0):
             most = c.parameter, float(change)
     return most
+
+
+def _deviations(train_data: RegressionData, hypothesis: Hypothesis) -> dict[str, float]:
+    """Return the standard deviations from noise of a set's coefficients and shapes, by name."""
+    names, covariance = noise_covariance(train_data, hypothesis.fit)
+    return dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
 
 
 def tied_sets(
@@ -158,19 +168,30 @@ def best_tied_set(
     return best if cost < priced(winner) - SEARCH.number_price else winner
 
 
-def shift_by_tied_rivals(
+def spread_by_tied_rivals(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
 ) -> dict[str, float]:
-    """Return by how much tied rivals of judged effects may shift each coefficient, by name.
+    """Return the standard error that tied rivals of judged effects add to each coefficient.
 
-    It is the root mean square shift over the sets that the records cannot separate, all with the
-    same weight and the best one with none (Buckland, Burnham and Augustin, Biometrics 53, 1997).
+    Each set that the records cannot separate counts with the same weight: the square is the mean,
+    over the winner and the rivals, of the squared shift and of the variance beyond the winner's
+    (Buckland, Burnham and Augustin, Biometrics 53, 1997).
     """
-    fits = [h.fit.beta for h in tied_sets(hypotheses, winner, effects)]
-    return {
-        name: math.sqrt(
-            sum((beta.get(name, value) - value) ** 2 for beta in fits) / (len(fits) + 1)
+    rivals = tied_sets(hypotheses, winner, effects)
+    if not rivals:
+        return {}
+    data = hypotheses.train_data
+    own, others = _deviations(data, winner), [_deviations(data, rival) for rival in rivals]
+
+    def added(name: str, value: float) -> float:
+        return sum(
+            (rival.fit.beta.get(name, value) - value) ** 2
+            + max(theirs.get(name, 0.0) ** 2 - own.get(name, 0.0) ** 2, 0.0)
+            for rival, theirs in zip(rivals, others, strict=True)
         )
+
+    return {
+        name: math.sqrt(added(name, value) / (len(rivals) + 1))
         for name, value in winner.fit.beta.items()
     }
 
