@@ -21,7 +21,7 @@ from analysis.identify.geometry import wider
 from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import Identification, by_geometry
 from analysis.regression.rows import Filtering, default_filtering
-from analysis.simulation.model import Model
+from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
@@ -54,7 +54,7 @@ from analysis.trace.notes import (
     record_condition_notes,
     refitted_notes,
     rival_notes,
-    shared_parameter_notes,
+    shared_parameters,
     undetermined_notes,
 )
 from analysis.trace.remaining import clues_to
@@ -63,6 +63,7 @@ from analysis.trace.result import (
     CONFOUNDED,
     EXPLAINED,
     UNEXPLAINED,
+    Gate,
     JudgedEffect,
     Trace,
 )
@@ -232,16 +233,40 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     effects = tuple(
         with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
     )
-    return _Fitted(winner, with_curve_values(after, effects), effects)
+    after = with_effect_values(after, effects)
+    shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
+    after = replace(after, parameters={**after.parameters, **shared})
+    return _Fitted(winner, after, effects)
 
 
-def with_curve_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:
-    """Return the model with a value for each number of a free curve that it lacks.
+def _without_interval(estimate: Estimate) -> Estimate:
+    return replace(estimate, std=math.nan, ci95=(math.nan, math.nan))
 
-    The records determine the curve as a whole, even where one of its values is mostly noise;
-    without that value the model could not be simulated. It is the effect's, with its interval.
+
+def _with_free_runs(
+    prepared: _Prepared, records: TraceRuns, finding: Finding
+) -> tuple[Finding, _Fitted, tuple[held_out.FreeRunErrors, held_out.FreeRunErrors]]:
+    """Return the finding, its model and the free runs of unseen records before and after.
+
+    Effects with which the free run fails or is far worse than without them are not named.
     """
-    known = {n: e for f in effects if f.free for n, e in f.parameters.items()}
+    unseen, before = [*records.holdout, *records.judge], prepared.baseline
+    fitted = _fitted(prepared, finding)
+    first, last = held_out.free_runs(unseen, before, fitted.model)
+    if worse := held_out.worse_free_run(first, last):
+        finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
+        fitted, last = _fitted(prepared, finding), first
+    return finding, fitted, (first, last)
+
+
+def with_effect_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:
+    """Return the model with a value for each number of the effects that it lacks.
+
+    The records determine a curve as a whole, even where one of its values is mostly noise, and a
+    level beside others; without that value the model could not be simulated. It is the effect's,
+    with its interval.
+    """
+    known = {n: e for f in effects for n, e in f.parameters.items()}
     parameters = {n: e if e.identified else known.get(n, e) for n, e in model.parameters.items()}
     return replace(model, parameters=parameters)
 
@@ -266,6 +291,7 @@ def _traced(
         finding = searched(prepared)
     done(JUDGED)
     records = replace(prepared.records, lines=finding.rows.lines)
+    finding, fitted, free_runs = _with_free_runs(prepared, records, finding)
     hypotheses, train_data, unseen = finding.hypotheses, finding.rows.train, finding.rows.unseen
     lines = spectral_lines(train_data, finding.winner.fit.residual)
     moves, formulas = (
@@ -278,7 +304,6 @@ def _traced(
         if options.look_ahead
         else None
     )
-    fitted = _fitted(prepared, finding)
     winner, after = fitted.winner, fitted.model
     if winner is not finding.winner:
         lines = spectral_lines(train_data, winner.fit.residual)
@@ -308,13 +333,13 @@ def _traced(
         *phase_notes(finding.named, records.lines),
         *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
         *refitted_notes(winner.fit, last, after),
-        *shared_parameter_notes(winner, after),
+        *shared_parameters(winner, after).values(),
         *record_condition_notes(train_data, winner),
         *undetermined_notes(after, undetermined, finding.rows.in_motion),
         *kept,
         *detection_limit_notes(hidden),
     ]
-    runs_before, runs_after = held_out.free_runs([*records.holdout, *records.judge], before, after)
+    runs_before, runs_after = free_runs
     left = 0.0  # of training rows that hold noise alone
     if not finding.held_out_only:
         left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)

@@ -35,6 +35,7 @@ from analysis.trace.result import (
     CONFOUNDED,
     EXPLAINED,
     UNEXPLAINED,
+    Gate,
     JudgedEffect,
 )
 from analysis.trace.search.exact_trials import improved_by_exact_trials
@@ -114,6 +115,11 @@ class Finding:
         """The effects that fitted best and are not named."""
         tied = [f for f in self.effects if gates.passes_gates(f) and not _is_named(f, self.verdict)]
         return (*gates.refused_effects(self.effects), *tied)
+
+    def refused_by(self, gate: Gate) -> Finding:
+        """Return the finding without names: every effect fails a further gate."""
+        effects = tuple(replace(f, gates=(*f.gates, gate)) for f in self.effects)
+        return replace(self, winner=self.hypotheses.empty, verdict=UNEXPLAINED, effects=effects)
 
 
 def _is_named(effect: JudgedEffect, verdict: str) -> bool:

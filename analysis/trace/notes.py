@@ -152,9 +152,12 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
     return out
 
 
-def shared_parameter_notes(winner: Hypothesis, after: Model) -> list[str]:
-    """Name the baseline parameters that free curves of the same joint share, with the reason."""
-    out = []
+def shared_parameters(winner: Hypothesis, after: Model) -> dict[str, str]:
+    """Return the baseline parameters that free curves of the same joint share, and why in words.
+
+    Their value depends on how the curve is centred, so that it has no interval.
+    """
+    out = {}
     for effect in (u.term for u in winner.effects):
         if isinstance(effect, PositionForce):
             name, what = f"W{effect.joint + 1}", "weight"
@@ -169,5 +172,5 @@ def shared_parameter_notes(winner: Hypothesis, after: Model) -> list[str]:
             continue
         if name in after.parameters:
             shared = f"{effect.name} at {effect.where} shares it"
-            out.append(f"{name} is no measured {what}: {why}, and {shared}")
+            out[name] = f"{name} is no measured {what}: {why}, and {shared}"
     return out

@@ -47,6 +47,9 @@ class TraceSettings:
     held-out records may be quieter than training records (tuned)."""
     held_out_band: float = 1.5
     """Largest held-out rms of an equation over its noise floor (tuned: no clean bench is above)."""
+    free_run_ratio: float = 3.0
+    """Error of a held-out free run in short windows over that without the effects, from which they
+    are refused (tuned: right answers of a foreign plant reach 1.5, wrong ones fail or reach 30)."""
     knot_margin: float = 0.05
     """Share of a free curve's range by which rows may lie beyond its outermost knots and still be
     compared with it (tuned)."""

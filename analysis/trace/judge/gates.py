@@ -37,8 +37,8 @@ from rig.model.units import plain, with_interval
 Array = NDArray[np.float64]
 
 
-REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL = (
-    "removes on held-out", "physical", "invariant", "significant", "no rival",
+REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL, FREE_RUN = (
+    "removes on held-out", "physical", "invariant", "significant", "no rival", "free run",
 )  # fmt: skip
 ZERO_IN_INTERVAL = ", but its size may be zero: another effect there shares its force or flow"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -231,6 +232,20 @@ def free_runs(
     """Return the free runs of both models, driven by the measured spool or drive alone."""
     first = _free_runs(holdout, before)
     return first, first if after is before else _free_runs(holdout, after)
+
+
+def worse_free_run(before: FreeRunErrors, after: FreeRunErrors) -> str:
+    """Say in which channel effects make the free run far worse ('' if in none).
+
+    Windows restarted from the data are compared: over a whole record a drift grows without bound.
+    """
+    for channel, error in before.window_rmse.items():
+        now = after.window_rmse.get(channel, 0.0)  # none: a parameter is not identified
+        if math.isfinite(error) and not now <= TRACE.free_run_ratio * error:
+            if not math.isfinite(now):
+                return f"the held-out free run of {channel} fails with it, and not without"
+            return f"the held-out free run of {channel} is {now / error:.2g} times worse with it"
+    return ""
 
 
 def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRunErrors:
