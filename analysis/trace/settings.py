@@ -314,7 +314,7 @@ class SearchSettings:
     # Refinement.
     tolerance: float = 1e-4
     """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
-    steps: int = 10
+    steps: int = 20
     """Largest number of steps of a refinement."""
     shape_error: float = 0.25
     """Largest relative standard error of a shape beside the details of its effect's form (tuned:

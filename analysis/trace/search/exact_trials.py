@@ -14,6 +14,8 @@ from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.settings import SEARCH
 
+_Trial = tuple[float, tuple[Used, ...]]  # the energy that a set leaves at a point of a shape grid
+
 
 def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypothesis:
     """Return the set, or a better one with an effect added or exchanged, of all candidates.
@@ -22,7 +24,10 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
     A set within that tolerance is left only for one that leaves a tenth.
     """
     while above := _equations_above(hypotheses, now):
-        tried = [hypotheses.refined(effects) for effects in _best_trials(hypotheses, now, above)]
+        tried = [
+            hypotheses.refined_below(energy, effects)
+            for energy, effects in _best_trials(hypotheses, now, above)
+        ]
         better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([now, *tried])))
         tolerated = hypotheses.within_form_tolerance(now)
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
@@ -44,8 +49,8 @@ def _equations_above(hypotheses: HypothesisSet, now: Hypothesis) -> set[str]:
 
 def _best_trials(
     hypotheses: HypothesisSet, now: Hypothesis, equations: Collection[str]
-) -> Iterator[tuple[Used, ...]]:
-    """Yield the sets of the best candidates, added to the set or in place of one of its effects.
+) -> Iterator[_Trial]:
+    """Yield the best candidates' sets, added to the set or in place of one of its effects.
 
     A candidate must act in one of the `equations`.
     """
@@ -60,10 +65,10 @@ def _best_trials(
 
 def _best_additions(
     hypotheses: HypothesisSet, now: Hypothesis, start: Sequence[Used], equations: Collection[str]
-) -> list[tuple[Used, ...]]:
+) -> list[_Trial]:
     """Return the sets with one more effect that leave least at a point of its shape grid."""
     data = hypotheses.train_data
-    least: dict[Key, tuple[float, tuple[Used, ...]]] = {}
+    least: dict[Key, _Trial] = {}
     for variant in hypotheses.variants_of(data, now.fit.residual):
         fresh = variant.key not in now.keys and not variant.effect.free
         if fresh and hypotheses.may_act(variant, now, equations):
@@ -71,5 +76,4 @@ def _best_additions(
             energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
             if energy < least.get(variant.key, (float("inf"), ()))[0]:
                 least[variant.key] = energy, effects
-    best = sorted(least.values(), key=lambda trial: trial[0])[: SEARCH.exact_trials]
-    return [effects for _, effects in best]
+    return sorted(least.values(), key=lambda trial: trial[0])[: SEARCH.exact_trials]

@@ -142,6 +142,15 @@ class HypothesisSet:
                 self.fitted[known.keys] = known
         return self.fitted[known.keys]
 
+    def refined_below(self, energy: float, effects: Sequence[Used]) -> Hypothesis:
+        """Return the exact fit of a set, searched anew where an earlier one leaves over `energy`.
+
+        The earlier search began elsewhere and ended in a local minimum: the set leaves `energy`
+        with the shapes of `effects` already.
+        """
+        known = self.refined(effects)
+        return known if known.fit.energy <= energy else self._refined_anew(effects)
+
     def replacements(self, winner: Hypothesis, used: Used) -> Iterator[tuple[Hypothesis, Used]]:
         """Yield the fitted sets with one other effect in the place of `used`, and that effect."""
         key = used.term.name, used.term.where

@@ -44,6 +44,18 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
     assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)
 
 
+@pytest.mark.parametrize("edges", [(0.0018, 0.014), (0.02, 0.001)])
+def test_the_search_goes_on_until_very_different_overlaps_are_found(
+    rig: Rig, edges: tuple[float, float]
+) -> None:
+    wrong = bench.Wrong.of(w_ahead=edges[0], w_astern=edges[1])
+    records = conditioned_records(rig, [bench.run(rig, wrong, 0.03, 1)])
+    train_data = regression_data(rig, tuple(map(Used, baseline())), records)
+    band = Used(make("valve_deadband", "joint 2"), (0.0042, 0.0042, 0.0028))
+    ahead, astern, *_ = refinement.refine(train_data, (*train_data.terms, band)).terms[-1].shape
+    assert (ahead, astern) == pytest.approx(edges, rel=0.02)
+
+
 @pytest.mark.parametrize("stiffening", [0.0, 60.0])
 def test_a_contact_stiffens_in_the_model_where_it_does_on_the_bench_and_else_says_nothing_of_it(
     rig: Rig, stiffening: float
