@@ -50,11 +50,12 @@ def remainders(
     ]
     listed = {r.equation for r in out}
     counts = hypotheses.train_data.row_counts
-    allowed = gates.form_share(used.term for used in winner.effects)
+    terms = [used.term for used in winner.effects]
     for e, energy in winner.excess_energy.items():
         share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
         if winner.effects and e not in listed and visible and share > TRACE.visible_share:
+            allowed = gates.form_share(holdout_data.rig, terms, e)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             out.append(Remainder(e, words + tolerance_words(share, allowed), False))
     return out

@@ -161,7 +161,7 @@ def _tolerated(result: Trace) -> list[str]:
     why = f"the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %"
     if any(note.startswith(f"{e}: {WITHOUT_RESTS}") for note in result.notes):
         why = "it includes the samples at which the joint rests, which are not judged"
-    elif share > _form_share(result):
+    elif share > _form_share(result, e):
         why = "in the records that choose, the error is within the band of an explanation"
     return [
         f"What is left in {e}, {result.after[e] / result.noise_floor[e]:.1f} times the noise "
@@ -169,8 +169,9 @@ def _tolerated(result: Trace) -> list[str]:
     ]
 
 
-def _form_share(result: Trace) -> float:
-    return form_share(make(effect.name, effect.at) for effect in result.effects)
+def _form_share(result: Trace, equation: str) -> float:
+    terms = [make(effect.name, effect.at or effect.where) for effect in result.effects]
+    return form_share(result.model_before.rig, terms, equation)
 
 
 def tolerated_error_notes(result: Trace) -> list[str]:
@@ -190,7 +191,7 @@ def tolerated_error_notes(result: Trace) -> list[str]:
             why = f"{plain(100 * share, 2)} % of the baseline's energy above noise, "
             why += (
                 "within the tolerance for the form of the named effect"
-                if share <= _form_share(result)
+                if share <= _form_share(result, e)
                 else "within the band in the records that choose"
             )
         times = result.after[e] / result.noise_floor[e]

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
-from analysis.terms.base import Term, Used
+from analysis.terms.base import Term, Used, family_of
+from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference, removal, rivals
 from analysis.trace.judge.curves import curves_of
@@ -32,6 +33,7 @@ from analysis.trace.search.hypothesis import (
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
+from rig.model.rig import Rig
 from rig.model.units import plain, with_interval
 
 Array = NDArray[np.float64]
@@ -197,21 +199,25 @@ def held_out_above_band(
     miss (`Effect.exact`), `TRACE.held_out_share` of the energy above noise that the model `before`
     leaves, whichever is larger.
     """
-    share = form_share(used.term for used in after.terms)
+    terms = [used.term for used in after.terms]
     left = held_out_residual(holdout_data, after)
     start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
     now = energy_above_noise(holdout_data, left)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in removal.error_over_floor(holdout_data, left).items()
-        if r > TRACE.held_out_band and now[e] > share * start[e]
+        if r > TRACE.held_out_band and now[e] > form_share(holdout_data.rig, terms, e) * start[e]
     ]
 
 
-def form_share(terms: Iterable[Term]) -> float:
-    """Return the share of the energy above noise that the forms of a set's effects may miss."""
+def form_share(rig: Rig, terms: Iterable[Term], equation: str) -> float:
+    """Return the share of an equation's energy above noise that the forms of effects may miss.
+
+    It is 0 where all effects that act in its family of equations are exact.
+    """
     effects = [term for term in terms if isinstance(term, Effect)]
-    return 0.0 if effects and all(effect.exact for effect in effects) else TRACE.held_out_share
+    inexact = [e for e in effects if not e.exact and family_of(equation) in families_of(rig, e)]
+    return TRACE.held_out_share if inexact or not effects else 0.0
 
 
 def _noise_samples(train_data: RegressionData, residual: Array) -> Array:
