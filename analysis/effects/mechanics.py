@@ -105,6 +105,7 @@ def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
 
 LEAST_REACH: Final = 0.1  # of the joint's range: against a stiffer spring it cannot move so far
 RESTS: Final = 5  # rest angles to start from, evenly in the joint's range
+PRELOAD: Final = 8.0  # ranges of the joint: a long gas spring changes its force by a tenth over it
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,7 @@ class JointSpring(Effect):
         return (f"rest_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the rest angle [rad], within the joint's range or as far beyond its ends.
+        """Return the rest angle [rad], up to `PRELOAD` times the joint's range beyond its ends.
 
         A preloaded spring rests outside the range. Far from the true angle a search ends at a
         spring that pushes away, so that several are tried.
@@ -151,7 +152,8 @@ class JointSpring(Effect):
         reach = high - low
         inside = map(float, np.linspace(low, high, RESTS + 2)[1:-1])
         looks = (low - 0.5 * reach, *inside, high + 0.5 * reach)
-        return (Shape(f"rest_{self.joint + 1}", "rad", low - reach, high + reach, looks),)
+        ends = low - PRELOAD * reach, high + PRELOAD * reach
+        return (Shape(f"rest_{self.joint + 1}", "rad", *ends, looks),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q - rest."""

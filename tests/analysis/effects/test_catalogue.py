@@ -355,7 +355,7 @@ REFUSED = [
     ("payload", "bench", {"m_payload": -1.0}, ()),
     ("payload", "bench", {"m_payload": 1000.0}, ()),
     ("joint_spring", "joint 2", {"k_spring_2": -30.0}, (-1.44,)),
-    ("joint_spring", "joint 2", {"k_spring_2": 30.0}, (0.5,)),
+    ("joint_spring", "joint 2", {"k_spring_2": 30.0}, (9.0,)),
     ("torque_offset", "joint 2", {"T_offset_2": 1e4}, ()),
     ("valve_deadband", "joint 1", {}, (0.56, 0.56, 1e-3)),
     ("spool_offset", "joint 1", {}, (0.14,)),
