@@ -46,7 +46,10 @@ from analysis.terms.orifice import root_of_drop, signed_root
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 
-OPENINGS: Final = 5  # knots of |u|, the first at the null; that and the last have no value
+OPENINGS: Final = 8  # knots of |u|, the first at the null; that and the last have no value
+PACKED: Final = 3 * OPENINGS  # numbers of an edge as `packed`
+# Quantiles of |u| for the knots: overlaps of a few per cent of the stroke lie near the first.
+TRAVEL: Final = (0.0, 0.04, 0.09, 0.16, 0.27, 0.45, 0.75, LAST)
 SOFTENS: Final = 0.2  # of a bulk modulus curve's range that it may soften by: its uncertainty
 PRESSURES: Final = 4  # knots of the oil's pressure; the last has no value: it is 1/b
 BACKWARDS: Final = 0.05  # of its largest flow that an edge may reverse: uncertainty
@@ -90,7 +93,7 @@ class MeteringCurve(Effect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the spool's travel."""
         travel = evidence.of_joint(self.joint, lambda x: np.abs(x.u[:, self.joint]))
-        return knot_points(travel, (0.0, 0.2, 0.45, 0.75, LAST), low=0.0)
+        return knot_points(travel, TRAVEL, low=0.0)
 
     def _names(self, edge: str) -> tuple[str, ...]:
         return tuple(f"C_{edge}_{self.joint + 1}_at_{k}" for k in range(2, OPENINGS))
@@ -268,11 +271,17 @@ def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     i = int(par[0])
     u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
     if u > 0.0:
-        out[FLOW_CAP, i] += curve_at(u, par, 1, 5) * signed_root(bench[P_S] - cap)
-        out[FLOW_ROD, i] -= curve_at(u, par, 31, 5) * signed_root(rod - bench[P_TANK])
+        out[FLOW_CAP, i] += curve_at(u, par, 1, OPENINGS) * signed_root(bench[P_S] - cap)
+        out[FLOW_ROD, i] -= curve_at(u, par, 1 + 2 * PACKED, OPENINGS) * signed_root(
+            rod - bench[P_TANK]
+        )
     elif u < 0.0:
-        out[FLOW_CAP, i] -= curve_at(-u, par, 16, 5) * signed_root(cap - bench[P_TANK])
-        out[FLOW_ROD, i] += curve_at(-u, par, 46, 5) * signed_root(bench[P_S] - rod)
+        out[FLOW_CAP, i] -= curve_at(-u, par, 1 + PACKED, OPENINGS) * signed_root(
+            cap - bench[P_TANK]
+        )
+        out[FLOW_ROD, i] += curve_at(-u, par, 1 + 3 * PACKED, OPENINGS) * signed_root(
+            bench[P_S] - rod
+        )
 
 
 @kernel

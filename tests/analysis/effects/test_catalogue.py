@@ -329,8 +329,8 @@ REFUSED = [
     (
         "metering_curve",
         "joint 2",
-        {f"C_{e}_2_at_{k}": (3 - k) * 1e-7 for e in ("pp", "pm", "mp", "mm") for k in (2, 3, 4)},
-        (0.0, 0.05, 0.1, 0.15, 0.2),
+        {f"C_{e}_2_at_{k}": (4 - k) * 1e-7 for e in ("pp", "pm", "mp", "mm") for k in range(2, 8)},
+        (0.0, 0.02, 0.04, 0.06, 0.09, 0.12, 0.16, 0.2),
     ),
     (
         "leakage_curve",
