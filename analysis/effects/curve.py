@@ -160,7 +160,7 @@ def shown(knots: Sequence[float]) -> Array:
     return np.linspace(knots[0], knots[-1], POINTS)
 
 
-def refuse_large(y: Array, limit: float, what: str) -> str:
-    """Return that a curve (m,) exceeds a limit, in words ('' if it does not)."""
+def refuse_large(y: Array, limit: float, what: str, unit: str) -> str:
+    """Return that a curve (m,) [unit] exceeds a limit, in words ('' if it does not)."""
     most = float(np.max(np.abs(y))) if len(y) else 0.0
-    return "" if most < limit else f"{what} reaches {most:.4g}, more than {limit:.4g}"
+    return "" if most < limit else f"{what} reaches {most:.4g}, more than {limit:.4g} {unit}"

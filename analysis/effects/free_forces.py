@@ -202,7 +202,8 @@ class FrictionCurve(Friction):
         against = whole * np.sign(line.x)
         if np.min(against[line.x != 0.0]) < -DRIVES * np.max(np.abs(own)):
             return "friction would drive the piston"
-        return refuse_large(against, force_limit(rig, self.joint), "friction")
+        limit, unit = force_limit(rig, self.joint), force_unit(rig, self.joint)
+        return refuse_large(against, limit, "friction", unit)
 
 
 @kernel
@@ -320,7 +321,8 @@ class PositionForce(Effect):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject more than half of the cylinder's force."""
         y = np.array([values[name] for name in self._names()])
-        return refuse_large(y, force_limit(rig, self.joint), "the force")
+        limit, unit = force_limit(rig, self.joint), force_unit(rig, self.joint)
+        return refuse_large(y, limit, "the force", unit)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's position [m]."""

@@ -59,7 +59,7 @@ class _FreeLeakage(Effect):
         """Reject a flow (m,) [m^3/s] that pumps, or is more than half the pump's."""
         if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
             return "the leak would pump"
-        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak")
+        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak", "m³/s")
 
 
 @dataclass(frozen=True)
@@ -218,10 +218,13 @@ class LeakageAlongStroke(_FreeLeakage):
         return (Branch("leakage over position", at, weights, "m", UNIT),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a leak that pumps, and one of more than half the pump's flow."""
+        """Reject a leak that pumps, and one of more than half the pump's flow under load.
+
+        The load is half of the supply's pressure: more across the piston hardly occurs.
+        """
         knots = self.shape_of(rig, shape)
         size = spline(knots, shown(knots)) @ self._values(values)
-        return self._refused(rig, size * rig.supply.pressure)
+        return self._refused(rig, 0.5 * size * rig.supply.pressure)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's position [m]."""
