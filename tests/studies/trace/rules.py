@@ -21,7 +21,7 @@ from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, in_motion, remaining
 from analysis.trace.data import noise_floor, regression_data
-from analysis.trace.judge import gates, inference, removal, rivals
+from analysis.trace.judge import gates, held_out, inference, removal, rivals
 from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
@@ -135,6 +135,10 @@ RULES: Final = (
     Rule("rivals that matter",
          "a rival with further numbers must remove the price of each, whatever it means",
          ((rivals, "_moved_parameter", lambda *_: None),)),
+    Rule("open parameters", "a richer name that leaves another parameter open is no rival",
+         (setting("open_share", math.inf),)),
+    Rule("free run", "the held-out free run may fail with the effects or be far worse",
+         ((held_out, "worse_free_run", lambda *_: ""),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
          ((SpoolOffset, "inseparable", lambda _: ()), (SensorOffset, "inseparable", lambda _: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
@@ -151,13 +155,15 @@ RULES: Final = (
     Rule("tied sets", "of sets that cannot be separated, the one found first is named",
          ((finding, "_with_best_tied_set", lambda found, *_: found),)),
     Rule("exact forms", "the form of a gain, an offset or a mass may miss as much as any other",
-         ((gates, "form_share", lambda _: TRACE.held_out_share),)),
+         ((gates, "form_share", lambda *_: TRACE.held_out_share),)),
     Rule("unstated noise", "where nothing repeats, the noise is the stated one",
          ((engine, "unstated_noise", lambda *_: None),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
     Rule("two for one", "no effect is exchanged for two that leave less",
          ((HypothesisSet, "composites", lambda *_: []),)),
+    Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
+         ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),)),
     Rule("exact columns", "first-order columns alone find the effects",
          ((finding, "improved_by_exact_trials", lambda _sets, now: now),)),
     Rule("unknown cause", "names beside an unknown cause need no more than other names do",
