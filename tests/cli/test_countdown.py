@@ -80,8 +80,8 @@ def test_the_figures_say_which_group_comes_and_what_is_left(
                 (folder / "run-0").mkdir()
         return []
 
-    for name in ("plant", "analysis", "stream", "demo", "growth", "run", "acquisition"):
+    for name in ("plant", "analysis", "trace", "stream", "demo", "growth", "run", "acquisition"):
         monkeypatch.setattr(figures, f"{name}_figures", figures_of)
     figures.measure(10.0, 2, None, said.append)
-    assert said[0] == "plant: group 1 of 7, about 16:40 left"
-    assert said[-1] == "acquisition: group 7 of 7, about 10:00 left"
+    assert said[0] == "plant: group 1 of 8, about 17:25 left"
+    assert said[-1] == "acquisition: group 8 of 8, about 10:00 left"

@@ -22,8 +22,8 @@ def bench(
     only: Annotated[
         str | None,
         typer.Option(
-            help="One of: plant, analysis, growth, run, stream, demo, acquisition, wires, faults, "
-            "screen."
+            help="One of: plant, analysis, trace, growth, run, stream, demo, acquisition, wires, "
+            "faults, screen."
         ),
     ] = None,
     quick: Annotated[

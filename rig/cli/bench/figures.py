@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from analysis.report import paper
+from analysis.trace.engine import trace
 from drivers import make_driver, wire_at
 from protocols.files.plan import Overrides
 from rig.cli.bench import plant
@@ -24,8 +25,9 @@ from rig.cli.bench.speed.figures import free_run_figures, plant_over_kernel, rat
 from rig.cli.bench.speed.growth import growth_figures
 from rig.cli.bench.speed.run_figures import run_figures
 from rig.cli.bench.stream_figures import stream_figures
+from rig.cli.bench.timing import processor_time
 from rig.cli.bench.wire_figures import wire_figures
-from rig.cli.simulated.experiment import RIG, Experiment, experiment
+from rig.cli.simulated.experiment import HIDDEN, RIG, Experiment, experiment
 from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.cli.text.output import clock_text, table
 from rig.model import channels as ch
@@ -39,6 +41,7 @@ JUDGING_SEED = (
 # Approximate time of a group on two cores [s]; `demo`: per seed. Other groups report their own.
 SECONDS: Final = {
     "plant": 20.0, "analysis": 60.0, "stream": 60.0, "demo": 30.0, "growth": 120.0, "run": 20.0,
+    "trace": 45.0,
 }  # fmt: skip
 LONG: Final = ("wires", "faults", "screen")  # measured only with --only
 Say = Callable[[str], None]
@@ -72,6 +75,19 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
         *ratio_figures("analysis", "solve", times["solve"], ("numpy's lstsq", times["lstsq"]), 1.1),
         *ratio_figures("analysis", "identify 12 of them", times["twelve"], None, 300.0),
         *free_run_figures(load_rig(RIG)),
+    ]
+
+
+def trace_figures(folder: Path, say: Say) -> list[Figure]:
+    """Measure the trace of twelve records of a bench with a hidden effect."""
+    say("trace: 12 records of a simulated bench with a hidden effect")
+    done = experiment(folder / "hidden", JUDGING_SEED - 1, Overrides(repeats=4), _quiet, HIDDEN)
+    held_out = (*done.unseen, *done.judged)
+    times = processor_time(lambda: trace(done.runs, held_out))
+    (run,) = done.runs
+    return [
+        Figure("trace", "records", len(run.records)),
+        Figure("trace", "of them the whole trace, processor time", times.least, "s", 8.0),
     ]
 
 
@@ -151,6 +167,7 @@ def measure(
     groups: Mapping[str, Callable[[Path, Say], list[Figure]]] = {
         "plant": plant_figures,
         "analysis": analysis_figures,
+        "trace": trace_figures,
         "stream": stream_figures,
         "demo": lambda folder, progress: demo_figures(folder, progress, seeds),
         "growth": lambda _, progress: growth_figures(progress),
@@ -208,6 +225,8 @@ tuning.
   `bench`). The solvers run at the loosest tolerance, in steps of a quarter of a decade, at which no
   state is less accurate; all give the same output. The solve computes values and covariance of all
   records from their triangles, lstsq the values from all rows.
+- **trace**: twelve records of 10 s of a bench with an effect that the analysis is not told, with
+  detection limits and free runs; least of five.
 - **growth**: times against the number of records, their length, joints and effects; least of five.
 - **run**: lock-and-excite over the wire, compared with bare pymodbus sending the same requests to
   the same device: processor time of this process and wall time of a block, in virtual and real
