@@ -84,6 +84,9 @@ def between_samples(rig: Rig, seconds: float) -> str:
     )
 
 
+UNNAMED: Final = ("piston", "spool", "position", "drive")  # sensors that a place does not name
+
+
 @dataclass(frozen=True)
 class Branch:
     """One line of an effect's curve: y(x) = sum of weights (m,) times parameters, by name.
@@ -134,6 +137,9 @@ class Effect(Term):
     cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
     [SI] of the smallest size of interest on a bench of some kW at some MPa.
 
+    `amplifies` marks effects that are undone by amplifying noise (a lag): as rivals they may leave
+    more, and be true.
+
     `exact` marks effects whose equation is a definition (a gain, an offset, a delay, a mass): a
     residual that they leave is not due to an error of their form.
 
@@ -161,6 +167,7 @@ class Effect(Term):
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False
     rescales: ClassVar[bool] = False
+    amplifies: ClassVar[bool] = False
     exact: ClassVar[bool] = False
 
     @property
@@ -169,7 +176,7 @@ class Effect(Term):
         words = self.where.split()
         if words[0] == "bench":
             return "bench"
-        return " ".join(words[:2]) if words[-1] in ("piston", "spool") else self.where
+        return " ".join(words[:2]) if words[-1] in UNNAMED else self.where
 
     def variable_on(self, rig: Rig) -> str:
         """Return what the effect follows, in words; electric joints have no piston."""

@@ -4,9 +4,10 @@ They transform the data, not the model: `prepare` undoes them in the signals, an
 equations hold between the corrected signals. `correct` does the same to sampled channels, so that a
 simulation is compared with the readings of a correct sensor.
 
-`where` is `joint I cap|rod` for a chamber's pressure, `joint I piston|spool` for those sensors
-(reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure. An
-effect on all channels of a kind has the place `bench pressure|piston|spool` (reported as `bench`).
+`where` is `joint I cap|rod` for a chamber's pressure, `joint I piston|spool` for those sensors, of
+an electric joint `joint I position|drive` (reported as `joint I`: the parameter's name says which),
+and `bench` for the supply pressure. An effect on all channels of a kind has the place `bench
+pressure|piston|spool|position|drive` (reported as `bench`).
 Source: each is the first-order model of a sensor, tau y' + y = gain x(t - delay) + offset.
 """
 
@@ -34,7 +35,9 @@ from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
-KINDS: Final = {"cap": ch.CAP, "rod": ch.ROD, "piston": ch.PISTON, "spool": ch.SPOOL}
+HYDRAULIC: Final = {"cap": ch.CAP, "rod": ch.ROD, "piston": ch.PISTON, "spool": ch.SPOOL}
+ELECTRIC: Final = {"position": ch.POSITION, "drive": ch.DRIVE}
+KINDS: Final = {**HYDRAULIC, **ELECTRIC}
 MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
 
 
@@ -56,13 +59,13 @@ class Sensor(Effect):
 
     @property
     def shared(self) -> str:
-        """The kind of all channels that share it: `pressure`, `piston`, `spool` or none ('')."""
+        """The kind of all channels that share it, as `pressure` or `piston`; none: ''."""
         return self.where.removeprefix("bench").strip() if self.where.startswith("bench ") else ""
 
     @property
     def least_joints(self) -> int:
         """Return how many joints must move; with one, all pistons are that joint's."""
-        return 2 if self.shared in ("piston", "spool") else 1
+        return 2 if self.shared and self.shared != "pressure" else 1
 
     def each(self, rig: Rig) -> tuple[Sensor, ...]:
         """Return the effect at every channel that shares it."""
@@ -82,9 +85,10 @@ class Sensor(Effect):
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every channel that the model uses."""
-        joints = range(1, len(rig.joints) + 1)
-        supply = ("bench",) if rig.sensors.supply_pressure is not None else ()
-        return (*(f"joint {i} {side}" for i in joints for side in KINDS), *supply)
+        joints, sides = range(1, len(rig.joints) + 1), ELECTRIC if rig.electric else HYDRAULIC
+        measured = not rig.electric and rig.sensors.supply_pressure is not None
+        supply = ("bench",) if measured else ()
+        return (*(f"joint {i} {side}" for i in joints for side in sides), *supply)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return nothing: a sensor's error is in every column."""
@@ -113,9 +117,11 @@ class Sensor(Effect):
             return replace(signals, p_s=self.undone(signals.p_s, 0, signals.rate, value))
         if self.side == "piston":
             return self._moved(rig, signals, value)
-        fields = {"spool": ("u",), "cap": ("p_cap", "pd_cap"), "rod": ("p_rod", "pd_rod")}
+        if self.side == "position":
+            return self._turned(signals, value)
+        fields = {"cap": ("p_cap", "pd_cap"), "rod": ("p_rod", "pd_rod")}
         new = {}
-        for order, field in enumerate(fields[self.side]):
+        for order, field in enumerate(fields.get(self.side, ("u",))):
             new[field] = getattr(signals, field).copy()
             x = new[field][:, self.joint]
             new[field][:, self.joint] = self.undone(x, order, signals.rate, value)
@@ -148,6 +154,18 @@ class Sensor(Effect):
         turn[:, i:] = (q - signals.q[:, i])[:, None]
         return replace(signals, theta=signals.theta + turn, **new)
 
+    def _turned(self, signals: Signals, value: float) -> Signals:
+        """Return the signals with another position of an electric joint."""
+        i, new = self.joint, {}
+        for order, names in enumerate((("s", "q"), ("sd", "qd"), ("qdd",))):
+            x = self.undone(getattr(signals, names[-1])[:, i], order, signals.rate, value)
+            for name in names:
+                new[name] = getattr(signals, name).copy()
+                new[name][:, i] = x
+        turn = np.zeros_like(signals.theta)
+        turn[:, i:] = (new["q"][:, i] - signals.q[:, i])[:, None]
+        return replace(signals, theta=signals.theta + turn, **new)
+
     def correct(
         self, rig: Rig, channels: Mapping[str, Array], rate: float, shape: Sequence[float]
     ) -> dict[str, Array]:
@@ -165,8 +183,9 @@ class Sensor(Effect):
         return self.outside(rig, shape)
 
     def plotted(self) -> str:
-        """Name the channel's quantity, of a piston its velocity."""
-        return {"spool": "spool", "piston": "velocity"}.get(self.shared or self.side, "pressure")
+        """Name the channel's quantity, of a position its velocity."""
+        names = {"spool": "spool", "drive": "drive", "piston": "velocity", "position": "velocity"}
+        return names.get(self.shared or self.side, "pressure")
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the channel, in the rows in which it occurs first."""
@@ -178,6 +197,9 @@ class Sensor(Effect):
             joints = range(signals.joints)
             return {equation(kind, i): signals.p_s for kind in kinds for i in joints}
         i = self.joint
+        if self.side in ELECTRIC:
+            x = signals.u if self.side == "drive" else signals.sd
+            return {equation("torque", i): self._shown(x, signals.rate)}
         flows = (equation("flow_cap", i), equation("flow_rod", i))
         if self.side == "spool":
             return dict.fromkeys(flows, self._shown(signals.u, signals.rate))
@@ -196,10 +218,14 @@ class Sensor(Effect):
 class Late(Sensor):
     """Common parts of delays and lags, which may act on all channels of a kind."""
 
+    hydraulic: ClassVar[bool] = False
+
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return every channel, then all pressures, and all pistons or spools of several joints."""
-        kinds = ("pressure", "piston", "spool") if len(rig.joints) > 1 else ("pressure",)
+        """Return every channel, then all of a kind, where these are several."""
+        kinds: tuple[str, ...] = () if rig.electric else ("pressure",)
+        if len(rig.joints) > 1:
+            kinds = (*kinds, *(ELECTRIC if rig.electric else ("piston", "spool")))
         return (*super().all_places(rig), *(f"bench {kind}" for kind in kinds))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
@@ -208,9 +234,9 @@ class Late(Sensor):
         return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds, and a spool delay within its path between samples."""
-        spool = "spool" in (self.side, self.shared)
-        bent = between_samples(rig, self.shape_of(rig, shape)[0]) if spool else ""
+        """Reject a shape at its bounds, and a delay of an input within its path between samples."""
+        held = not {"spool", "drive"}.isdisjoint((self.side, self.shared))
+        bent = between_samples(rig, self.shape_of(rig, shape)[0]) if held else ""
         return super().problem(rig, values, shape) or bent
 
     def plotted(self) -> str:
@@ -261,6 +287,7 @@ class SensorLag(Late):
     """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter."""
 
     name: ClassVar[str] = "sensor_lag"
+    amplifies: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     variable: ClassVar[str] = "the channel's rate"
     confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "spool_lag", "dead_volume")

@@ -26,6 +26,7 @@ Box = tuple[float, float, float, float]  # left, bottom, right, top in units of 
 WIDTH: Final = 10.5  # of a joint's column
 CHAMBERS: Final = ("cap", "rod")
 SENSORS: Final = ("cap sensor", "rod sensor", "piston sensor", "spool sensor")
+ELECTRIC_SENSORS: Final = ("position sensor", "drive sensor")
 # Positions of the elements in a column; names without a number belong to the bench.
 HYDRAULIC: Final[dict[str, Box]] = {
     "cap": (1.2, 6.0, 3.6, 7.4), "piston": (3.6, 5.9, 4.1, 7.5), "rod": (4.1, 6.0, 7.0, 7.4),
@@ -88,16 +89,16 @@ def _sensors(
     rig: Rig, kind: type[Any], where: str, joints: Sequence[str], words: str
 ) -> tuple[str, ...]:
     """Return the sensors of a place that a sensor effect can act on, or those of `words`."""
-    stated = [
-        side for side in ("supply", *CHAMBERS, "piston", "spool", "pressure") if side in words
-    ]
+    sensors = ELECTRIC_SENSORS if rig.electric else SENSORS
+    known_sides = ("supply", *(sensor.split()[0] for sensor in sensors), "pressure")
+    stated = [side for side in known_sides if side in words]
     there = [place.split() for place in kind.places(rig) if kind(place).place == where]
     sides = stated[:1] or ["supply" if place == ["bench"] else place[-1] for place in there]
     if "supply" in sides:
         return ("supply sensor",)
     if "pressure" in sides:
         sides += CHAMBERS
-    return tuple(f"{s} {i}" for i in joints for s in SENSORS if s.split()[0] in sides)
+    return tuple(f"{s} {i}" for i in joints for s in sensors if s.split()[0] in sides)
 
 
 def places(result: Trace) -> Markup | None:

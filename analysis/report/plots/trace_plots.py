@@ -345,10 +345,11 @@ def _unit_of_variable(rig: Rig, name: str) -> str:
         return rig.unit_of(name)
     way = rig.unit_of(ch.channel(rig.position_kind, 1))
     spool, pressure = ch.UNITS[ch.SPOOL], ch.UNITS[ch.SUPPLY]
+    drive = rig.unit_of(ch.channel(rig.drive_kind, 1))
     return {
         "position": way, "velocity": f"{way}/s", "acceleration": f"{way}/s^2",
         "joint position": way if rig.electric else "rad", "absolute angle": "rad",
-        "spool": spool, "spool rate": f"{spool}/s",
+        "spool": spool, "spool rate": f"{spool}/s", "drive": drive, "drive rate": f"{drive}/s",
         "pressure": pressure, "pressure difference": pressure,
         "pressure across the leak": pressure, "pressure rate": f"{pressure}/s",
         "flow drawn": "m^3/s", "flow returned": "m^3/s", "time": "s",

@@ -75,11 +75,11 @@ def conditioned_records(
 def is_hidden_by_lock(term: Term, conditioned: ConditionedRecord) -> bool:
     """Return whether an effect cannot show in a record because its joint is locked there.
 
-    An error of the piston sensor shows in a locked joint too, by the position where it stands.
+    An error of a position sensor shows in a locked joint too, by the position where it stands.
     """
     where = term.where
-    piston = getattr(term, "stage", None) == SENSOR and where.endswith("piston")
-    if not where.startswith("joint ") or piston:
+    place = getattr(term, "stage", None) == SENSOR and where.endswith(("piston", "position"))
+    if not where.startswith("joint ") or place:
         return False
     return int(where.split()[1]) in conditioned.record.locked
 

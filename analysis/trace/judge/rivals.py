@@ -68,9 +68,8 @@ def rivals_of(
         ):
             continue
         ratio = held_out_test.ratio(rival_residual)
-        tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
-            alike or ratio < TRACE.decisive_ratio
-        )
+        near = TRACE.tie_ratio_training if other.amplifies else TRACE.tie_ratio
+        tied = held_out_test.ties(rival_residual, near) and (alike or ratio < TRACE.decisive_ratio)
         own = judged_effect.family if same_law else ""
         moved = _moved_parameter(train_data, winner, hypothesis, own) if tied else None
         # However many numbers it has: a free form has no parameters to compare.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,26 @@ def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> No
     arm = {e.name for e in catalogue(load_rig("electric-2dof"))}
     assert "payload" in arm
     assert "base_inclination" not in arm  # that rig's inclination is a parameter already
+
+
+def test_a_drive_that_is_recorded_late_is_named_with_its_delay() -> None:
+    def late(run: Run) -> Run:
+        drives = [np.roll(one.channels["drive_1"], 3) for one in run.records]
+        return replace(
+            run,
+            records=tuple(
+                replace(one, channels={**one.channels, "drive_1": drive})
+                for one, drive in zip(run.records, drives, strict=True)
+            ),
+        )
+
+    plain = Carriage(dry=0.0, offset=0.0)
+    train, unseen = (late(experiment(plain, *how)) for how in ((3, 0.05, 0.25), (4, 0.07, 0.2)))
+    result = trace([train], [unseen], look_ahead=False)
+    first = result.effects[0]
+    assert (first.name, first.at, first.where) == ("channel_delay", "joint 1 drive", "joint 1")
+    assert first.parameters["delay_drive_1"].value == pytest.approx(3e-3, rel=0.02)
+    assert result.tied in ([], [("sensor_lag", "joint 1")])
 
 
 def test_a_revolute_joint_rubs_along_an_angle() -> None:
