@@ -20,6 +20,7 @@ from analysis.terms.base import (
     P_ROD,
     P_S,
     P_TANK,
+    Array,
     Coefficient,
     Columns,
     Kernel,
@@ -95,13 +96,12 @@ def signed_root(drop):  # type: ignore[no-untyped-def]
     return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
 
 
-@njit(cache=True)
-def root_of_drop(drop):  # type: ignore[no-untyped-def]
-    """Return the signed roots [Pa^0.5] of pressure drops (n,) [Pa]."""
-    out = np.empty_like(drop)
-    for k in range(len(drop)):
-        out[k] = signed_root(drop[k])
-    return out
+def root_of_drop(drop: Array) -> Array:
+    """Return the signed roots [Pa^0.5] of pressure drops (n,) [Pa].
+
+    Not compiled: loading compiled code takes longer than the roots of an identification.
+    """
+    return np.copysign(np.sqrt(np.abs(drop)), drop)
 
 
 @kernel
