@@ -119,7 +119,7 @@ def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
     boxes = elements(rig)
     left = -1.4 if rig.electric else -3.2
     right = WIDTH * len(rig.joints) + 1.0
-    low, high = (1.8, 6.2) if rig.electric else (-0.5, 9.7)
+    low, high = (1.8, 6.7) if rig.electric else (-0.5, 9.7)
     with style():
         canvas = figure(0.3 * len(lines) + (CARD * 2) * min((high - low) / (right - left), 0.5),
                       CARD * 2)  # fmt: skip
@@ -169,10 +169,11 @@ def _block(axes: Any, box: Box, words: str, colour: str = "white") -> None:
     )  # fmt: skip
 
 
-def _pin(axes: Any, box: Box, number: int) -> None:
+def _pin(axes: Any, box: Box, number: int, label: float = 0.3) -> None:
+    """Draw a joint, its name `label` above it."""
     middle = (0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]))
     axes.add_patch(Circle(middle, 0.5, fc="white", ec=INK, lw=1.4, zorder=3))
-    axes.text(box[2] - 0.05, box[3] + 0.3, f"joint {number}", ha="right", va="bottom", fontsize=8)
+    axes.text(box[2] - 0.05, box[3] + label, f"joint {number}", ha="right", va="bottom", fontsize=8)
 
 
 def _hydraulic(axes: Any, x: float, number: int) -> None:
@@ -204,8 +205,8 @@ def _electric(axes: Any, x: float, number: int) -> None:
     _line(axes, (x + 2.9, 4.2), (x + 2.9, 4.9))
     _line(axes, (x + 6.9, 3.9), (x + 6.9, 4.6))
     _block(axes, at["drive"], f"drive {number}")
-    _pin(axes, at["joint"], number)
-    for name in ("position sensor", "drive sensor"):
+    _pin(axes, at["joint"], number, label=-1.6)  # the sensor is above
+    for name in ELECTRIC_SENSORS:
         _sensor(axes, at[name], LETTERS[name])
 
 
