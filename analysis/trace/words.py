@@ -115,15 +115,21 @@ def _constant(variable: str) -> bool:
 
 
 def _effect(effect: JudgedEffect, rig: Rig) -> str:
-    """Return name, place and numbers; of a free curve its range instead of values at knots."""
+    numbers = ", ".join(numbers_in_words(effect, rig))
+    return f"{effect.name.replace('_', ' ')} at {effect.location} ({numbers})"
+
+
+def numbers_in_words(effect: JudgedEffect, rig: Rig) -> list[str]:
+    """Return an effect's numbers; of a free curve its range instead of values at knots."""
     values, hidden = [_curve_range(c) for c in effect.curves if effect.free], set[str]()
-    if values:
-        hidden = {c.parameter for c in make(effect.name, effect.at).coefficients(rig)}
+    if effect.free:
+        term = make(effect.name, effect.at or effect.where)
+        hidden = {c.parameter for c in term.coefficients(rig)}
     for n, e in effect.parameters.items():
         if n not in hidden:
             link = " not determined: " if _undetermined(effect, n) else " = "
             values.append(f"{n}{link}{quantity(e)}")
-    return f"{effect.name.replace('_', ' ')} at {effect.location} ({', '.join(values)})"
+    return values
 
 
 def _curve_range(curve: Curve) -> str:

@@ -8,19 +8,26 @@ from collections.abc import Sequence
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.loop_rounds import Round
 from analysis.trace.result import JudgedEffect, Trace
-from analysis.trace.words import free_run_row, quantity, shot_in_words, unit_of_equation
+from analysis.trace.words import (
+    free_run_row,
+    numbers_in_words,
+    shot_in_words,
+    unit_of_equation,
+)
 from rig.cli.text.output import table
 from rig.model.channels import place_in_words
+from rig.model.rig import Rig
 from rig.model.units import RESULTS, display_unit, plain, typeset
 
 
 def trace_text(result: Trace) -> str:
     """Return verdict, effects with their tests, errors, clues and the next experiment as text."""
+    rig = result.model_before.rig
     lines = [f"verdict: {result.verdict}", "", result.sentence, ""]
     for effect in result.effects:
-        lines += _effect(effect)
+        lines += _effect(effect, rig)
     for effect in result.refused:
-        lines += ["fitted best, but not named:", *_effect(effect)]
+        lines += ["fitted best, but not named:", *_effect(effect, rig)]
     lines += [_errors(result), ""]
     if result.fit_before:
         lines += [_free_runs(result), ""]
@@ -77,9 +84,9 @@ def _share(error: float | None, size: float | None) -> str:
     return f"{100 * error / size:.1f} %" if error is not None and size else ""
 
 
-def _effect(effect: JudgedEffect) -> list[str]:
-    values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
-    lines = [f"{effect.name} at {effect.location}: {values}"]
+def _effect(effect: JudgedEffect, rig: Rig) -> list[str]:
+    numbers = ", ".join(numbers_in_words(effect, rig))
+    lines = [f"{effect.name} at {effect.location}{f': {numbers}' if numbers else ''}"]
     if effect.shot:
         lines.append(f"  {shot_in_words(effect)}")
     lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in effect.gates]
