@@ -14,7 +14,6 @@ from analysis.trace.data.noise_floor import (
     NEIGHBOURS,
     OTHER_STEPS,
     PERIODS,
-    REPEATS,
     STATED,
     UNSTATED,
 )
@@ -50,9 +49,11 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
             f"noise in {most.equation}, follows no variable of the records: it counts as noise; "
             "repeat a record to measure the noise"
         )
-    elif not sources <= {REPEATS, OTHER_STEPS, STATED}:
-        where = PERIODS if PERIODS in sources else NEIGHBOURS
-        out.append(f"one repeat per step: the noise floor comes from {where} within the record")
+    for where in (PERIODS, NEIGHBOURS):
+        steps = sorted({f.group[1] for f in train_data.floors if f.source == where})
+        if steps:
+            words = f"one repeat of {' '.join(steps)}: the noise floor comes from {where}"
+            out.append(f"{words} within the record")
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     every = (*train_data.floors, *holdout_data.floors)
