@@ -26,6 +26,7 @@ from numba import njit
 from scipy.special import erf
 
 from analysis.effects.base import Array, Shape
+from rig.model import channels as ch
 from rig.model.rig import Rig
 
 SHEAR: Final = 0.02  # of the bore: a third of a seal's section, which is a fifteenth of the bore
@@ -76,7 +77,7 @@ def contact_range(rig: Rig, joint: int) -> ContactRange:
 
 def path_unit(rig: Rig, joint: int) -> str:
     """Return the unit of a joint's path of friction: m, or rad of a revolute drive."""
-    return str(getattr(rig.joints[joint], "position_unit", "m"))
+    return rig.unit_of(ch.channel(rig.position_kind, joint + 1))
 
 
 def presliding(name: str, among: ContactRange) -> Shape:
