@@ -53,6 +53,11 @@ DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its un
 LEVEL: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=np.float64)
 
 
+def _refuse_large_force(rig: Rig, joint: int, y: Array, what: str) -> str:
+    """Return that a curve (m,) exceeds half of the joint's force, in words ('' if not)."""
+    return refuse_large(y, force_limit(rig, joint), what, force_unit(rig, joint))
+
+
 @dataclass(frozen=True)
 class FrictionCurve(Friction):
     """F_f = max(0, 1 + k x) (z f(|s'|) + |z| g(|s'|)): friction over speed by direction.
@@ -202,8 +207,7 @@ class FrictionCurve(Friction):
         against = whole * np.sign(line.x)
         if np.min(against[line.x != 0.0]) < -DRIVES * np.max(np.abs(own)):
             return "friction would drive the piston"
-        limit, unit = force_limit(rig, self.joint), force_unit(rig, self.joint)
-        return refuse_large(against, limit, "friction", unit)
+        return _refuse_large_force(rig, self.joint, against, "friction")
 
 
 @kernel
@@ -321,8 +325,7 @@ class PositionForce(Effect):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject more than half of the cylinder's force."""
         y = np.array([values[name] for name in self._names()])
-        limit, unit = force_limit(rig, self.joint), force_unit(rig, self.joint)
-        return refuse_large(y, limit, "the force", unit)
+        return _refuse_large_force(rig, self.joint, y, "the force")
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's position [m]."""

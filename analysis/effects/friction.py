@@ -112,14 +112,8 @@ class Friction(Effect):
             return ()
         place = self._speed_place()
         none = (0.0,) * (place - self.before)
-        return (
-            (
-                *shape[: self.before],
-                *none,
-                contact_range(rig, self.joint).speed,
-                *shape[place + 1 :],
-            ),
-        )
+        speed = contact_range(rig, self.joint).speed
+        return ((*shape[: self.before], *none, speed, *shape[place + 1 :]),)
 
     def _speed_place(self) -> int:
         """Return the place of the transition speed in a shape, the last of the contact's own."""
@@ -295,13 +289,8 @@ class StribeckFriction(Friction):
         """Return the Stribeck speed [m/s], presliding distance [m] and transition speed [m/s]."""
         speed = rig.joints[self.joint].limits.speed
         grid = (0.01 * speed, 0.03 * speed, 0.1 * speed)
-        own = Shape(
-            self.shape_names()[0],
-            f"{path_unit(rig, self.joint)}/s",
-            2e-3 * speed,
-            0.4 * speed,
-            grid,
-        )
+        unit = f"{path_unit(rig, self.joint)}/s"
+        own = Shape(self.shape_names()[0], unit, 2e-3 * speed, 0.4 * speed, grid)
         return (own, *super().shapes(rig))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:

@@ -19,7 +19,7 @@ from analysis.trace.engine import trace
 from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
 from rig.cli.main import app
 from rig.cli.text.trace_text import trace_text
-from rig.model.records import Run
+from rig.model.records import Record, Run
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.rigs import load_rig
 from rig.tui.pages.trace import errors_of
@@ -116,14 +116,11 @@ def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> No
 
 def test_a_drive_that_is_recorded_late_is_named_with_its_delay() -> None:
     def late(run: Run) -> Run:
-        drives = [np.roll(one.channels["drive_1"], 3) for one in run.records]
-        return replace(
-            run,
-            records=tuple(
-                replace(one, channels={**one.channels, "drive_1": drive})
-                for one, drive in zip(run.records, drives, strict=True)
-            ),
-        )
+        def delayed(one: Record) -> Record:
+            drive = np.roll(one.channels["drive_1"], 3)
+            return replace(one, channels={**one.channels, "drive_1": drive})
+
+        return replace(run, records=tuple(map(delayed, run.records)))
 
     plain = Carriage(dry=0.0, offset=0.0)
     train, unseen = (late(experiment(plain, *how)) for how in ((3, 0.05, 0.25), (4, 0.07, 0.2)))
