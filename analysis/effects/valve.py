@@ -13,6 +13,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 from numba import njit
+from scipy.linalg import expm
 
 from analysis.effects.base import (
     EDGES,
@@ -202,14 +203,19 @@ class SpoolOffset(ValveEffect):
 
 TAKEN_UP: Final = 5e-4  # [s] time constant of the play in simulation
 QUICKEST: Final = 1e-4  # [s] time constant that the integrator can follow
+# Damping ratios of spools: with a larger one the quicker of two poles hardly shows.
+DAMPING_BOUNDS: Final = (0.3, 1.5)
+DAMPING_START: Final = 0.8
 
 
 @dataclass(frozen=True)
 class SpoolLag(ValveEffect):
     """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003).
 
-    x is a hidden state; the rows use the exact response to the sampled spool, linear between
-    samples.
+    With a damping ratio zeta, a detail of the form, the lag is of second order: with the natural
+    frequency w = 2 zeta / tau, so that tau remains the delay of slow motion, d2x/dt2 + 2 zeta w
+    dx/dt + w^2 x = w^2 u (Merritt 1967, as data sheets of valves state it). x and dx/dt are hidden
+    states; the rows use the exact response to the sampled spool, linear between samples.
     """
 
     mechanism: ClassVar[str] = "spool_dynamics"
@@ -230,17 +236,21 @@ class SpoolLag(ValveEffect):
         return _lag
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the time constant."""
-        return (f"tau_spool_{self.joint + 1}",)
+        """Name the time constant and the damping ratio."""
+        return (f"tau_spool_{self.joint + 1}", f"zeta_spool_{self.joint + 1}")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the time constant [s]."""
+        """Return the time constant [s] and the damping ratio [-]."""
+        tau, zeta = self.shape_names()
         grid = (5e-4, 2e-3, 1e-2, 4e-2)
-        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
+        return (
+            Shape(tau, "s", 0.0, longest_lag(rig), grid, 0.0),
+            Shape(zeta, "", *DAMPING_BOUNDS, (DAMPING_START,), saturates=True, detail=True),
+        )
 
     def hidden(self, rig: Rig) -> int:
-        """Return 1: the opening."""
-        return 1
+        """Return 2: the opening and its rate."""
+        return 2
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Delay the spool's signal by the lag."""
@@ -249,9 +259,14 @@ class SpoolLag(ValveEffect):
     def hidden_path(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
-        """Return the opening (n, 1) [V]."""
+        """Return the opening [V] and its rate [V/s], (n, 2); the rate of a first order as 0."""
         u = np.ascontiguousarray(signals.u[:, self.joint])
-        return lagged(u, self.shape_of(rig, shape)[0] * signals.rate)[:, None]
+        tau, zeta = self.whole(rig, shape)
+        samples = tau * signals.rate
+        if zeta:
+            path: Array = second_order(u, samples, zeta) * (1.0, signals.rate)
+            return path
+        return np.column_stack((lagged(u, samples), np.zeros(len(u))))
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a shape at its bounds, and a lag that a path between samples may cause."""
@@ -259,13 +274,29 @@ class SpoolLag(ValveEffect):
             rig, self.shape_of(rig, shape)[0]
         )
 
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the natural frequency and the damping ratio of a lag of second order."""
+        tau, zeta = self.whole(rig, shape)
+        if not zeta:
+            return ""
+        return (
+            f"the spool's lag is of second order, with a natural frequency of "
+            f"{zeta / (math.pi * tau):.3g} Hz and a damping ratio of {zeta:.2g}; "
+            f"tau_spool_{self.joint + 1} is its delay in slow motion"
+        )
+
     def fastest(self, shape: Sequence[float]) -> float:
-        """Return 1 / tau, as simulated."""
-        return 1.0 / max(shape[0], QUICKEST) if len(shape) else 0.0
+        """Return the rate [1/s] of the quickest pole, as simulated."""
+        if not len(shape):
+            return 0.0
+        zeta = shape[1] if len(shape) > 1 else 0.0
+        quicker = 2.0 * zeta * (zeta + math.sqrt(max(zeta * zeta - 1.0, 0.0)))
+        return max(1.0, 2.0 * zeta, quicker) / max(shape[0], QUICKEST)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, time constant, kept above what the integrator can follow."""
-        return np.array([self.joint, max(self.shape_of(rig, shape)[0], QUICKEST)])
+        """Return joint, time constant, kept above what the integrator can follow, and damping."""
+        tau, zeta = self.whole(rig, shape)
+        return np.array([self.joint, max(tau, QUICKEST), zeta])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the spool's velocity [V/s]."""
@@ -276,6 +307,20 @@ class SpoolLag(ValveEffect):
 def lagged(u: Array, tau: float) -> Array:
     """Return the response (n,) of a first-order lag of `tau` samples, at rest before the first."""
     return u if tau < 1e-3 else np.asarray(_lagged(u, tau))
+
+
+def second_order(u: Array, tau: float, zeta: float) -> Array:
+    """Return the response and its rate per sample (n, 2) of a lag of second order.
+
+    Its delay in slow motion is `tau` samples and its damping ratio `zeta`; it is at rest before the
+    first sample. Exact for u linear between samples (Van Loan 1978: the matrix exponential of the
+    states with the input and its slope).
+    """
+    frequency = 2.0 * zeta / max(tau, 1e-3)
+    rates = np.zeros((4, 4))
+    rates[0, 1] = rates[2, 3] = 1.0
+    rates[1] = -(frequency**2), -2.0 * zeta * frequency, frequency**2, 0.0
+    return np.asarray(_second_order(u, np.ascontiguousarray(expm(rates)[:2])))
 
 
 @dataclass(frozen=True)
@@ -355,6 +400,21 @@ def _lagged(u, tau):  # type: ignore[no-untyped-def]
     return x
 
 
+@njit(cache=True)
+def _second_order(u, step):  # type: ignore[no-untyped-def]
+    # A row of `step`: weights of the two states, of the input and of its slope.
+    x = np.zeros((len(u), 2))
+    x[0, 0] = u[0]
+    for k in range(1, len(u)):
+        slope = u[k] - u[k - 1]
+        for i in range(2):
+            x[k, i] = (
+                step[i, 0] * x[k - 1, 0] + step[i, 1] * x[k - 1, 1]
+                + step[i, 2] * u[k - 1] + step[i, 3] * slope
+            )  # fmt: skip
+    return x
+
+
 @kernel
 def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE:
@@ -373,7 +433,13 @@ def _offset(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def
 def _lag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE:
         i = int(par[0])
-        dz[0] = (x[U, i] - z[0]) / par[1]
+        if par[2] > 0.0:
+            frequency = 2.0 * par[2] / par[1]
+            dz[0] = z[1]
+            dz[1] = frequency * (frequency * (x[U, i] - z[0]) - 2.0 * par[2] * z[1])
+        else:
+            dz[0] = (x[U, i] - z[0]) / par[1]
+            dz[1] = -z[1] / par[1]
         x[U, i] = z[0]
 
 

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
 from analysis.effects.base import SUPPLY, Effect, Evidence, ordered
 from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth
+from analysis.effects.valve import second_order
 from analysis.identify.identify import identify
 from analysis.regression.rows import right_sides
 from analysis.signals.conditioning import Signals
@@ -285,20 +287,42 @@ def test_hidden_states_move_as_the_rows_say(rig: Rig) -> None:
     signals.u[:] = 0.1 * np.sin(2 * np.pi * 5 * t)[:, None]
     signals.p_cap[:] = 3e6 + 5e5 * np.sin(2 * np.pi * 3 * t)[:, None]
     signals.p_rod[:] = 4e6
-    for name in ("coulomb_friction", "pressure_dependent_friction", "spool_lag"):
+    for name, shape in (
+        ("coulomb_friction", (1e-4, 40.0)), ("pressure_dependent_friction", (1e-4, 40.0)),
+        ("spool_lag", (3e-3,)), ("spool_lag", (3e-3, 0.6)), ("spool_lag", (3e-3, 1.4)),
+    ):  # fmt: skip
         e = effect(name, "joint 2")
-        shape = (1e-4, 40.0) if e.family == "friction" else (3e-3,)
-        memory = hidden_state(e, rig, signals, shape)
-        slope = np.gradient(memory, 1 / rate)
+        if e.prepares:
+            memory = e.hidden_path(rig, signals, {}, shape)[:, : len(shape)]
+        else:
+            memory = hidden_state(e, rig, signals, shape)[:, None]
+        slope = np.gradient(memory, 1 / rate, axis=0)
         par = packed(e, rig, shape)[1]
-        scale = np.abs(slope).max()
+        scale = np.abs(slope[500:]).max(axis=0)
         for k in range(500, 5500, 97):
             x, bench = observed(signals, k)
-            dz = np.zeros(1)
+            z, dz = np.zeros(e.hidden(rig)), np.zeros(e.hidden(rig))
+            z[: memory.shape[1]] = memory[k]
             out, M = np.zeros((base.OUT_ROWS, 2)), np.zeros((2, 2))
             phase = base.PREPARE if e.prepares else base.CONTRIBUTE
-            e.kernel.function(phase, bench, x, memory[k : k + 1].copy(), par, out, M, dz)
-            assert dz[0] == pytest.approx(slope[k], abs=0.03 * scale), (name, k)
+            e.kernel.function(phase, bench, x, z, par, out, M, dz)
+            for i in range(memory.shape[1]):
+                assert dz[i] == pytest.approx(slope[k, i], abs=0.03 * scale[i]), (name, shape, k)
+
+
+@pytest.mark.parametrize("zeta", [0.3, 0.8, 1.0, 1.5])
+def test_a_lag_of_second_order_is_that_of_another_library(zeta: float) -> None:
+    """Linear between samples, at rest before the first, its delay in slow motion as stated."""
+    u = np.random.default_rng(2).standard_normal(400)
+    time = 1e-3 * np.arange(len(u))
+    tau = 4e-3
+    w = 2.0 * zeta / tau
+    _, x, states = lsim(([w * w], [1.0, 2.0 * zeta * w, w * w]), u - u[0], time)
+    path = second_order(u, tau * 1e3, zeta)
+    assert path[:, 0] == pytest.approx(x + u[0], abs=1e-9)
+    assert 1e3 * path[:, 1] == pytest.approx(w * w * states[:, 0], abs=1e-6)
+    ramp = second_order(time, tau * 1e3, zeta)[:, 0]
+    assert time[-1] - ramp[-1] == pytest.approx(tau, rel=1e-6)
 
 
 REFUSED = [

@@ -38,8 +38,8 @@ TANH, SIGMOID, KARNOPP = range(3)
 (
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
-    STIFFER, BACK_POWER, SPRING_REST, KNEE, TIGHTER, WORN,
-) = range(27)  # fmt: skip
+    STIFFER, BACK_POWER, SPRING_REST, KNEE, TIGHTER, WORN, SPOOL, SPOOL_DAMPING,
+) = range(29)  # fmt: skip
 MIDDLE = -1.44  # [rad] where springs are at rest
 
 
@@ -61,7 +61,8 @@ class Hidden:
     to the `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure;
     within `knee` [V] of the null the edges have half their gain; the levels of dry friction grow by
     e with every 1 / `tighter` [m] of the stroke; at mid-stroke, about 1 cm wide, the leak is 1 +
-    `worn` times as large.
+    `worn` times as large; the opening follows the spool's signal by a lag of second order
+    of natural frequency `spool_frequency` [Hz] and damping ratio `spool_damping`.
     """
 
     ahead: float = 0.0
@@ -91,6 +92,8 @@ class Hidden:
     knee: float = 0.0
     tighter: float = 0.0
     worn: float = 0.0
+    spool_frequency: float = 0.0
+    spool_damping: float = 0.7
 
     @property
     def array(self) -> Array:
@@ -203,7 +206,13 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
     q, w, cap, rod = y[0], y[1], y[2], y[3]
     s, G = _linkage(q)
     v = G * w
-    u = _opening(drive - CENTRING * s, held, hidden)[0]
+    u = drive - CENTRING * s
+    out[5] = out[6] = 0.0
+    if hidden[SPOOL] > 0.0:
+        rate = 2.0 * math.pi * hidden[SPOOL]
+        out[5], out[6] = y[6], rate * (rate * (u - y[5]) - 2.0 * hidden[SPOOL_DAMPING] * y[6])
+        u = y[5]
+    u = _opening(u, held, hidden)[0]
     p_s = _supply(cap, rod, u, par, hidden[SAG])
     out[4] = 0.0
     if hidden[SAG_LAG] > 0.0:
@@ -241,14 +250,15 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
 
 @njit(cache=True)
 def _integrated(start, steps, q1, par, hidden, drive, bias, coarse):
-    """States (steps + 1, 5): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa].
+    """States (steps + 1, 7): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa].
 
+    The last two are the opening [V] and its rate [V/s] of a spool with a natural frequency.
     `drive` [V] is a period of the excitation at every half of STEP; steps are `coarse` of those.
     """
     dt = coarse * STEP
-    y, z, out = start.copy(), start.copy(), np.zeros((steps + 1, 5))
+    y, z, out = start.copy(), start.copy(), np.zeros((steps + 1, 7))
     out[0] = y
-    a, b, c, d = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5)
+    a, b, c, d = np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(7)
     after = bias + drive[0]
     held = after - CENTRING * _linkage(y[0])[0]
     for k in range(steps):
@@ -256,16 +266,16 @@ def _integrated(start, steps, q1, par, hidden, drive, bias, coarse):
         before, middle = after, bias + drive[coarse * (2 * k + 1) % len(drive)]
         after = bias + drive[coarse * (2 * k + 2) % len(drive)]
         _rates(y, t, q1, par, hidden, before, held, a)
-        for i in range(5):
+        for i in range(7):
             z[i] = y[i] + 0.5 * dt * a[i]
         _rates(z, t + 0.5 * dt, q1, par, hidden, middle, held, b)
-        for i in range(5):
+        for i in range(7):
             z[i] = y[i] + 0.5 * dt * b[i]
         _rates(z, t + 0.5 * dt, q1, par, hidden, middle, held, c)
-        for i in range(5):
+        for i in range(7):
             z[i] = y[i] + dt * c[i]
         _rates(z, t + dt, q1, par, hidden, after, held, d)
-        for i in range(5):
+        for i in range(7):
             y[i] += dt / 6.0 * (a[i] + 2.0 * b[i] + 2.0 * c[i] + d[i])
         held = _opening(after - CENTRING * _linkage(y[0])[0], held, hidden)[1]
         out[k + 1] = y
@@ -276,7 +286,7 @@ def _states(hidden: Hidden, drive: Array, bias: float, seconds: float, coarse: i
     q1, q2 = angle(0.0, 0), angle(0.0, 1)
     par = np.array([TRUTH[name] for name in NAMES_1])
     hold = TRUTH["W2"] * 9.8 * math.sin(q1 + q2) / _linkage(q2)[1]
-    start = np.array([q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0])
+    start = np.array([q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0, 0.0, 0.0])
     steps = round((SETTLE + seconds) / (coarse * STEP))
     return np.asarray(_integrated(start, steps, q1, par, hidden.array, drive, bias, coarse))
 

@@ -390,6 +390,26 @@ def test_what_stands_between_the_world_and_the_records_is_named(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
 
 
+def test_a_spool_of_second_order_is_one_lag_with_its_damping_and_leaves_the_bulk_modulus(
+    rig: Rig,
+) -> None:
+    """The valve has no sensor: its command stands for the spool, whose natural frequency is 90 Hz.
+
+    A lag of first order makes b 4 % too small.
+    """
+    hidden = Hidden(spool_frequency=90.0, spool_damping=0.75)
+    result = traced(rig, hidden, "spool_lag", "channel_delay", "sensor_lag")
+    assert result.verdict == "explained"
+    (lag,) = result.effects
+    assert (lag.name, lag.where) == ("spool_lag", "joint 2")
+    delay = 2.0 * 0.75 / (2.0 * np.pi * 90.0)
+    assert lag.parameters["tau_spool_2"].value == pytest.approx(delay, rel=0.01)
+    assert lag.parameters["zeta_spool_2"].value == pytest.approx(0.75, rel=0.1)
+    low, high = result.model_after.parameters["b"].ci95
+    assert low < TRUTH["b"] < high
+    assert any("Hz and a damping ratio of 0.7" in note for note in result.notes), result.notes
+
+
 def test_a_supply_whose_sag_has_no_name_in_the_catalogue_is_a_curve_over_the_flow(rig: Rig) -> None:
     """Without `supply_sag` among the candidates the data draw the line that is there."""
     train, held_out = pair_of_runs(rig, Hidden(sag=2e6))
