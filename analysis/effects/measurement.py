@@ -400,7 +400,8 @@ class SensorOffset(Sensor):
     """reading = x + offset, in the channel's unit.
 
     Of a spool's LVDT it is the same as the null's offset, and is listed under that name
-    (`spool_offset`); it is a candidate for all other channels.
+    (`spool_offset`); it is a candidate for all other channels. Of a supply that no sensor measures
+    it is the error of the pressure that the rig file states.
     """
 
     name: ClassVar[str] = "sensor_offset"
@@ -428,18 +429,22 @@ class SensorOffset(Sensor):
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return every channel that the model uses but the spools."""
-        return tuple(place for place in super().all_places(rig) if not place.endswith("spool"))
+        """Return every channel that the model uses but the spools, and a supply that is stated."""
+        places = (place for place in super().all_places(rig) if not place.endswith("spool"))
+        return (*places, *(("bench",) if _states_supply(rig) else ()))
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the offset."""
         return (f"offset_{self.channel}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the offset, within a quarter of the sensor's span."""
+        """Return the offset, within a quarter of the sensor's span, or of a stated supply."""
         kind = ch.kind_of(self.channel)[0]
-        low, high = rig.sensors.of(kind).range
-        span = high - low
+        if self.where == "bench" and _states_supply(rig):
+            span = rig.supply.pressure
+        else:
+            low, high = rig.sensors.of(kind).range
+            span = high - low
         grid = (-0.02 * span, -0.004 * span, 0.004 * span, 0.02 * span)
         unit = ch.unit_of(self.channel)
         return (Shape(self.shape_names()[0], unit, -0.25 * span, 0.25 * span, grid, 0.0),)
@@ -447,6 +452,21 @@ class SensorOffset(Sensor):
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x - offset; derivatives as they are."""
         return x - value if order == 0 else x
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the pressure of a supply that no sensor measures."""
+        if self.where != "bench" or not _states_supply(rig):
+            return ""
+        pressure = (rig.supply.pressure - self.shape_of(rig, shape)[0]) / 1e6
+        return (
+            f"no sensor measures the supply; by these records its pressure is {pressure:.4g} MPa, "
+            f"not the {rig.supply.pressure / 1e6:.4g} MPa of the rig file (`supply: pressure`)"
+        )
+
+
+def _states_supply(rig: Rig) -> bool:
+    """Return whether the supply's pressure comes from the rig file, since no sensor measures it."""
+    return not rig.electric and rig.sensors.supply_pressure is None
 
 
 def corrected_channels(

@@ -20,6 +20,7 @@ from analysis.simulation.model import load_model, save_model
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
+from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace.foreign_bench import (
@@ -408,6 +409,30 @@ def test_a_spool_of_second_order_is_one_lag_with_its_damping_and_leaves_the_bulk
     low, high = result.model_after.parameters["b"].ci95
     assert low < TRUTH["b"] < high
     assert any("Hz and a damping ratio of 0.7" in note for note in result.notes), result.notes
+
+
+def test_a_supply_that_no_sensor_measures_is_found_to_have_another_pressure(rig: Rig) -> None:
+    """The rig file states 6.65 MPa, the pump makes 7."""
+    stated = rig.model_copy(update={
+        "supply": rig.supply.model_copy(update={"pressure": 6.65e6}),
+        "sensors": rig.sensors.model_copy(update={"supply_pressure": None}),
+    })  # fmt: skip
+
+    def unmeasured(run: Run) -> Run:
+        records = (
+            replace(r, channels={k: v for k, v in r.channels.items() if k in stated.channels})
+            for r in run.records
+        )
+        return Run(stated, tuple(records), run.source)
+
+    train, held_out = map(unmeasured, pair_of_runs(rig, Hidden()))
+    names = (*FLOWS, "sensor_offset")
+    result = trace([train], [held_out], catalogue(stated, names), look_ahead=False)
+    assert result.verdict == "explained"
+    (offset,) = result.effects
+    assert (offset.name, offset.at) == ("sensor_offset", "bench")
+    assert offset.parameters["offset_supply_pressure"].value == pytest.approx(-0.35e6, rel=0.03)
+    assert any("no sensor measures the supply" in note for note in result.notes)
 
 
 def test_a_supply_whose_sag_has_no_name_in_the_catalogue_is_a_curve_over_the_flow(rig: Rig) -> None:
