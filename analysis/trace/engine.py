@@ -15,7 +15,7 @@ from analysis.effects.base import Effect, ordered
 from analysis.effects.payload import Payload
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
-from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
+from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
 from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.identify.geometry import wider
 from analysis.identify.port_flows import with_identified_bulk_modulus
@@ -492,7 +492,7 @@ def _identified(
     Temperature and spool path are left out of `terms`: the estimator fits them itself. Torque rows
     of the joints `in_motion` (0-based) are weighted by speed; sines at `lines` are taken out.
     """
-    nuisances = (BulkTemperature, SpoolPath)
+    nuisances = (BulkTemperature, DrivePath, SpoolPath)
     kept = ordered([u for u in terms if not isinstance(u.term, nuisances)])
 
     def filtering(record: Record) -> Filtering:

@@ -19,8 +19,8 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.data.sample_paths import path_terms
 from analysis.trace.data.set_aside import UnseenRows, set_aside
-from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
+from scipy.signal import cont2discrete
 
+from analysis.identify.estimators import nuisance
 from analysis.identify.identify import identify
 from analysis.identify.result import to_json
 from analysis.identify.stacked_rows import build_rows
@@ -17,7 +19,7 @@ from analysis.signals.filters import butterworth, channel_filter
 from analysis.simulation.model import Estimate, Model, load_model, save_model
 from analysis.simulation.simulate import DrivingInput, State, compiled, simulate
 from analysis.simulation.validate import validate
-from analysis.terms import with_effects
+from analysis.terms import baseline_of, with_effects
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -304,3 +306,46 @@ def test_filters_pass_electric_channels_like_any_other(robot: ElectricRig, run: 
     inner = slice(500, -500)
     np.testing.assert_allclose(a.qd[inner], b.qd[inner], atol=0.05)
     np.testing.assert_allclose(a.theta, np.cumsum(a.q, axis=1))
+
+
+def test_a_current_that_follows_held_commands_leaves_viscous_friction_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A carriage, its command held for 1 ms and its current a lag of 0.8 ms behind it.
+
+    Between samples the current runs along exponentials, on average ahead of the line between them
+    by T^2 / (12 tau), 0.1 ms. Sampled exactly by another library.
+    """
+    rig = load_rig("emps")
+    mass, viscous, lag, T = 95.0, 200.0, 8e-4, 1.0 / rig.sample_rate
+    A = np.array([[0, 1, 0], [0, -viscous / mass, rig.drive_gains[0] / mass], [0, 0, -1 / lag]])
+    step, drive, *_ = cont2discrete(
+        (A, np.array([[0], [0], [1 / lag]]), np.eye(3), np.zeros((3, 1))), T
+    )
+    rng = np.random.default_rng(8)
+    t = T * np.arange(8000)
+    waves = rng.uniform(0, 2 * np.pi, 12)
+    command = sum(0.5 * np.sin(2 * np.pi * (1.0 + k) * t + p) for k, p in enumerate(waves))
+    state, states = np.array([0.12, 0.0, 0.0]), []
+    for c in np.asarray(command):
+        states.append(state)
+        state = step @ state + drive[:, 0] * (c - 40.0 * (state[0] - 0.12))
+    position, _, current = np.array(states).T
+
+    def run_of(seed: int) -> Run:
+        noise = np.random.default_rng(seed).standard_normal((2, len(t)))
+        channels = {"position_1": position + 1e-7 * noise[0], "drive_1": current + 1e-4 * noise[1]}
+        record = Record(f"held_r{seed}", "held", (), seed, rig.sample_rate, channels)
+        return Run(rig, (record,), "held command")
+
+    runs = [run_of(1), run_of(2)]
+    terms = [Used(term) for term in baseline_of(rig)]
+    found = identify(runs, terms=terms)
+    low, high = found.model.parameters["Fv1"].ci95
+    assert low < viscous < high
+    half = 0.5 * (high - low)
+    (check,) = (c for c in found.checks if c.name == "drive's path between samples at joint 1")
+    assert check.detail.startswith("+0.10")
+    monkeypatch.setattr(nuisance, "nuisance_terms", lambda *_: ())
+    without = identify(runs, terms=terms).model.values["Fv1"]
+    assert abs(without - viscous) > max(5 * half, 0.005 * viscous)

@@ -1,7 +1,8 @@
-"""Small effects that the model leaves out, fitted as additional columns of the fluid rows.
+"""Small effects that the model leaves out, fitted as additional columns of the rows.
 
 They shift parameters by more than their scatter, so that intervals without them would be wrong.
-Each is one column of the fluid rows, estimated with the parameters but not reported as one.
+Each is one column of the fluid rows, or of an electric joint's torque rows, estimated with the
+parameters but not reported as one.
 
 Oil temperature. The oil's temperature, and with it the bulk modulus, changes between records; one b
 for all records would be that of their mean temperature, and the gains of the steps would shift.
@@ -20,7 +21,8 @@ Path between samples. A command that is held between samples makes the spool's p
 renewal: the path interpolated between samples leads or lags the true one by a part of the interval
 T, to first order C (u + f T du/dt) sqrt(dp), one f for each valve. A flow proportional to du/dt
 resembles compression, so that it would shift b. Known beforehand: |f| is of the order of 0.05 or
-below.
+below. An electric drive's current does the same to a joint's torque, k (i + f T di/dt), which would
+shift viscous friction.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ Array = NDArray[np.float64]
 
 KAPPA, TAU = "1/b per kelvin", "transition pressure squared"
 BETWEEN = "spool's path between samples at joint "
+DRIVE_BETWEEN = "drive's path between samples at joint "
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,26 @@ class SpoolPath(Term):
         return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
 
 
+@dataclass(frozen=True)
+class DrivePath(Term):
+    """- k T di/dt of the drive of electric joint `joint` (0-based), beside its torque k i."""
+
+    name: ClassVar[str] = "drive_path_nuisance"
+    joint: int = 0
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return f, in sample intervals."""
+        return (Coefficient(f"{DRIVE_BETWEEN}{self.joint + 1}", "", "mechanical"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the column of the joint's torque rows; none where it is not excited."""
+        i = self.joint
+        if i not in signals.excited_joints:
+            return {}
+        column = -rig.drive_gains[i] * np.gradient(signals.u[:, i])
+        return {equation("torque", i): {f"{DRIVE_BETWEEN}{i + 1}": column}}
+
+
 def _lost(drop: Array) -> Array:
     held = np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop)
     return np.asarray(-0.25 / (held * np.sqrt(held)))
@@ -152,6 +175,9 @@ def nuisance_terms(
     with it.
     """
     names = {used.term.name for used in terms}
+    rig = runs[0].rig
+    if rig.electric:
+        return tuple(Used(DrivePath(joint=i)) for i in range(len(rig.joints)))
     nuisances: list[Used] = []
     measured = all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
     if "compressibility" in names and measured and np.isfinite(values.get("b", np.nan)):
@@ -177,7 +203,7 @@ def priors(names: Sequence[str], value: Array) -> list[Prior]:
         h[names.index(TAU)] = 1.0
         out.append(Prior(TAU, h, IDENTIFY.transition_drop**2))
     for k, name in enumerate(names):
-        if name.startswith(BETWEEN):
+        if name.startswith((BETWEEN, DRIVE_BETWEEN)):
             h = np.zeros(len(names))
             h[k] = 1.0
             out.append(Prior(name, h, IDENTIFY.path_between_samples))

@@ -35,7 +35,10 @@ def nuisance_statement(
     check = _possible(prior, names, beta, error, moved is not None)
     if moved is None or moved[1] > shift_limit(moved[0]):
         return check
-    least = f"left out, which moves no parameter by more than {100 * moved[1]:.2g} %"
+    least = f"no parameter moves by more than {100 * moved[1]:.2g} %"
+    if not moved[1]:
+        share = IDENTIFY.shift_of_interval
+        least = f"no parameter moves by more than {share:g} of its 95 % interval's half width"
     return Check(check.name, True, f"{check.detail} ({least})")
 
 
@@ -59,7 +62,7 @@ def _possible(
         else:
             statement += "; b is that of the rig's nominal oil temperature"
         return Check("oil temperature", not wrong, statement)
-    if prior.name.startswith(nu.BETWEEN):
+    if prior.name.startswith((nu.BETWEEN, nu.DRIVE_BETWEEN)):
         statement = (
             f"{value:+.3f} +- {2 * std:.3f} of a sample's interval from the interpolated one"
         )
