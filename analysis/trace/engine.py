@@ -43,7 +43,7 @@ from analysis.trace.judge.curves import (
     curves_that_limit,
     rows_within_curves,
 )
-from analysis.trace.judge.rivals import spread_by_tied_rivals
+from analysis.trace.judge.rivals import alternatives_of, with_alternatives
 from analysis.trace.judge.scatter import form_shift, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
@@ -222,14 +222,18 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     """Identify the model with the effects found, hidden states by multiple shooting."""
     runs, before, rows = prepared.records.train, prepared.baseline, finding.rows
     winner = finding.winner
-    by_rivals = spread_by_tied_rivals(finding.hypotheses, winner, finding.named)
-    after, from_tolerances = _identified_with_effects(runs, winner, before, rows, by_rivals)
+    after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
     shooting = shoot_hidden_states(
         runs, prepared.rows.unseen.choosing_runs, after, rows.train, rows.unseen.choosing, winner
     )
     if shooting.winner is not winner:
         winner = shooting.winner
-        after, from_tolerances = _identified_with_effects(runs, winner, before, rows, by_rivals)
+        after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    alternatives = [
+        (_identified_with_effects(runs, other, before, rows)[0], law)
+        for other, law in alternatives_of(finding.hypotheses, finding.winner, finding.named)
+    ]
+    after = with_alternatives(after, alternatives)
     effects = tuple(
         with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
     )
@@ -462,21 +466,18 @@ def _not_in_model(
 
 
 def _identified_with_effects(
-    runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows,
-    by_rivals: Mapping[str, float],
-) -> tuple[Model, dict[str, float]]:  # fmt: skip
+    runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows
+) -> tuple[Model, dict[str, float]]:
     """Return the model identified together with the effects of a set, and errors by tolerance.
 
-    Its intervals include the uncertainty of shapes and forms, and the shifts of the coefficients
-    `by_rivals`. The second value is the part of each standard error that the tolerances of the
-    rig's geometry make, by parameter name.
+    Its intervals include the uncertainty of shapes and forms. The second value is the part of each
+    standard error that the tolerances of the rig's geometry make, by parameter name.
     """
     if not winner.effects:
         return before, {}
     train_data = rows.train
     found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion, rows.lines)
     shift = form_shift(train_data, winner.fit)
-    shift |= {n: math.hypot(shift.get(n, 0.0), more) for n, more in by_rivals.items()}
     model = with_form_errors(train_data, winner.fit, found.model, shift)
     return at_nominal_temperature(model), by_geometry(found)
 

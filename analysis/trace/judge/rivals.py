@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
+from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
@@ -18,9 +21,10 @@ from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
 from analysis.trace.result import JudgedEffect, Rival
-from analysis.trace.search.hypothesis import Hypothesis, Key, of_one_law
+from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -37,7 +41,7 @@ def rivals_of(
 
     Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
     held-out records have shown that it is too simple; a richer one is a rival where it changes a
-    parameter of another law.
+    parameter of another law, or where the effect cannot be separated from others anyway.
     """
     judged_effect, train_data = used.term, hypotheses.train_data
     others = winner.keys - {(judged_effect.name, judged_effect.where)}
@@ -47,7 +51,8 @@ def rivals_of(
         winner.fit.residual,
         alternative.fit.residual,
     )
-    out = []
+    out: list[Rival] = []
+    richer: list[Rival] = []
     assert isinstance(judged_effect, Effect)
     for hypothesis, fresh in hypotheses.replacements(winner, used):
         other = fresh.term
@@ -74,19 +79,18 @@ def rivals_of(
         moved = _moved_parameter(train_data, winner, hypothesis, own) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
         free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
-        if (same_law and moved is None) or (not justified and (moved is None or free)):
+        if not same_law and not justified and (moved is None or free):
             continue
-        out.append(
-            Rival(
-                other.name,
-                place_of(other),
-                ratio,
-                training_test.ratio(hypothesis.fit.residual),
-                tied,
-                other.where,
-                moved,
-            )
-        )
+        rival = Rival(
+            other.name, place_of(other), ratio, training_test.ratio(hypothesis.fit.residual), tied,
+            other.where, moved,
+        )  # fmt: skip
+        if not same_law or moved is not None:
+            out.append(rival)
+        elif tied:
+            richer.append(rival)
+    if any(rival.tied for rival in out):
+        out += richer
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: max(TRACE.most_rivals, sum(r.tied for r in out))]
 
@@ -112,8 +116,10 @@ def _moved_parameter(
     deviations = _deviations(train_data, rival)
     most: tuple[str, float] | None = None
     rig = train_data.rig
-    others = [term for term in baseline_of(rig) if not law or not term.name.endswith(law)]
-    for c in (c for term in others for c in term.coefficients(rig)):
+    left_out = _of_law(rig, law)
+    for c in (c for term in baseline_of(rig) for c in term.coefficients(rig)):
+        if c.parameter in left_out:
+            continue
         value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
         if not value or not other or c.parameter not in deviations:
             continue
@@ -167,32 +173,67 @@ def best_tied_set(
     return best if cost < priced(winner) - SEARCH.number_price else winner
 
 
-def spread_by_tied_rivals(
+def alternatives_of(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
-) -> dict[str, float]:
-    """Return the standard error that tied rivals of judged effects add to each coefficient.
+) -> list[tuple[Hypothesis, str]]:
+    """Return the sets that could hold in place of the winner, and the law that each leaves out.
 
-    Each set that the records cannot separate counts with the same weight: the square is the mean,
-    over the winner and the rivals, of the squared shift and of the variance beyond the winner's
-    (Buckland, Burnham and Augustin, Biometrics 53, 1997).
+    They are those with a tied rival, which leave out none (''), and those with a richer form of a
+    named effect, such as two levels of friction for one, that move parameters too little to be
+    rivals. A richer form leaves out its law's term of the baseline, viscous friction: forms of
+    friction differ by a slope too.
     """
-    rivals = tied_sets(hypotheses, winner, effects)
-    if not rivals:
-        return {}
-    data = hypotheses.train_data
-    own, others = _deviations(data, winner), [_deviations(data, rival) for rival in rivals]
+    tied = tied_sets(hypotheses, winner, effects)
+    out = [(hypothesis, "") for hypothesis in tied]
+    named = {(effect.name, effect.at) for effect in effects}
+    for used in winner.effects:
+        effect = used.term
+        assert isinstance(effect, Effect)
+        if (effect.name, effect.where) not in named:
+            continue
+        others = [u for u in winner.effects if u is not used]
+        for form in hypotheses.effects:
+            if not is_special_case(effect, form) or (form.name, form.where) in winner.keys:
+                continue
+            start = Used(form, form.shape_of(hypotheses.train_data.rig, ()))
+            richer = hypotheses.refined([*others, start])
+            rows, law = hypotheses.train_data, effect.family
+            if richer not in tied and _moved_parameter(rows, winner, richer, law) is None:
+                out.append((richer, law))
+    return out
 
-    def added(name: str, value: float) -> float:
-        return sum(
-            (rival.fit.beta.get(name, value) - value) ** 2
-            + max(theirs.get(name, 0.0) ** 2 - own.get(name, 0.0) ** 2, 0.0)
-            for rival, theirs in zip(rivals, others, strict=True)
-        )
 
-    return {
-        name: math.sqrt(added(name, value) / (len(rivals) + 1))
-        for name, value in winner.fit.beta.items()
-    }
+def with_alternatives(model: Model, alternatives: Sequence[tuple[Model, str]]) -> Model:
+    """Return the model with intervals that include what other models of the records give.
+
+    Each alternative, identified as the model is, counts with the same weight: the square of the
+    standard error added is the mean, over the model and them, of the squared shift and of the
+    variance beyond the model's (Buckland, Burnham and Augustin, Biometrics 53, 1997). Parameters
+    of the baseline's term of the law that an alternative leaves out are not compared with it.
+    """
+    names = list(model.parameters)
+    parameters, covariance = dict(model.parameters), model.covariance.copy()
+    for name, own in model.parameters.items():
+        others = [
+            other.parameters[name]
+            for other, law in alternatives
+            if name in other.parameters and name not in _of_law(model.rig, law)
+        ]
+        more = sum(
+            (o.value - own.value) ** 2 + max(o.std**2 - own.std**2, 0.0)
+            for o in others if o.identified
+        )  # fmt: skip
+        if own.identified and more > 0.0:
+            std = math.sqrt(more / (len(alternatives) + 1))
+            parameters[name] = wider(own, std)
+            covariance[names.index(name), names.index(name)] += std**2
+    return replace(model, parameters=parameters, covariance=covariance)
+
+
+def _of_law(rig: Rig, law: str) -> set[str]:
+    """Return the parameters of the baseline's term of a law ('': of none)."""
+    terms = [term for term in baseline_of(rig) if law and term.name.endswith(law)]
+    return {c.parameter for term in terms for c in term.coefficients(rig)}
 
 
 def composites_in_words(

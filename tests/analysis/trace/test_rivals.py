@@ -1,0 +1,76 @@
+"""Names that fit as well as the one given: which are listed, and what intervals they widen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from analysis.simulation.model import Model
+from analysis.trace.judge import rivals
+from analysis.trace.judge.rivals import with_alternatives
+from analysis.trace.settings import TRACE
+from rig.model.records import Run
+from rig.model.rig import Rig
+from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
+from tests.analysis.trace.gate_cases import traced
+
+
+@pytest.fixture(scope="module")
+def noisy(rig: Rig) -> tuple[Run, Run]:
+    """Levels of 24 and 20 N in six times the noise."""
+    return pair_of_runs(rig, Hidden(24.0, 20.0), repeats=1, noise=6.0)
+
+
+@pytest.mark.parametrize(
+    ("more", "tied"),
+    [((), set()),
+     (("pressure_dependent_friction",), {"asymmetric_friction", "pressure_dependent_friction"})],
+)  # fmt: skip
+def test_levels_by_direction_are_listed_where_another_law_fits_as_well_anyway(
+    rig: Rig,
+    noisy: tuple[Run, Run],
+    more: tuple[str, ...],
+    tied: set[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They change no parameter of another law by enough to be a rival of one level alone."""
+    monkeypatch.setattr(rivals, "TRACE", replace(TRACE, noted_shift=0.5, open_share=0.5))
+    result = traced(rig, noisy, "coulomb_friction", "asymmetric_friction", *more)
+    (effect,) = result.effects
+    assert effect.name == "coulomb_friction"
+    assert {r.name for r in effect.rivals if r.tied} == tied
+
+
+def test_an_interval_reaches_what_a_richer_form_of_the_named_effect_gives(
+    rig: Rig, noisy: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The weight takes up the difference of two levels, which these records do not show."""
+    monkeypatch.setattr(rivals, "TRACE", replace(TRACE, noted_shift=0.5, open_share=0.5))
+    found = {
+        names: traced(rig, noisy, *names).model_after.parameters["W2"]
+        for names in (("coulomb_friction",), ("coulomb_friction", "asymmetric_friction"))
+    }
+    alone, beside = found.values()
+    assert beside.value == alone.value
+    assert beside.std > 1.5 * alone.std
+
+
+def test_alternatives_widen_what_they_share_with_the_model(
+    rig: Rig, noisy: tuple[Run, Run]
+) -> None:
+    model = traced(rig, noisy, "coulomb_friction").model_after
+    own = model.parameters
+
+    def shifted(**by: float) -> Model:
+        changed = {n: replace(own[n], value=own[n].value * (1 + x)) for n, x in by.items()}
+        return replace(model, parameters={**own, **changed})
+
+    wide = with_alternatives(model, [(shifted(W2=0.02, Fv2=0.1), "friction")]).parameters
+    assert wide["W2"].std == pytest.approx(
+        math.hypot(own["W2"].std, 0.02 * own["W2"].value / math.sqrt(2))
+    )
+    assert wide["W2"].value == own["W2"].value
+    assert wide["Fv2"] == own["Fv2"]  # of the law in which the two differ
+    assert with_alternatives(model, [(shifted(Fv2=0.1), "")]).parameters["Fv2"] != own["Fv2"]
