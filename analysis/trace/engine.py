@@ -56,6 +56,7 @@ from analysis.trace.notes import (
     rival_notes,
     shared_parameters,
     undetermined_notes,
+    unseen_load_notes,
 )
 from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
@@ -329,6 +330,7 @@ def _traced(
     )
     undetermined = [n for n, e in before.parameters.items() if not e.identified]
     notes = [
+        *unseen_load_notes(records.train, [*records.holdout, *records.judge]),
         *prepared.rows.unseen.notes,
         *evidence_notes(prepared.rows.train, prepared.rows.unseen.choosing),
         *prepared.notes,

@@ -23,6 +23,7 @@ from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
+from rig.model.records import Run
 from rig.model.units import plain
 
 # Begins what a note says of a torque whose rests are not judged; the sentence refers to it.
@@ -123,6 +124,23 @@ def record_condition_notes(train_data: RegressionData, winner: Hypothesis) -> li
     signals = signals_of(train_data)
     said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
     return [f"{name}: {text}" for name, text in said if text]
+
+
+def unseen_load_notes(train: Sequence[Run], unseen: Sequence[Run]) -> list[str]:
+    """Name the steps of unseen records with a stated load where no training record has one.
+
+    A load that every training record has is in the arm's own parameters, one that none has in none.
+    """
+    if any(record.loaded for run in train for record in run.records):
+        return []
+    steps = dict.fromkeys(r.step for run in unseen for r in run.records if r.loaded)
+    if not steps:
+        return []
+    return [
+        f"{' '.join(steps)}: these held-out records carry a load (`loaded`) that no training "
+        "record carries, so that its weight and inertia are not in the model: train on loaded "
+        "records too, or hold out unloaded ones"
+    ]
 
 
 def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:

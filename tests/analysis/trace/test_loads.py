@@ -20,6 +20,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
+from analysis.trace.notes import unseen_load_notes
 from analysis.trace.search.undeclared_loads import undeclared_load
 from rig.model.records import LOADED, Record, Run
 from rig.model.rig import Rig
@@ -182,3 +183,12 @@ def test_a_load_in_some_repeats_of_the_only_step_is_found(
         assert [r.loaded for r in load.train[0].records] == list(map(heavy, kept))
     else:
         assert load is None
+
+
+def test_a_load_that_only_held_out_records_state_is_named(runs: tuple[Run, Run]) -> None:
+    bare, carrying = chosen(runs[0], lambda r: not heavy(r)), stated(chosen(runs[0], heavy), heavy)
+    (note,) = unseen_load_notes([bare], [carrying])
+    assert note.startswith(f"{carrying.records[0].step}")
+    assert "no training record carries" in note
+    assert unseen_load_notes([bare, carrying], [carrying]) == []
+    assert unseen_load_notes([bare], [bare]) == []
