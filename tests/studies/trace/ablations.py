@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from typing import Any, Final
 
 from analysis.trace import engine, finding
@@ -19,11 +20,12 @@ from analysis.trace.judge.shooting import ShootingResult
 from analysis.trace.result import Trace
 from analysis.trace.search import hypothesis_set
 from rig.model.records import Run
+from rig.runs.rigs import load_rig
 from tests.studies.foreign.bench import runs_of
 from tests.studies.foreign.cases import OUTSIDE, PAIR, SINGLE, Case, case_of
 from tests.studies.foreign.study import answer_of, bounds
 from tests.studies.pages import Section, Table
-from tests.studies.trace.rules import RULES, Rule, switched_off
+from tests.studies.trace.rules import FAULTS, RULES, Rule, by_name, switched_off
 
 log = logging.getLogger(__name__)
 
@@ -148,6 +150,60 @@ def loaded(_: int, data: Mapping[str, Any]) -> list[Answer]:
     return [Answer(**{**a, "named": tuple((n, w) for n, w in a["named"])}) for a in data["answers"]]
 
 
+@dataclass(frozen=True)
+class SmallBench:
+    """A small bench made for a rule or a fault: what is asserted of it, and what comes of that.
+
+    `holds` with all rules; `lost` without the rule, or with the fault.
+    """
+
+    rule: Rule
+    asserted: str
+    holds: bool
+    lost: bool
+
+
+def small_benches() -> Iterator[SmallBench]:
+    """Assert what `tests/analysis/trace/rule_stories.py` does of each rule, with and without it."""
+    # By name: the tests' own modules are not typed as the studies are.
+    stories: Any = import_module("tests.analysis.trace.rule_stories")
+    benches, known = stories.Benches(load_rig("shinshu-2dof")), by_name(RULES + FAULTS)
+
+    def holds(story: Callable[[Any], None]) -> bool:
+        try:
+            story(benches)
+        except AssertionError:
+            return False
+        return True
+
+    for story, names in stories.STORIES:
+        with_all, words = holds(story), story.__name__.replace("_", " ")
+        for name in names:
+            with switched_off(known[name]):
+                yield SmallBench(known[name], words, with_all, not holds(story))
+
+
+def small_bench_section(found: Sequence[SmallBench]) -> Section:
+    """Return the table of small benches, in the order of the rules."""
+    order = [rule.name for rule in RULES + FAULTS]
+    rows = [
+        [b.rule.name, b.rule.off, b.asserted, _yes(b.holds), _yes(b.lost)]
+        for b in sorted(found, key=lambda b: order.index(b.rule.name))
+    ]
+    return Section("Small benches, one for each rule", (
+        "`tests/analysis/trace/rule_stories.py` has a small bench that needs the rule, for each "
+        "rule but pairs, and one that notices each of a number of faults. The same command asserts "
+        "them again, with all rules and with one switched off.",
+        Table("What is asserted of a small bench, and lost without a rule",
+              ("rule or fault", "without the rule, or with the fault", "asserted",
+               "holds with all rules", "lost without"), rows),
+    ))  # fmt: skip
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "**no**"
+
+
 def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Section]:
     """Return the page: a table of rules with changed answers, and every change in words."""
     rows, changes = [], []
@@ -200,9 +256,7 @@ def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Sectio
                   ("rule", "without it", "benches", "changed", "lost", "wrong", "won", "cured"),
                   rows),
             "No answer changes on these benches without: " + (", ".join(idle) or "none") + ". So "
-            "few benches do not prove that a rule has no use: "
-            "`tests/analysis/trace/test_gates.py` has a bench that needs the rule, for each rule "
-            "but pairs.",
+            "few benches do not prove that a rule has no use: see the small benches below.",
         )),
         Section("Every change", (
             Table("With all rules, and without one",

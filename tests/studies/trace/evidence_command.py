@@ -35,7 +35,15 @@ def ablations(
     Example: python -m tests.studies ablations --count 2
     """
     from tests.studies.pool import Kept, performed
-    from tests.studies.trace.ablations import ALL, as_json, loaded, perform, sections
+    from tests.studies.trace.ablations import (
+        ALL,
+        as_json,
+        loaded,
+        perform,
+        sections,
+        small_bench_section,
+        small_benches,
+    )
 
     def report(done: int, of: int, job: int, found: list[Answer] | Exception) -> None:
         if isinstance(found, Exception):
@@ -54,8 +62,13 @@ def ablations(
     done = performed(work, perform, cluster or workers, report, kept)
     found = dict(sorted(done, key=lambda pair: pair[0]))
     write_json(json, {str(k): as_json(v) for k, v in found.items()})
-    _show("Answers of the trace without each of its rules", sections(found, _command(
-        "ablations", {"--seed": seed, "--count": count}, docs)), json, docs)  # fmt: skip
+    page = sections(found, _command("ablations", {"--seed": seed, "--count": count}, docs))
+    small = []
+    for bench in small_benches():
+        progress(f"{bench.rule.name}: {bench.asserted}")
+        small.append(bench)
+    page.insert(1, small_bench_section(small))
+    _show("Answers of the trace without each of its rules", page, json, docs)
 
 
 def isolability(
