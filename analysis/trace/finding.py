@@ -181,22 +181,23 @@ def unstated_noise(
 ) -> tuple[TraceRuns, TraceRows] | None:
     """Return runs and rows whose noise floors are what `finding` leaves, where nothing repeats.
 
-    The stated noise may lack what a sensor has at low frequencies. None where an equation's noise
-    was measured, where more than `DATA.unstated_ratio` times the stated noise is left, where a
-    variable of the records removes a part of that from held-out records, or an effect that the
-    gates refuse.
+    The stated noise may lack what a sensor has at low frequencies. Equations whose noise a step
+    shows keep their floors. None where each has one, where more than `DATA.unstated_ratio` times
+    the stated noise is left, where a variable of the records removes a part of that from held-out
+    records, or an effect that the gates refuse.
     """
     data = finding.rows.train
-    measured = any(f.source != STATED for f in data.floors)
+    measured = {f.equation for f in data.floors if f.source != STATED}
     refused = any(map(gates.removes, gates.refused_effects(finding.effects)))
-    if finding.verdict != UNEXPLAINED or refused or measured:
+    if finding.verdict != UNEXPLAINED or refused:
         return None
     winner = _with_tied_effects(finding)
     power: dict[str, list[Array]] = {}
     for s in data.segments:  # whitened by the stated noise
-        power.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
+        if s.equation not in measured:
+            power.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
     ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in power.items()}
-    if max(ratio.values()) > DATA.unstated_ratio:
+    if not ratio or max(ratio.values()) > DATA.unstated_ratio:
         return None
     moves, formulas = clues_to(data, finding.rows.unseen.choosing, winner, ())
     if formulas or any(m.share > DATA.unstated_clue for m in moves):

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from analysis.effects.valve import ValveDeadband
+from analysis.regression.rows import Rows
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms.base import Used
 from analysis.trace import engine
+from analysis.trace.data import noise_floor
 from analysis.trace.data.candidates import catalogue
-from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.conditioned_record import ConditionedRecord, conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.judge import gates, held_out, inference
 from analysis.trace.result import Trace
@@ -395,6 +397,16 @@ def noise_above_the_stated_one_is_noise_where_nothing_repeats(b: Benches) -> Non
         )
         result = b.traced((train, held_out), "internal_leakage", "coulomb_friction")
         assert result.verdict == verdict
+        # Torque rows that show their noise do not keep flow rows from having unstated noise.
+        shown = (noise_floor, "noise_by_neighbours", noise_of_torque_rows)
+        with switched_off(Rule("", "", (shown,))):
+            result = b.traced((train, held_out), "internal_leakage", "coulomb_friction")
+        assert result.verdict == verdict
+
+
+def noise_of_torque_rows(_: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
+    """Return the rms of the residual of torque rows, as if neighbouring states showed it."""
+    return float(np.sqrt(np.mean(residual**2))) if rows.equation.startswith("torque") else None
 
 
 def a_high_return_pressure_is_found_beside_an_underlap(b: Benches) -> None:
