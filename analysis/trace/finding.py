@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -41,7 +41,7 @@ from analysis.trace.result import (
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.hypothesis import Hypothesis, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
-from analysis.trace.settings import DATA, TRACE
+from analysis.trace.settings import DATA, SEARCH, TRACE
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -450,6 +450,20 @@ def _least_needed(
     return [used for used in failed if used in least.values()]
 
 
+def _completes(
+    hypotheses: HypothesisSet, winner: Hypothesis, larger: Hypothesis, equations: Collection[str]
+) -> bool:
+    """Return whether a further effect removes all but `SEARCH.further_share` of what `winner` left.
+
+    Only in equations in which the winner's effects act: what they leave there is missing from the
+    explanation, while in others it is a small effect beside it.
+    """
+    removed = {e: v - winner.excess_energy[e] for e, v in hypotheses.empty.excess_energy.items()}
+    acting = SEARCH.acting_share * max(removed.values())
+    before, after = (sum(max(0.0, h.excess_energy[e]) for e in equations) for h in (winner, larger))
+    return after <= SEARCH.further_share * before and all(removed[e] >= acting for e in equations)
+
+
 def _extended_set(
     hypotheses: HypothesisSet, effects: tuple[JudgedEffect, ...], winner: Hypothesis,
     left: list[Remainder], holdout_data: RegressionData, rng: np.random.Generator,
@@ -457,17 +471,19 @@ def _extended_set(
     """Add effects for equations that keep too much, while all pass and fewer equations do.
 
     Returns the judged effects, their set, and what it leaves. Where no remainder speaks against the
-    set, a further effect must not change whether the answer has a tied rival, unless simpler names
-    beside it make the whole set no larger.
+    set, a further effect must not change whether the answer has a tied rival, unless it completes
+    the explanation or simpler names beside it make the whole set no larger.
     """
     while left:
-        larger = hypotheses.extended_in(winner, {r.equation for r in left})
+        equations = {r.equation for r in left}
+        larger = hypotheses.extended_in(winner, equations)
         if larger is None:
             break
         judged = gates.judge_effects(hypotheses, larger, holdout_data, rng)
         less = remainders(hypotheses, larger, holdout_data)
         replaces = not winner.keys <= larger.keys and sum(larger.size) <= sum(winner.size)
-        needed = replaces or any(r.veto for r in left)
+        completes = _completes(hypotheses, winner, larger, equations)
+        needed = replaces or completes or any(r.veto for r in left)
         if not needed and has_tied_rival(judged) != has_tied_rival(effects):
             break
         if len(less) >= len(left) or not all(map(gates.passes_gates, judged)):

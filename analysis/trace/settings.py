@@ -270,6 +270,9 @@ class SearchSettings:
     add_share: float = 0.3
     """Least share of the remaining energy, in the equations where an effect acts, that the effect
     must remove to be added (tuned)."""
+    further_share: float = 0.1
+    """Largest share of tolerated remainders that a further effect may leave to be added although it
+    cannot be separated from another (a dead volume beside a leak, of which 25 % stayed)."""
     simpler_ratio: float = 1.25
     """Largest remaining energy of a simpler set over that of the best one, as a product over
     equations, at which the simpler set is chosen (tuned)."""

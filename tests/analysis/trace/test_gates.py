@@ -6,10 +6,15 @@ make it fail (`rule_stories`).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from analysis.trace import finding
 from analysis.trace.judge import removal
+from analysis.trace.remaining import remainders
+from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
 from tests.analysis.trace import gate_cases
 from tests.analysis.trace.gate_cases import LEAK
@@ -66,3 +71,25 @@ def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect
     assert removal.disturbed_in_held_out(rows, bad, good, bad) == []
     assert removal.disturbed_in_held_out(rows, good, bad, bad) == []
     assert removal.disturbed_in_held_out(rows, good, good, good) == []
+
+
+def test_a_further_effect_that_takes_all_that_is_left_is_named_although_it_ties(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A dead volume beside a leak, in equations that held-out records allow to keep it."""
+    runs = pair_of_runs(rig, c_internal=LEAK, V_cap=3e-5)
+    s = gate_cases.searched(rig, *runs, "internal_leakage", "dead_volume")
+    leak = s.set_of("internal_leakage")
+    left = [r._replace(veto=False) for r in remainders(s.hypotheses, leak, s.holdout_data)]
+    assert left
+    monkeypatch.setattr(finding, "has_tied_rival", lambda effects: len(effects) > 1)
+    for share, names in (
+        (SEARCH.further_share, {"internal_leakage", "dead_volume"}),
+        (-1.0, {"internal_leakage"}),
+    ):
+        monkeypatch.setattr(finding, "SEARCH", replace(SEARCH, further_share=share))
+        effects = finding._extended_set(
+            s.hypotheses, tuple(s.judged("internal_leakage")), leak, left, s.holdout_data,
+            np.random.default_rng(0),
+        )[0]  # fmt: skip
+        assert {e.name for e in effects} == names
