@@ -308,9 +308,16 @@ def judge_winner(
     hypotheses: HypothesisSet, winner: Hypothesis, free: Sequence[Effect],
     holdout_data: RegressionData, rng: np.random.Generator,
 ) -> Judgement:  # fmt: skip
-    """Judge the set that the search has found, and try free forms where it does not explain."""
-    winner = readings.best_readings(hypotheses, winner, holdout_data)
-    found = _apply_gates(hypotheses, winner, holdout_data, rng)
+    """Judge the set that the search has found, and try free forms where it does not explain.
+
+    Its effects are judged under the simplest names that fit, and where these do not explain, under
+    the names found: of a breakaway the level alone is not the same at all speeds.
+    """
+    simplest = readings.best_readings(hypotheses, winner, holdout_data)
+    found = _apply_gates(hypotheses, simplest, holdout_data, rng)
+    if found.verdict == UNEXPLAINED and simplest.keys != winner.keys:
+        as_found = _apply_gates(hypotheses, winner, holdout_data, rng)
+        found = as_found if as_found.verdict != UNEXPLAINED else found
     if found.verdict == CONFOUNDED:
         found = _with_best_tied_set(found, holdout_data, rng)
     by_free_form = _try_free_forms(found, free, holdout_data, rng)

@@ -14,9 +14,11 @@ import pytest
 from analysis.trace import finding
 from analysis.trace.judge import removal
 from analysis.trace.remaining import remainders
+from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
-from tests.analysis.trace import gate_cases
+from tests.analysis.trace import foreign_bench, gate_cases
+from tests.analysis.trace.foreign_bench import Hidden
 from tests.analysis.trace.gate_cases import LEAK
 from tests.analysis.trace.hidden import pair_of_runs
 from tests.analysis.trace.rule_stories import ELSEWHERE, NO_BENCH, STORIES, Benches, Story
@@ -93,3 +95,21 @@ def test_a_further_effect_that_takes_all_that_is_left_is_named_although_it_ties(
             np.random.default_rng(0),
         )[0]  # fmt: skip
         assert {e.name for e in effects} == names
+
+
+def test_names_as_found_are_judged_where_simpler_ones_do_not_explain(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Friction with a large breakaway: its level alone varies with speed."""
+    runs = foreign_bench.pair_of_runs(rig, Hidden(60.0, 60.0, breakaway=120.0))
+    names = ("coulomb_friction", "stribeck_friction")
+    s = gate_cases.searched(rig, *runs, *names)
+    level, both = s.set_of("coulomb_friction"), s.set_of(*names)
+    monkeypatch.setattr(finding.readings, "best_readings", lambda *_: level)
+
+    def judged(found: Hypothesis) -> finding.Judgement:
+        rng = np.random.default_rng(0)
+        return finding.judge_winner(s.hypotheses, found, (), s.holdout_data, rng)
+
+    assert judged(level).verdict == "unexplained"
+    assert {e.name for e in judged(both).effects} == set(names)
