@@ -1,6 +1,6 @@
 """Compile what many tests need, once, before the workers start: each would compile its own.
 
-    python -m tests.warm_up plant | model
+    python -m tests.warm_up plant | model | benches
 
 In a checkout that has been tested before, everything is read from numba's caches at once.
 """
@@ -56,7 +56,24 @@ def compile_model() -> None:
                 assert value.address
 
 
-PARTS: Final[dict[str, Callable[[], None]]] = {"plant": compile_plant, "model": compile_model}
+def compile_benches() -> None:
+    """Compile the benches that tests simulate without the product's plant."""
+    from tests.analysis.effects import one_joint
+    from tests.analysis.small_bench import shinshu
+    from tests.analysis.trace import foreign_bench
+    from tests.studies.foreign import bench, cases
+
+    wave = one_joint.excitation(0.03, 1)
+    one_joint.channels(shinshu(), one_joint.RIGHT, wave, 0.1)
+    foreign_bench.channels(shinshu(), foreign_bench.Hidden(), wave, 0.1)
+    bench.channels(cases.case_of(0, kind=cases.NONE).bench, "step1", 1, 1.0)
+
+
+PARTS: Final[dict[str, Callable[[], None]]] = {
+    "plant": compile_plant,
+    "model": compile_model,
+    "benches": compile_benches,
+}
 
 if __name__ == "__main__":
     PARTS[sys.argv[1]]()
