@@ -80,7 +80,7 @@ def shapes_text(shapes: Mapping[str, Estimate]) -> str:
     lines = []
     for name, shape in shapes.items():
         half = f" ± {shape.half:.2g}" if math.isfinite(shape.half) else ""
-        lines.append(f"\nshape: {name} = {shape.value:.4g}{half} {shape.unit}")
+        lines.append(f"\nshape: {name} = {shape.value:.4g}{half} {shape.unit}".rstrip())
     return "".join(lines)
 
 
