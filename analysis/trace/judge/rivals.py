@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
-from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
@@ -20,6 +18,7 @@ from analysis.trace.judge import removal
 from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
+from analysis.trace.judge.scatter import with_errors
 from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -211,23 +210,17 @@ def with_alternatives(model: Model, alternatives: Sequence[tuple[Model, str]]) -
     variance beyond the model's (Buckland, Burnham and Augustin, Biometrics 53, 1997). Parameters
     of the baseline's term of the law that an alternative leaves out are not compared with it.
     """
-    names = list(model.parameters)
-    parameters, covariance = dict(model.parameters), model.covariance.copy()
+    compared = [(other.parameters, _of_law(model.rig, law)) for other, law in alternatives]
+    errors = {}
     for name, own in model.parameters.items():
-        others = [
-            other.parameters[name]
-            for other, law in alternatives
-            if name in other.parameters and name not in _of_law(model.rig, law)
-        ]
+        others = [found[name] for found, out in compared if name in found and name not in out]
         more = sum(
             (o.value - own.value) ** 2 + max(o.std**2 - own.std**2, 0.0)
             for o in others if o.identified
         )  # fmt: skip
         if own.identified and more > 0.0:
-            std = math.sqrt(more / (len(alternatives) + 1))
-            parameters[name] = wider(own, std)
-            covariance[names.index(name), names.index(name)] += std**2
-    return replace(model, parameters=parameters, covariance=covariance)
+            errors[name] = math.sqrt(more / (len(alternatives) + 1))
+    return with_errors(model, errors)
 
 
 def _of_law(rig: Rig, law: str) -> set[str]:

@@ -188,17 +188,24 @@ def with_form_errors(
     more = _variance_from_shapes(
         train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names
     )
-    parameters, covariance = dict(model.parameters), model.covariance.copy()
-    names = list(parameters)
+    errors = {}
     for k, name in enumerate(rows.names):
-        if name not in parameters or not parameters[name].identified or size[k] == 0:
+        old = model.parameters.get(name)
+        if old is None or not old.identified or size[k] == 0:
             continue
-        old = parameters[name]
         # The rows may hold the reciprocal: relative sizes are the same.
         relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
-        grown = abs(old.value) * float(relative)
-        parameters[name] = wider(old, grown)
-        covariance[names.index(name), names.index(name)] += grown**2
+        errors[name] = abs(old.value) * float(relative)
+    return with_errors(model, errors)
+
+
+def with_errors(model: Model, errors: Mapping[str, float]) -> Model:
+    """Return the model with further standard errors of parameters, by name, in quadrature."""
+    names = list(model.parameters)
+    parameters, covariance = dict(model.parameters), model.covariance.copy()
+    for name, std in errors.items():
+        parameters[name] = wider(parameters[name], std)
+        covariance[names.index(name), names.index(name)] += std**2
     return replace(model, parameters=parameters, covariance=covariance)
 
 
