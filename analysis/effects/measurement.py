@@ -430,8 +430,8 @@ class SensorOffset(Sensor):
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every channel that the model uses but the spools, and a supply that is stated."""
-        places = (place for place in super().all_places(rig) if not place.endswith("spool"))
-        return (*places, *(("bench",) if _states_supply(rig) else ()))
+        places = tuple(place for place in super().all_places(rig) if not place.endswith("spool"))
+        return places if rig.electric or "bench" in places else (*places, "bench")
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the offset."""
@@ -440,7 +440,7 @@ class SensorOffset(Sensor):
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the offset, within a quarter of the sensor's span, or of a stated supply."""
         kind = ch.kind_of(self.channel)[0]
-        if self.where == "bench" and _states_supply(rig):
+        if self._is_stated(rig):
             span = rig.supply.pressure
         else:
             low, high = rig.sensors.of(kind).range
@@ -455,7 +455,7 @@ class SensorOffset(Sensor):
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the pressure of a supply that no sensor measures."""
-        if self.where != "bench" or not _states_supply(rig):
+        if not self._is_stated(rig):
             return ""
         pressure = (rig.supply.pressure - self.shape_of(rig, shape)[0]) / 1e6
         return (
@@ -463,10 +463,9 @@ class SensorOffset(Sensor):
             f"not the {rig.supply.pressure / 1e6:.4g} MPa of the rig file (`supply: pressure`)"
         )
 
-
-def _states_supply(rig: Rig) -> bool:
-    """Return whether the supply's pressure comes from the rig file, since no sensor measures it."""
-    return not rig.electric and rig.sensors.supply_pressure is None
+    def _is_stated(self, rig: Rig) -> bool:
+        """Return whether it is that of the supply's pressure, which the rig file states."""
+        return self.where == "bench" and rig.sensors.supply_pressure is None
 
 
 def corrected_channels(

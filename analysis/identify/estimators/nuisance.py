@@ -27,7 +27,7 @@ shift viscous friction.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -177,7 +177,7 @@ def nuisance_terms(
     names = {used.term.name for used in terms}
     rig = runs[0].rig
     if rig.electric:
-        return tuple(Used(DrivePath(joint=i)) for i in range(len(rig.joints)))
+        return sample_paths(rig, range(len(rig.joints)), values)
     nuisances: list[Used] = []
     measured = all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
     if "compressibility" in names and measured and np.isfinite(values.get("b", np.nan)):
@@ -186,8 +186,19 @@ def nuisance_terms(
     if "orifice" in names and gains:
         nuisances.append(Used(LaminarTransition(gains=tuple(gains.items()))))
         joints = sorted({int(n.rsplit("_", 1)[1]) - 1 for n in gains})
-        nuisances += [Used(SpoolPath(gains=tuple(gains.items()), joint=i)) for i in joints]
+        nuisances += sample_paths(rig, joints, gains)
     return tuple(nuisances)
+
+
+def sample_paths(rig: Rig, joints: Iterable[int], values: Mapping[str, float]) -> tuple[Used, ...]:
+    """Return the path between samples of the drives or spools of `joints` (0-based).
+
+    That of a spool needs the gains among `values`, first estimates by name: none without them.
+    """
+    if rig.electric:
+        return tuple(Used(DrivePath(joint=i)) for i in joints)
+    gains = tuple((n, v) for n, v in values.items() if n.startswith("C_") and np.isfinite(v))
+    return tuple(Used(SpoolPath(gains=gains, joint=i)) for i in joints) if gains else ()
 
 
 def priors(names: Sequence[str], value: Array) -> list[Prior]:

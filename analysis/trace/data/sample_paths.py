@@ -12,11 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.effects.base import BETWEEN_SAMPLES
-from analysis.identify.estimators.nuisance import BETWEEN, DRIVE_BETWEEN, DrivePath, SpoolPath
+from analysis.identify.estimators.nuisance import sample_paths
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows
 from analysis.trace.data.regression_data import RegressionData, least_squares
-from rig.model.parameters import gain_names
 
 
 def path_terms(data: RegressionData) -> tuple[Used, ...]:
@@ -24,20 +23,17 @@ def path_terms(data: RegressionData) -> tuple[Used, ...]:
 
     A path whose fitted lead exceeds `BETWEEN_SAMPLES` of a sample is left out: another delay acts.
     """
-    moved, electric = ("torque", True) if data.rig.electric else ("flow", False)
-    kinds = [s.equation.rsplit("_", 1) for s in data.segments]
-    joints = sorted({int(number) - 1 for kind, number in kinds if kind.startswith(moved)})
-    names = [name for i in joints for name in gain_names(i + 1)] if not electric else []
-    gains = tuple((n, float(data.beta[n])) for n in names if np.isfinite(data.beta[n]))
-    if not (gains or electric):
+    rig, kind = data.rig, "torque" if data.rig.electric else "flow"
+    moved = [s.equation for s in data.segments if s.equation.startswith(kind)]
+    joints = sorted({int(equation.rsplit("_", 1)[1]) - 1 for equation in moved})
+    paths = sample_paths(rig, joints, {name: float(v) for name, v in data.beta.items()})
+    if not paths:
         return ()
-    paths = [
-        Used(DrivePath(joint=i) if electric else SpoolPath(gains=gains, joint=i)) for i in joints
-    ]
-    rows = [model_rows(data.rig, (*data.terms, *paths), record) for record in data.records]
-    lead, name = least_squares(data.rig, rows), DRIVE_BETWEEN if electric else BETWEEN
-    return tuple(
-        used
-        for used, i in zip(paths, joints, strict=True)
-        if abs(lead.get(f"{name}{i + 1}", np.inf)) <= BETWEEN_SAMPLES
-    )
+    rows = [model_rows(rig, (*data.terms, *paths), record) for record in data.records]
+    lead = least_squares(rig, rows)
+
+    def in_range(used: Used) -> bool:
+        (own,) = used.term.coefficients(rig)
+        return abs(lead.get(own.parameter, np.inf)) <= BETWEEN_SAMPLES
+
+    return tuple(filter(in_range, paths))
