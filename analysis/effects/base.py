@@ -304,6 +304,10 @@ class Effect(Term):
         """Return shapes from which a search finds other forms of the same effect."""
         return ()
 
+    def comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
+        """Return whether the coefficients have the same meaning in the forms of two shapes."""
+        return True
+
     def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
         """Return the name of the effect of `includes` that this one equals ('' if none).
 

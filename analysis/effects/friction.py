@@ -59,6 +59,7 @@ FALLEN: Final = 1 / 3  # of the breakaway, up to the records' top speed: less is
 SLOWEST_FALL: Final = 0.5  # Stribeck over top speed: above it the fall is a line within 7 % rms
 SPEEDS: Final = 200  # points of the curve over speed in which a fall is looked for
 LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it is negligible: prevents division by zero
+GAUSSIAN, EXPONENTIAL = 2.0, 1.0  # exponents of the fall from breakaway
 
 
 @dataclass(frozen=True)
@@ -255,10 +256,10 @@ class CoulombFriction(Friction):
 class StribeckFriction(Friction):
     """F_f = Fs w: breakaway above Coulomb's level (Armstrong-Helouvry et al. 1994).
 
-    The level e = exp(-(s'/vs)^2) falls off over the Stribeck speed vs (shape); w builds up to it
-    at a contact stiffness that does not depend on it (Dahl 1968): dw/ds = (sign(s') - w / e) / d.
-    Alone it is the part that vanishes with speed; together with `coulomb_friction` it is the
-    whole Stribeck curve.
+    The level e = exp(-|s'/vs|^n) falls off over the Stribeck speed vs (shape), with n = 2, or of a
+    shape with an exponent n = 1 (Tustin 1947); w builds up to it at a contact stiffness that does
+    not depend on it (Dahl 1968): dw/ds = (sign(s') - w / e) / d. Alone it is the part that vanishes
+    with speed; together with `coulomb_friction` it is the whole Stribeck curve.
     """
 
     name: ClassVar[str] = "stribeck_friction"
@@ -268,6 +269,7 @@ class StribeckFriction(Friction):
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # at a high Stribeck speed
     beside: ClassVar[bool] = True
     before: ClassVar[int] = 1
+    after: ClassVar[int] = 1
     separated_by: ClassVar[str] = (
         "slow sweeps through zero velocity beside fast ones: it is gone above the Stribeck speed"
     )
@@ -282,16 +284,31 @@ class StribeckFriction(Friction):
         return (Coefficient(f"Fs{self.joint + 1}", force_unit(rig, self.joint), "mechanical"),)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the Stribeck speed, the presliding distance and the transition speed."""
-        return (f"v_stribeck_{self.joint + 1}", *super().shape_names())
+        """Name the Stribeck speed, presliding distance, transition speed and exponent."""
+        joint = self.joint + 1
+        return (f"v_stribeck_{joint}", *super().shape_names(), f"exponent_stribeck_{joint}")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the Stribeck speed [m/s], presliding distance [m] and transition speed [m/s]."""
+        """Return Stribeck speed [m/s], presliding distance [m], transition speed [m/s], exponent.
+
+        A shape without an exponent has n = 2.
+        """
+        first, *_, last = self.shape_names()
         speed = rig.joints[self.joint].limits.speed
         grid = (0.01 * speed, 0.03 * speed, 0.1 * speed)
         unit = f"{path_unit(rig, self.joint)}/s"
-        own = Shape(self.shape_names()[0], unit, 2e-3 * speed, 0.4 * speed, grid)
-        return (own, *super().shapes(rig))
+        own = Shape(first, unit, 1e-3 * speed, 0.4 * speed, grid)
+        exponent = Shape(
+            last, "1", EXPONENTIAL, EXPONENTIAL, (EXPONENTIAL,), detail=True, fixed=True
+        )
+        return (own, *super().shapes(rig), exponent)
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the contact without memory, and the fall with the other exponent."""
+        falling, (distance, _, speed) = self.shape_of(rig, shape)[0], self.contact_of(shape)
+        memory = (distance, 0.0) if self.remembers(shape) else (0.0, speed)
+        exponent = () if shape[3:] else (EXPONENTIAL,)
+        return (*super().other_forms(rig, shape), (falling, *memory, *exponent))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
@@ -303,9 +320,12 @@ class StribeckFriction(Friction):
         return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
 
     def _level(self, rig: Rig, speed: Array, shape: Sequence[float]) -> Array:
-        """Return exp(-(s'/vs)^2) (n,) of speeds s' (n,) [m/s]."""
-        ratio = speed / self.shape_of(rig, shape)[0]
-        return np.asarray(np.exp(-(ratio**2)))
+        """Return exp(-|s'/vs|^n) (n,) of speeds s' (n,) [m/s]."""
+        ratio = np.abs(speed) / self.shape_of(rig, shape)[0]
+        return np.asarray(np.exp(-(ratio ** self._exponent(shape))))
+
+    def _exponent(self, shape: Sequence[float]) -> float:
+        return shape[3] if len(shape) > 3 else GAUSSIAN
 
     def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
@@ -316,10 +336,10 @@ class StribeckFriction(Friction):
         return np.asarray(shape[1] * contact_under_load(s, level, 1.0 / shape[1]))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), Fs, Stribeck speed, presliding distance, transition speed."""
-        falling = self.shape_of(rig, shape)[0]
+        """Return joint (0-based), Fs, Stribeck speed, distance, transition speed, exponent."""
+        force, falling = values[f"Fs{self.joint + 1}"], self.shape_of(rig, shape)[0]
         distance, _, speed = self.contact_of(shape)
-        return np.array([self.joint, values[f"Fs{self.joint + 1}"], falling, distance, speed])
+        return np.array([self.joint, force, falling, distance, speed, self._exponent(shape)])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a breakaway below Coulomb's level, too much of it, and a speed at its bounds.
@@ -382,7 +402,7 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
     # The hidden state is w times d [m].
     if phase == CONTRIBUTE:
         i = int(par[0])
-        level = math.exp(-((x[SD, i] / par[2]) ** 2))
+        level = math.exp(-(abs(x[SD, i] / par[2]) ** par[5]))
         if par[3] > 0.0:
             level = max(level, LEAST_LEVEL)
         # At a constant stiffness the distance goes with the level.

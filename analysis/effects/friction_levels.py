@@ -205,6 +205,10 @@ class PressureDependentFriction(Friction):
             forms = (*forms, (*memory, DIFFERENCE_LOAD, *constant))
         return forms
 
+    def comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
+        """Return whether both shapes are of the same load."""
+        return self._weight(shape) == self._weight(other)
+
     def _weight(self, shape: Sequence[float]) -> float:
         """Return the weight of the rod pressure in the load."""
         return shape[3] if len(shape) > 3 else SUM

@@ -107,6 +107,9 @@ class TraceSettings:
     """Multiple of the form's tolerance up to which the richer of two names is close to the simpler:
     its further number must then remove more than the richer form itself leaves (tuned: Maxwell slip
     shows 13 % of difference)."""
+    form_noise: float = 2.0
+    """Energy by which noise alone may prefer one form of an effect to another (arithmetic: twice
+    the mean of one number's)."""
     # Significance.
     sign_flips: int = 199
     """Number of sign flips; p is not below 0.005 (convention)."""

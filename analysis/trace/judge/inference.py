@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.identify.geometry import wider
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
@@ -142,7 +143,7 @@ def estimates(
     units |= {s.parameter: s.unit for s in shapes_of(rig, used)}
     half = half_width(errors.std, errors.dof)
     out = {
-        name: wider(
+        name: _with_form_error(
             Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h))),
             shift.get(name, 0.0),
         )
@@ -155,6 +156,21 @@ def estimates(
             low, high = out[name].ci95
             out[name] = replace(out[name], ci95=(min(low, *beyond), max(high, *beyond)))
     return out
+
+
+def _with_form_error(estimate: Estimate, shift: float) -> Estimate:
+    """Return an estimate whose interval includes the standard error `shift` by unknown forms.
+
+    Another form changes a size by a factor but not its sign: an interval that excludes 0 still
+    does.
+    """
+    (low, high), out = estimate.ci95, wider(estimate, shift)
+    if not low * high > 0.0:
+        return out
+    factor = 1.0 + IDENTIFY.normal_quantile * shift / abs(estimate.value)
+    if low > 0.0:
+        return replace(out, ci95=(max(out.ci95[0], low / factor), out.ci95[1]))
+    return replace(out, ci95=(out.ci95[0], min(out.ci95[1], high / factor)))
 
 
 def is_of_unknown_size(

@@ -14,15 +14,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import Effect
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces, segments
 from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
-from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData, Segment
+from analysis.trace.search.hypothesis import parameter_values
 from analysis.trace.search.refinement import (
     ExactFit,
     contribution,
@@ -113,18 +113,18 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
 
     Two errors are added as squares. (1) Where an effect has another form (`Effect.other_forms`),
     that is fitted too and shifts each coefficient, but for its own under another load, where they
-    mean something else. The shift counts by sqrt(E / E'), with E and E'
-    the energies above noise that the chosen and the other form leave: in full where the other is as
-    good. (2) An effect may not grow in proportion, with x (1 + e |x| / rms x) in place of its
-    contribution x to the rows. Where e exceeds `TRACE.standard_errors` of its noise, the shift that
-    it makes counts.
+    mean something else. The shift counts by sqrt(E / (E + D)), with E the energy above noise that
+    the chosen form leaves, at least `TRACE.form_noise`, and D what the other leaves more: in full
+    where the other is as good, and not at all where it is physically impossible. (2) An effect may
+    not grow in proportion, with x (1 + e |x| / rms x) in place of its contribution x to the rows.
+    Where e exceeds `TRACE.standard_errors` of its noise, the shift that it makes counts.
     """
-    noise = len(fit.residual)
-    own = max(fit.energy - noise, np.sqrt(2.0 * noise))
+    own = max(fit.energy - len(fit.residual), TRACE.form_noise)
     squares = _growth_shift_squares(train_data, fit)
     for other in fits_in_other_forms(train_data, fit):
-        left = max(other.energy - noise, np.sqrt(2.0 * noise))
-        share = min(1.0, own / left)
+        if not _is_possible(train_data.rig, other):
+            continue
+        share = own / (own + max(0.0, other.energy - fit.energy))
         incomparable = _of_other_meaning(train_data.rig, fit, other)
         for name, value in other.beta.items():
             if name in incomparable:
@@ -134,17 +134,19 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
 
 
+def _is_possible(rig: Rig, fit: ExactFit) -> bool:
+    """Return whether the numbers of all effects of a fit are physically possible."""
+    values = parameter_values(rig, fit.terms, dict(fit.beta))
+    effects = [(u.term, u.shape) for u in fit.terms if isinstance(u.term, Effect)]
+    return not any(e.problem(rig, values, s) or e.outside(rig, s) for e, s in effects)
+
+
 def _of_other_meaning(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:
-    """Return the coefficients of effects whose fixed shapes, as the load of a friction, differ."""
-
-    def fixed(used: Used) -> list[float]:
-        shapes = shapes_of(rig, used)
-        return [v for s, v in zip(shapes, used.shape, strict=True) if s.fixed]
-
+    """Return the coefficients of effects whose other form gives them another meaning."""
     return {
         c.parameter
         for used, changed in zip(fit.terms, other.terms, strict=True)
-        if isinstance(used.term, Effect) and fixed(used) != fixed(changed)
+        if isinstance(used.term, Effect) and not used.term.comparable(used.shape, changed.shape)
         for c in used.term.coefficients(rig)
     }
 

@@ -261,12 +261,16 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
     """Return the fit with the term number `place` in the form that leaves least.
 
     Each further free number that a form has must be significant (`TRACE.standard_errors`): an
-    exponent that is not would widen the interval of the size tenfold.
+    exponent that is not would widen the interval of the size tenfold. A form within its physical
+    bounds is preferred to one at them.
     """
     price = TRACE.standard_errors**2
 
-    def priced(model: ExactFit) -> float:
-        return model.energy + price * len(_free_shapes(data, model.terms))
+    def priced(model: ExactFit) -> tuple[bool, float]:
+        used = model.terms[place]
+        assert isinstance(used.term, Effect)
+        outside = bool(used.term.outside(data.rig, used.shape))
+        return outside, model.energy + price * len(_free_shapes(data, model.terms))
 
     while True:
         used = fit.terms[place]

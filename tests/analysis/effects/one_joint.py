@@ -25,18 +25,17 @@ Array = NDArray[np.float64]
 FLOW = 11.7e-3 / 60  # the pump's [m^3/s]
 P0 = 101_325.0
 NAMES = (
-    "Fc", "Fs", "v_stribeck", "F_ext", "F_ret", "k_friction", "k_seal", "presliding",
+    "Fc", "Fs", "v_stribeck", "fall", "F_ext", "F_ret", "k_friction", "k_seal", "presliding",
     "stiffening", "inclination", "k_spring", "rest", "T_offset",
     "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool",
     "c_internal", "c_cap", "c_rod", "dp_supply", "p_tank", "p_back",
     "alpha_air", "V_cap", "V_rod", "m_payload",
 )  # fmt: skip
 (
-    FC, FS, VS, FE, FR, KF, KD, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD, ASTERN,
-    NULL, UNDERLAP,
-    TAU, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD, LOAD,
+    FC, FS, VS, FALL, FE, FR, KF, KD, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD,
+    ASTERN, NULL, UNDERLAP, TAU, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD, LOAD,
 ) = range(len(NAMES))  # fmt: skip
-SHAPES = {"presliding": 40e-6, "v_stribeck": 0.03, "rest": -1.35}
+SHAPES = {"presliding": 40e-6, "v_stribeck": 0.03, "fall": 2.0, "rest": -1.35}
 NAMES_1 = ("M2", "Fv2", "W2", "b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2")
 END = 11 + len(NAMES)  # of what is wrong, in what is passed to the integrator
 CHANNELS = ("spool", "piston", "cap_pressure", "rod_pressure")
@@ -114,7 +113,10 @@ def _ports(cap, rod, ahead, astern, par, e):
 def _friction(v, cap, rod, deflection, e):
     z = deflection / e[DELTA]
     level = (
-        e[FC] + e[FS] * math.exp(-((v / e[VS]) ** 2)) + e[KF] * (cap + rod) + e[KD] * abs(cap - rod)
+        e[FC]
+        + e[FS] * math.exp(-(abs(v / e[VS]) ** e[FALL]))
+        + e[KF] * (cap + rod)
+        + e[KD] * abs(cap - rod)
     )
     level += e[FE] if z > 0 else e[FR]
     rate = 0.0 if level == 0.0 else v - abs(v) * deflection / e[DELTA]

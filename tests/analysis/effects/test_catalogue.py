@@ -171,8 +171,9 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         path = worked(s, signals.sd[:, e.joint], sum(shape[1:2]))
         return np.asarray(contact_under_load(path, load, stiffness) / stiffness)
     if e.name == "stribeck_friction":
-        level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))
-        return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
+        exponent = sum(shape[3:4]) or 2.0
+        level = np.exp(-(np.abs(signals.sd[:, e.joint] / shape[0]) ** exponent))
+        return np.asarray(contact_under_load(s, level, 1.0 / shape[1]) * shape[1])
     if e.family == "friction":
         distance, *stiffening = shape[4:5] if e.name == "friction_curve" else shape
         path = worked(s, signals.sd[:, e.joint], sum(stiffening[:1]))

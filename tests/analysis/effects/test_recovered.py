@@ -97,9 +97,13 @@ CASES = (
         "sensor_offset", "bench", {"offset_supply_pressure": 2e5},
         {"offset_supply_pressure": 2e5},
     ),
+    Case(  # a breakaway that falls with exp(-v/vs)
+        "stribeck_friction", "joint 2", {"Fs": 50, "fall": 1.0, "v_stribeck": 0.06},
+        {"Fs2": 50, "v_stribeck_2": 0.06, "exponent_stribeck_2": 1.0}, 0.1, 1.5,
+    ),
 )  # fmt: skip
 IDS = [f"{case.name} {case.where}" for case in CASES]
-EACH_FAMILY = (0, 4, 6, 8, 10, 12, 16, 18, 20, 24)
+EACH_FAMILY = (0, 4, 6, 8, 10, 12, 16, 18, 20, 24, 27)
 
 
 @pytest.fixture(scope="module")

@@ -101,10 +101,16 @@ def opened(x: float, form: float, rounding: float) -> float:
 
 
 @njit(cache=True)
+def breakaway(v: float, j: Array) -> Any:
+    """Friction [N] above the sliding level at speed v (Hess and Soom 1990)."""
+    return j[BREAKAWAY] / (1.0 + (v / j[STRIBECK]) ** 2)
+
+
+@njit(cache=True)
 def level(v: float, s: float, cap: float, rod: float, j: Array) -> Any:
     """Sliding friction [N] at speed v: by direction, falling with speed, by pressure, by place."""
     size = j[AHEAD] if v >= 0.0 else j[ASTERN]
-    size += j[BREAKAWAY] * math.exp(-abs(v) / j[STRIBECK])
+    size += breakaway(v, j)
     size += j[BY_PRESSURE] * (cap + rod if j[PRESSURE_FORM] == 0.0 else abs(cap - rod))
     return size * (1.0 + j[TAPER] * s)
 
@@ -118,7 +124,7 @@ def dry(v: float, s: float, z: float, cap: float, rod: float, others: float, j: 
         return 0.0, 0.0
     if form == KARNOPP:
         if abs(v) < j[WIDTH]:
-            hold = size + j[BREAKAWAY] * (1.0 - math.exp(-abs(v) / j[STRIBECK]))
+            hold = size + j[BREAKAWAY] - breakaway(v, j)
             return min(max(others, -hold), hold), 0.0
         return (size if v > 0.0 else -size), 0.0
     if form == TANH:
