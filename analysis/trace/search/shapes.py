@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from analysis.effects.base import Effect, open_shapes, shapes_of
 from analysis.identify import checks as ck
 from analysis.simulation.model import Estimate
-from analysis.terms.base import Used
+from analysis.terms.base import Term, Used
 from analysis.trace.data.candidates import shape_grid
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
@@ -33,7 +33,9 @@ def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
     """Fit the open shapes of a model's terms to the runs' rows; return None where none is open.
 
     By variable projection: effects are added one after another, each from the points of its shape
-    grid that leave least. Given shapes are kept. Raises InputError for unusable records.
+    grid that leave least. Then each is searched anew beside the others until none leaves less:
+    without its lag, the flow of one joint would spoil b for the lag of another. Given shapes are
+    kept. Raises InputError for unusable records.
     """
     rig = ck.common_rig(runs)
     wanted = [u for u in terms if open_shapes(rig, u)]
@@ -44,19 +46,31 @@ def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
         rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
     )
     seen = evidence(data, data.mean_residual)
-    refined: tuple[Used, ...] = ()
-    for used in wanted:
-        assert isinstance(used.term, Effect)
-        looks = shape_grid(used.term, rig, seen)
-        trials = [(*data.terms, *refined, Used(used.term, p)) for p in looks]
+
+    def searched(effect: Term, others: Sequence[Used], place: int) -> ExactFit:
+        assert isinstance(effect, Effect)
+        trials = [
+            (*data.terms, *others[:place], Used(effect, point), *others[place:])
+            for point in shape_grid(effect, rig, seen)
+        ]
         # Several starts, since the best point may be one from which no search leads on: a metering
         # edge that no spool reaches has no derivative.
-        near = sorted(trials, key=lambda trial: fit_coefficients(data, trial).energy)[
-            : SEARCH.shape_starts
-        ]
-        best = min((refine(data, trial) for trial in near), key=lambda candidate: candidate.energy)
-        refined = best.terms[len(data.terms) :]
-    shaped = dict(zip(wanted, refined, strict=True))
+        near = sorted(trials, key=lambda trial: fit_coefficients(data, trial).energy)
+        starts = near[: SEARCH.shape_starts]
+        return min((refine(data, trial) for trial in starts), key=lambda fit: fit.energy)
+
+    best = fit_coefficients(data, data.terms)
+    for k, used in enumerate(wanted):
+        best = searched(used.term, best.terms[len(data.terms) :], k)
+    improved = len(wanted) > 1
+    while improved:
+        improved = False
+        for k, used in enumerate(wanted):
+            own = best.terms[len(data.terms) :]
+            again = searched(used.term, (*own[:k], *own[k + 1 :]), k)
+            if again.energy < best.energy - SEARCH.number_price:
+                best, improved = again, True
+    shaped = dict(zip(wanted, best.terms[len(data.terms) :], strict=True))
     return ShapeFit(tuple(shaped.get(u, u) for u in terms), data, best)
 
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 
 from analysis.effects.base import open_shapes
 from analysis.identify.identify import identify
 from analysis.terms import with_effects
 from analysis.terms.base import Used
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import with_shape_errors
+from analysis.trace.search import shapes
+from analysis.trace.search.refinement import ExactFit, fit_coefficients
 from analysis.trace.search.shapes import ShapeFit, fit_shapes, shapes_in
+from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
@@ -35,9 +41,9 @@ def test_a_dead_band_is_found_with_both_edges_and_the_gains_come_back(
     rig: Rig, overlapped: Run
 ) -> None:
     terms = shaped(overlapped, used(rig, "valve_deadband@joint 2")).terms
-    shapes = {name: shape.value for name, shape in shapes_in(rig, terms).items()}
-    assert shapes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
-    assert shapes["w_astern_2"] == pytest.approx(5e-3, rel=0.05)
+    sizes = {name: shape.value for name, shape in shapes_in(rig, terms).items()}
+    assert sizes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
+    assert sizes["w_astern_2"] == pytest.approx(5e-3, rel=0.05)
     found = identify([overlapped], terms=terms).estimates
     plain = identify([overlapped]).estimates
     off = [abs(e["C_pp_2"].value / TRUTH["C_pp_2"] - 1) for e in (found, plain)]
@@ -49,8 +55,28 @@ def test_what_the_records_do_not_have_comes_out_as_next_to_nothing(rig: Rig) -> 
     """And not as edges that no spool ever reaches."""
     run = experiment(rig, repeats=2)
     terms = shaped(run, used(rig, "valve_deadband@joint 2")).terms
-    shapes = {name: shape.value for name, shape in shapes_in(rig, terms).items()}
-    assert max(shapes["w_ahead_2"], shapes["w_astern_2"]) < 1e-3
+    sizes = {name: shape.value for name, shape in shapes_in(rig, terms).items()}
+    assert max(sizes["w_ahead_2"], sizes["w_astern_2"]) < 1e-3
+
+
+def test_a_search_that_ended_in_a_local_minimum_beside_another_effect_is_begun_anew(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a dead band of half a volt no search leads on, with the right lag beside it neither."""
+    run = experiment(rig, repeats=2, w_ahead=8e-3, w_astern=8e-3, tau_spool=3e-3)
+    terms = used(rig, "valve_deadband@joint 2", "spool_lag@joint 2")
+    whole, calls = shapes.refine, []
+
+    def refined(data: RegressionData, trial: Sequence[Used]) -> ExactFit:
+        calls.append(trial)
+        if len(calls) > SEARCH.shape_starts:
+            return whole(data, trial)
+        return fit_coefficients(data, (*trial[:-1], Used(trial[-1].term, (0.5, 0.5, 0.0))))
+
+    monkeypatch.setattr(shapes, "refine", refined)
+    found = {n: e.value for n, e in shapes_in(rig, shaped(run, terms).terms).items()}
+    assert found["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
+    assert found["tau_spool_2"] == pytest.approx(3e-3, rel=0.05)
 
 
 def test_a_shape_that_is_given_stays_and_dry_friction_needs_none(rig: Rig, overlapped: Run) -> None:
@@ -65,9 +91,9 @@ def test_a_shape_that_is_given_stays_and_dry_friction_needs_none(rig: Rig, overl
 def test_edges_come_with_intervals_that_hold(rig: Rig, overlapped: Run) -> None:
     found = shaped(overlapped, used(rig, "valve_deadband@joint 2"))
     model = identify([overlapped], terms=found.terms).model
-    wider, shapes = with_shape_errors(found, model)
+    wider, edges = with_shape_errors(found, model)
     for name, size in (("w_ahead_2", 8e-3), ("w_astern_2", 5e-3)):
-        low, high = shapes[name].ci95
+        low, high = edges[name].ci95
         assert low < size < high
         assert high - low < 0.2 * size
     assert wider.values == model.values
