@@ -17,7 +17,7 @@ from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.remaining import remainders
 from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
 from analysis.trace.search.confounders import act_at_one_joint
-from analysis.trace.search.hypothesis import Hypothesis, law_of
+from analysis.trace.search.hypothesis import Hypothesis, law_of, may_grow
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 
@@ -106,7 +106,7 @@ def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothe
     larger: Hypothesis | None = None
     if not above_form_error:
         larger = wide.completed_to_noise(hypothesis)
-    elif len(hypothesis.effects) < SEARCH.largest_set:
+    elif may_grow(hypothesis.effects):
         larger = wide.extended_in(hypothesis, above_form_error)
     return hypothesis if larger is None or _curves_share_a_balance(wide, larger) else larger
 

@@ -300,8 +300,8 @@ class SearchSettings:
     """Largest fitted size over the size for which the first-order column of a signal change was
     computed; smaller sizes are closer to linear (tuned)."""
     # Effort.
-    largest_set: int = 3
-    """Largest number of effects in a set that is extended."""
+    most_names: int = 3
+    """Largest number of effects in a set; one that acts at several joints counts once."""
     pair_starts: int = 10
     """Number of single candidates from which pairs are tried."""
     full_fits: int = 40

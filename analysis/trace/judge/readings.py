@@ -20,7 +20,13 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.inference import effect_errors, estimates
 from analysis.trace.judge.scatter import form_shift
-from analysis.trace.search.hypothesis import Hypothesis, Key, of_one_law, parameter_values
+from analysis.trace.search.hypothesis import (
+    Hypothesis,
+    Key,
+    may_grow,
+    of_one_law,
+    parameter_values,
+)
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
 
@@ -201,7 +207,7 @@ def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypo
                 kept.append(used)
             elif used.term.name not in effect.includes:
                 continue
-            if len(kept) == SEARCH.largest_set:
+            if not may_grow(kept):
                 continue
             effects = (*kept, Used(effect, effect.shape_of(rig, ())))
             sets[frozenset((u.term.name, u.term.where) for u in effects)] = effects

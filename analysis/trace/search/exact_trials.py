@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 
 from analysis.terms.base import Used
-from analysis.trace.search.hypothesis import Hypothesis, Key
+from analysis.trace.search.hypothesis import Hypothesis, Key, may_grow
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.settings import SEARCH
@@ -57,7 +57,7 @@ def _best_trials(
     starts: list[tuple[Used, ...]] = [
         tuple(u for u in now.effects if u is not used) for used in now.effects
     ]
-    if len(now.effects) < SEARCH.largest_set:
+    if may_grow(now.effects):
         starts.append(now.effects)
     for start in starts:
         yield from _best_additions(hypotheses, now, start, equations)

@@ -47,6 +47,11 @@ class Hypothesis:
         return sum(max(0.0, e) for e in self.excess_energy.values())
 
 
+def may_grow(effects: Sequence[Used], by: int = 1) -> bool:
+    """Return whether a set may have so many more effects of other names (`SEARCH.most_names`)."""
+    return len({used.term.name for used in effects}) + by <= SEARCH.most_names
+
+
 def law_of(used: Used) -> Key:
     """Return the mechanism and the place of an effect."""
     assert isinstance(used.term, Effect)

@@ -36,6 +36,7 @@ from analysis.trace.search.hypothesis import (
     energy_above_noise,
     is_special_case,
     law_of,
+    may_grow,
     negative_body,
     noise_band,
     parameter_values,
@@ -175,13 +176,20 @@ class HypothesisSet:
         )
 
     def is_preferred(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether a set leaves much less than `other`, or about as little and is simpler."""
+        """Return whether a set leaves much less than `other`, or about as little and is simpler.
+
+        Of two equally simple ones that leave about the same in all, that is preferred which leaves
+        less for its equations: what one effect leaves elsewhere may hide what another spoils.
+        """
         slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
         more, near = self.log_energy_ratio(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
         if hypothesis.size < other.size:
             return more <= near or hypothesis.total <= other.total + slack
         if hypothesis.size > other.size:
             return more < -near and hypothesis.total < other.total - slack
+        about = hypothesis.total / SEARCH.simpler_ratio, hypothesis.total * SEARCH.simpler_ratio
+        if abs(more) > near and about[0] <= other.total <= about[1]:
+            return more < 0.0
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
@@ -192,9 +200,17 @@ class HypothesisSet:
         allowed = [o for o in (*among, *self._simpler_sets(among)) if not self.physical_problem(o)]
         if not allowed:
             return self.empty
+
+        def preferred(one: Hypothesis, other: Hypothesis) -> Hypothesis:
+            return other if self.is_preferred(other, one) else one
+
         least = min(allowed, key=lambda o: o.total)
+        least = functools.reduce(preferred, (o for o in allowed if o.size == least.size), least)
         near = [o for o in allowed if o is least or self.is_preferred(o, least)]
-        return min(near, key=lambda o: (sum(o.size), o.size[0], o.total))
+        simplest = min((sum(o.size), o.size[0]) for o in near)
+        return functools.reduce(
+            preferred, (o for o in near if (sum(o.size), o.size[0]) == simplest)
+        )
 
     def _simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return sets with an effect replaced by a simpler one that it equals."""
@@ -243,10 +259,7 @@ class HypothesisSet:
             far = [o for o in others if self.log_energy_ratio(o, now) < -SEARCH.far_log_gain]
             return self.completed_to_noise(self.prune(self.best([now, *far])))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while (
-            not within_band(now.excess_energy, self.noise_band)
-            and len(now.effects) < SEARCH.largest_set
-        ):
+        while not within_band(now.excess_energy, self.noise_band) and may_grow(now.effects):
             grown = self.prune(self.best([now, *self.extensions(now)]))
             if grown.keys == now.keys or self.log_energy_ratio(now, grown) < SEARCH.least_log_gain:
                 break
@@ -274,10 +287,7 @@ class HypothesisSet:
         The set leaves no more than form error already: an effect that leaves less, but not only
         noise, would just fit that error.
         """
-        if (
-            within_band(now.excess_energy, self.noise_band)
-            or len(now.effects) >= SEARCH.largest_set
-        ):
+        if within_band(now.excess_energy, self.noise_band) or not may_grow(now.effects):
             return now
         more = [o for o in self.extensions(now) if within_band(o.excess_energy, self.noise_band)]
         best = self.best(more) if more else now
@@ -433,7 +443,7 @@ class HypothesisSet:
         assert isinstance(own, Effect)
         known = now.keys | {(u.term.name, u.term.where) for u in self.base}
         others = tuple(u for u in now.effects if u is not used)
-        if len(others) + 2 > SEARCH.largest_set:
+        if not may_grow(others, by=2):
             return []
         simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
         confounders = [
@@ -466,7 +476,7 @@ class HypothesisSet:
         Counted over all equations, the form error of a large effect in one equation would hide a
         small effect in another.
         """
-        if len(now.effects) >= SEARCH.largest_set:
+        if not may_grow(now.effects):
             return None
 
         def residual(hypothesis: Hypothesis) -> float:
