@@ -322,6 +322,14 @@ class SearchSettings:
     """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
     steps: int = 20
     """Largest number of steps of a refinement."""
+    first_steps: int = 3
+    """Number of steps of a refinement, and of its continuation, after which it is asked whether the
+    set is promising."""
+    unpromising_ratio: float = 10.0
+    """Energy of a set over that of the set that it may replace, above which it is unpromising."""
+    promising_drop: float = 0.5
+    """Energy after the continuation over that before, up to which a set stays promising (tuned:
+    useless sets 0.7 to 1)."""
     shape_error: float = 0.25
     """Largest relative standard error of a shape beside the details of its effect's form (tuned:
     contacts that stiffen have 0.01 to 0.07, noise at rest that passes for one 0.4 to 1)."""

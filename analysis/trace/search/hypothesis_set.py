@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 import logging
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 
@@ -123,11 +124,14 @@ class HypothesisSet:
                 return problem if used is first else whose + problem
         return negative_body(rig, hypothesis.fit, self.empty.fit)
 
-    def refined(self, effects: Sequence[Used]) -> Hypothesis:
-        """Return the exact fit of a set of effects, computed once for its names and places."""
+    def refined(self, effects: Sequence[Used], limit: float = math.inf) -> Hypothesis:
+        """Return the exact fit of a set of effects, computed once for its names and places.
+
+        The search of its shapes ends early where they leave more than the energy `limit`.
+        """
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.fitted:
-            fit = refine(self.train_data, (*self.base, *effects))
+            fit = refine(self.train_data, (*self.base, *effects), limit)
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
@@ -409,7 +413,8 @@ class HypothesisSet:
         """
         seen = {now.keys}
         while sets := self._confusable_sets(now):
-            pruned = self.prune(self.best([now, *map(self.refined, sets)]))
+            limit = SEARCH.unpromising_ratio * now.fit.energy
+            pruned = self.prune(self.best([now, *(self.refined(s, limit) for s in sets)]))
             other = self.best([now, pruned])  # one that lost an effect again may be worse
             if other.keys in seen:
                 break

@@ -190,14 +190,27 @@ def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     return ExactFit(tuple(terms), dict(zip(names, values, strict=True)), residual, information)
 
 
-def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
+def refine(
+    data: RegressionData, terms: Sequence[Used], limit: float = math.inf, steps: int = SEARCH.steps
+) -> ExactFit:
     """Return the fit with the shapes of all effects that are not among the data's own terms.
+
+    One that leaves more than the energy `limit` and little less than `SEARCH.first_steps` before is
+    returned as it is.
 
     The search starts from the shapes given. Of the forms of an effect the one that leaves least, at
     a price for each free number, is used. Then details of the form are added that remove more than
     chance (`SEARCH.number_price`) and more than `SEARCH.detail_share` of the remaining energy above
     noise.
     """
+    if math.isfinite(limit):
+        first = _with_searched_shapes(data, terms, SEARCH.first_steps)
+        terms = first.terms
+        if first.energy > limit:
+            second = _with_searched_shapes(data, terms, SEARCH.first_steps)
+            if second.energy > max(limit, SEARCH.promising_drop * first.energy):
+                return second
+            terms = second.terms
     fit = _with_searched_shapes(data, terms, steps)
     for k in range(len(terms)):
         used = fit.terms[k]

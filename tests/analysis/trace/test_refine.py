@@ -17,6 +17,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.search import refinement
 from analysis.trace.search.hypothesis import energy_above_noise
+from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 from tests.analysis.trace.gate_cases import searched
@@ -54,6 +55,35 @@ def test_the_search_goes_on_until_very_different_overlaps_are_found(
     band = Used(make("valve_deadband", "joint 2"), (0.0042, 0.0042, 0.0028))
     ahead, astern, *_ = refinement.refine(train_data, (*train_data.terms, band)).terms[-1].shape
     assert (ahead, astern) == pytest.approx(edges, rel=0.02)
+
+
+def test_the_search_of_a_set_that_leaves_too_much_ends_where_it_leads_nowhere(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From edges beyond the spool's travel no step leads on; from others each step does."""
+    wrong = bench.Wrong.of(w_ahead=5e-3, w_astern=8e-3)
+    records = conditioned_records(rig, [bench.run(rig, wrong, 0.03, 1)])
+    train_data = regression_data(rig, tuple(map(Used, baseline())), records)
+    searches: list[int] = []
+    whole = refinement.minimise
+
+    def counted(*arguments: Any, max_nfev: int, **named: Any) -> Any:
+        searches.append(max_nfev)
+        return whole(*arguments, max_nfev=max_nfev, **named)
+
+    def refined(edge: float, limit: float = np.inf) -> tuple[float, list[int]]:
+        searches.clear()
+        band = Used(make("valve_deadband", "joint 2"), (edge, edge, 0.0028))
+        fit = refinement.refine(train_data, (*train_data.terms, band), limit)
+        return fit.energy, list(searches)
+
+    monkeypatch.setattr(refinement, "minimise", counted)
+    least, _ = refined(6e-3)
+    first, most = SEARCH.first_steps, SEARCH.steps
+    assert refined(0.5, 1.1 * least)[1] == [first, first]
+    energy, steps = refined(0.02, 1.1 * least)
+    assert energy == pytest.approx(least, rel=1e-3)
+    assert most in steps
 
 
 @pytest.mark.parametrize("stiffening", [0.0, 60.0])
