@@ -57,7 +57,9 @@ class AsymmetricFriction(Friction):
     name: ClassVar[str] = "asymmetric_friction"
     least: ClassVar[tuple[float, ...]] = (30.0, 10.0)  # [N] either way
     variable: ClassVar[str] = "the direction of the piston's motion"
-    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset", "sensor_offset")
+    confounders: ClassVar[tuple[str, ...]] = (
+        "coulomb_friction", "torque_offset", "sensor_offset", "sensor_gain", "base_inclination",
+    )  # fmt: skip
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # where both levels are equal
     separated_by: ClassVar[str] = (
         "motion about several places of the stroke: an offset torque does not change with G"

@@ -337,7 +337,8 @@ def _with_best_tied_set(
     if best is found.winner:
         return found
     other = _apply_gates(found.hypotheses, best, holdout_data, rng)
-    return other if other.verdict == CONFOUNDED else found
+    all_pass = best.keys <= other.winner.keys
+    return other if all_pass and other.verdict == CONFOUNDED else found
 
 
 def _try_free_forms(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -82,6 +82,7 @@ class Rival:
     of the best set, held out and in training. `tied`: the records cannot separate the two. `at` is
     the rival's place in the catalogue, with sensor or chamber. `moved` names the baseline parameter
     that a tied rival changes most, with its relative change; None if it changes none noticeably.
+    `beside` is a second effect, which fits in the place of the judged one only with the first.
     """
 
     name: str
@@ -91,11 +92,20 @@ class Rival:
     tied: bool
     at: str = ""
     moved: tuple[str, float] | None = None
+    beside: Rival | None = None
 
     @property
     def location(self) -> str:
-        """Where it is, in words: of a sensor or chamber, which."""
-        return place_in_words(self.at or self.where)
+        """Where it is, in words: of a sensor or chamber, which; with the effect beside it."""
+        place = place_in_words(self.at or self.where)
+        other = self.beside
+        return f"{place} with {other.name} at {other.location}" if other else place
+
+    @property
+    def effects(self) -> tuple[Rival, ...]:
+        """The rival and the effect beside it, each as a rival by itself."""
+        alone = replace(self, beside=None)
+        return (alone, *self.beside.effects) if self.beside else (alone,)
 
 
 @dataclass(frozen=True)
@@ -267,12 +277,16 @@ class Trace:
     @property
     def tied_at(self) -> list[tuple[str, str]]:
         """Name and catalogue place (with sensor or chamber) of the rivals of `tied`."""
-        return sorted({(r.name, r.at or r.where) for e in self.effects for r in e.rivals if r.tied})
+        return sorted({(r.name, r.at or r.where) for r in self._tied_rivals})
 
     @property
     def tied(self) -> list[tuple[str, str]]:
         """Name and place of the rivals that the data cannot separate from an effect named."""
-        return sorted({(r.name, r.where) for e in self.effects for r in e.rivals if r.tied})
+        return sorted({(r.name, r.where) for r in self._tied_rivals})
+
+    @property
+    def _tied_rivals(self) -> list[Rival]:
+        return [x for e in self.effects for r in e.rivals if r.tied for x in r.effects]
 
     def worst(self, error: Mapping[str, float]) -> float:
         """Return the largest of the held-out errors, `before` or `after`, over its noise floor."""
@@ -370,8 +384,9 @@ def _effect(effect: JudgedEffect) -> dict[str, Any]:
                 "held_out_ratio": finite(r.ratio), "training_ratio": finite(r.training_ratio),
                 "tied": r.tied,
                 "moved": {"parameter": r.moved[0], "relative": r.moved[1]} if r.moved else None,
+                "beside": [x.name for x in rival.effects if (x.name, x.at) != (r.name, r.at)],
             }
-            for r in effect.rivals
+            for rival in effect.rivals for r in rival.effects
         ],
         "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in effect.gates],
         "shooting": _shot(effect.shot) if effect.shot else None,

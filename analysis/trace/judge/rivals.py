@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from analysis.effects.base import Effect
 from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
-from analysis.terms.base import Used
+from analysis.terms.base import Term, Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import removal
 from analysis.trace.judge.curves import noise_covariance
@@ -75,23 +76,35 @@ def rivals_of(
         near = TRACE.tie_ratio_training if other.amplifies else TRACE.tie_ratio
         tied = held_out_test.ties(rival_residual, near) and (alike or ratio < TRACE.decisive_ratio)
         own = judged_effect.family if same_law else ""
-        moved = _moved_parameter(train_data, winner, hypothesis, own) if tied else None
+        moved = moved_parameter(train_data, winner, hypothesis, own) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
         free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
         if not same_law and not justified and (moved is None or free):
             continue
-        rival = Rival(
-            other.name, place_of(other), ratio, training_test.ratio(hypothesis.fit.residual), tied,
-            other.where, moved,
-        )  # fmt: skip
+        rival = _rival(other, ratio, training_test.ratio(hypothesis.fit.residual), tied, moved)
         if not same_law or moved is not None:
             out.append(rival)
         elif tied:
             richer.append(rival)
+    for composite, ratio in _tied_composites(hypotheses, winner, used, holdout_data, held_out_test):
+        moved = moved_parameter(train_data, winner, composite)
+        # One effect is the simpler explanation, unless the records prefer two.
+        if moved and _cost(composite, holdout_data) < _cost(winner, holdout_data):
+            ratios = ratio, training_test.ratio(composite.fit.residual)
+            one, two = (_rival(u.term, *ratios, True) for u in composite.effects[-2:])
+            out.append(replace(one, moved=moved, beside=two))
     if any(rival.tied for rival in out):
         out += richer
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: max(TRACE.most_rivals, sum(r.tied for r in out))]
+
+
+def _rival(
+    effect: Term, ratio: float, training_ratio: float, tied: bool,
+    moved: tuple[str, float] | None = None,
+) -> Rival:  # fmt: skip
+    assert isinstance(effect, Effect)
+    return Rival(effect.name, place_of(effect), ratio, training_ratio, tied, effect.where, moved)
 
 
 def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
@@ -100,8 +113,8 @@ def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
     return more <= 0 or rival.total <= winner.total - SEARCH.number_price * more
 
 
-def _moved_parameter(
-    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str
+def moved_parameter(
+    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str = ""
 ) -> tuple[str, float] | None:
     """Return the baseline parameter that a rival changes most, and its relative change.
 
@@ -134,9 +147,16 @@ def _moved_parameter(
 
 
 def _deviations(train_data: RegressionData, hypothesis: Hypothesis) -> dict[str, float]:
-    """Return the standard deviations from noise of a set's coefficients and shapes, by name."""
-    names, covariance = noise_covariance(train_data, hypothesis.fit)
-    return dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    """Return the standard deviations from noise of a set's coefficients, by name.
+
+    Those that the rows do not determine are left out: the pseudo-inverse gives them less variance
+    than 1 / I, with their information I.
+    """
+    fit = hypothesis.fit
+    names, covariance = noise_covariance(train_data, fit)
+    variance = dict(zip(names, np.diag(covariance).tolist(), strict=True))
+    information = zip(fit.beta, np.diag(fit.information).tolist(), strict=True)
+    return {n: math.sqrt(variance[n]) for n, known in information if variance[n] * known > 0.5}
 
 
 def tied_sets(
@@ -144,7 +164,7 @@ def tied_sets(
 ) -> list[Hypothesis]:
     """Return the fitted sets with a tied rival in place of one judged effect of the winner."""
     keys = (
-        winner.keys - {(effect.name, effect.at)} | {(rival.name, rival.at)}
+        winner.keys - {(effect.name, effect.at)} | {(r.name, r.at) for r in rival.effects}
         for effect in effects for rival in effect.rivals if rival.tied
     )  # fmt: skip
     return [hypotheses.fitted[k] for k in keys if k in hypotheses.fitted]
@@ -154,22 +174,27 @@ def best_tied_set(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect],
     holdout_data: RegressionData,
 ) -> Hypothesis:  # fmt: skip
-    """Return the winner, or the set with a tied rival that training and held-out rows prefer.
+    """Return the winner, or the set with a tied rival that training and held-out rows prefer."""
+    tied = tied_sets(hypotheses, winner, effects)
+    best = min(tied, key=lambda o: _cost(o, holdout_data), default=winner)
+    return best if _is_cheaper(best, winner, holdout_data) else winner
 
-    It leaves less energy by more than `SEARCH.number_price`, and by that for each further free
-    number: the search saw the training rows only.
+
+def _is_cheaper(hypothesis: Hypothesis, winner: Hypothesis, holdout_data: RegressionData) -> bool:
+    """Return whether training and held-out rows prefer a set to the winner.
+
+    It leaves less energy by more than `SEARCH.number_price`, and by that for each further effect
+    and free number: the search saw the training rows only.
     """
+    cost = _cost(hypothesis, holdout_data)
+    return cost < _cost(winner, holdout_data) - SEARCH.number_price
 
-    def priced(hypothesis: Hypothesis) -> float:
-        residual = held_out_residual(holdout_data, hypothesis.fit)
-        energy = hypothesis.fit.energy + float(residual @ residual)
-        return energy + SEARCH.number_price * hypothesis.size[1]
 
-    tied = [(priced(o), o) for o in tied_sets(hypotheses, winner, effects)]
-    if not tied:
-        return winner
-    cost, best = min(tied, key=lambda pair: pair[0])
-    return best if cost < priced(winner) - SEARCH.number_price else winner
+def _cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
+    """Return the energy in training and held-out rows with the price of effects and numbers."""
+    residual = held_out_residual(holdout_data, hypothesis.fit)
+    energy = hypothesis.fit.energy + float(residual @ residual)
+    return energy + SEARCH.number_price * sum(hypothesis.size)
 
 
 def alternatives_of(
@@ -197,7 +222,7 @@ def alternatives_of(
             start = Used(form, form.shape_of(hypotheses.train_data.rig, ()))
             richer = hypotheses.refined([*others, start])
             rows, law = hypotheses.train_data, effect.family
-            if richer not in tied and _moved_parameter(rows, winner, richer, law) is None:
+            if richer not in tied and moved_parameter(rows, winner, richer, law) is None:
                 out.append((richer, law))
     return out
 
@@ -229,14 +254,14 @@ def _of_law(rig: Rig, law: str) -> set[str]:
     return {c.parameter for term in terms for c in term.coefficients(rig)}
 
 
-def composites_in_words(
+def _tied_composites(
     hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData,
     held_out_test: TieTest,
-) -> str:  # fmt: skip
-    """Name two effects that together leave as little as one ('' if none do).
+) -> Iterator[tuple[Hypothesis, float]]:  # fmt: skip
+    """Yield the sets with two effects in the place of one that leave as little in held-out rows.
 
-    For levels of friction by direction one level and an offset torque differ by the lever arm only.
-    They make no rival, since one effect is the simpler explanation.
+    From levels of friction by direction one level and an offset torque differ by the lever arm
+    only. The ratio yielded is that of `TieTest`; the two effects are the last of the set's.
     """
     for effects in hypotheses.composites(winner, used):
         both = hypotheses.refined(effects)
@@ -244,9 +269,20 @@ def composites_in_words(
             continue
         residual = held_out_residual(holdout_data, both.fit)
         if held_out_test.ties(residual, TRACE.tie_ratio):
-            names = " and ".join(u.term.name for u in effects[-2:])
-            ratio = held_out_test.ratio(residual)
-            return f"; {names} together would leave {ratio:.2f} times the held-out rms"
+            yield both, held_out_test.ratio(residual)
+
+
+def composites_in_words(
+    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData,
+    held_out_test: TieTest,
+) -> str:  # fmt: skip
+    """Name two effects that together leave as little as one ('' if none do).
+
+    They are no rival where no parameter changes with them, since one effect is simpler.
+    """
+    for both, ratio in _tied_composites(hypotheses, winner, used, holdout_data, held_out_test):
+        names = " and ".join(u.term.name for u in both.effects[-2:])
+        return f"; {names} together would leave {ratio:.2f} times the held-out rms"
     return ""
 
 
