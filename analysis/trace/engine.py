@@ -49,6 +49,10 @@ from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import detection_limit_notes, detection_limits
 from analysis.trace.next_experiment.proposal import propose
+from analysis.trace.next_experiment.small_effects import (
+    sets_with_small_effect,
+    small_effect_notes,
+)
 from analysis.trace.notes import (
     evidence_notes,
     record_condition_notes,
@@ -211,12 +215,14 @@ def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
 class _Fitted:
     """The set of effects with the shapes that are used, and the model with them.
 
-    `effects` are those named, with intervals that hold every error.
+    `effects` are those named, with intervals that hold every error; `notes` state what widens
+    intervals.
     """
 
     winner: Hypothesis
     model: Model
     effects: tuple[JudgedEffect, ...]
+    notes: tuple[str, ...]
 
 
 def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
@@ -230,9 +236,15 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     if shooting.winner is not winner:
         winner = shooting.winner
         after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
+    larger: list[Hypothesis] = []
+    if finding.verdict != UNEXPLAINED:
+        larger = sets_with_small_effect(
+            finding.hypotheses, prepared.candidates, finding.winner, rows.unseen.choosing
+        )
+        others += [(hypothesis, "") for hypothesis in larger]
     alternatives = [
-        (_identified_with_effects(runs, other, before, rows)[0], law)
-        for other, law in alternatives_of(finding.hypotheses, finding.winner, finding.named)
+        (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
     ]
     after = with_alternatives(after, alternatives)
     effects = tuple(
@@ -241,7 +253,8 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     after = with_effect_values(after, effects)
     shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
     after = replace(after, parameters={**after.parameters, **shared})
-    return _Fitted(winner, after, effects)
+    notes = small_effect_notes(rows.train, finding.winner, larger)
+    return _Fitted(winner, after, effects, tuple(notes))
 
 
 def _without_interval(estimate: Estimate) -> Estimate:
@@ -343,6 +356,7 @@ def _traced(
         *record_condition_notes(train_data, winner),
         *undetermined_notes(after, undetermined, finding.rows.in_motion),
         *kept,
+        *fitted.notes,
         *detection_limit_notes(hidden),
     ]
     runs_before, runs_after = free_runs

@@ -14,6 +14,7 @@ An effect of this size would have changed the parameters by L d without a visibl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,22 +46,34 @@ from rig.model.units import plain, typeset
 Array = NDArray[np.float64]
 
 
-def detection_limits(
-    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis, model: Model
-) -> list[DetectionLimit]:
-    """Return the limits of effects that would change a parameter visibly, largest change first.
+@dataclass(frozen=True)
+class AbsorbedEffects:
+    """Further effects at their smallest sizes of interest, beside a set.
 
-    `effects` are the candidates; each name is returned once, at the place where it changes most.
-    `winner` is the set found and `model` the model identified with it. Another name of a law that
-    acts in the set has the shape with which it was fitted in place of that name. A special case of
-    an effect of the set is no further effect, and no effect is larger than what changes a parameter
-    by all of its value. Beside a free form no limit is computed, since its curve absorbs any
-    similar effect.
+    What each adds to the whitened `rows` is `shown` (M, n) in the residual and `taken` (k, n) in
+    the coefficients and shapes `names` of the set.
+    """
+
+    rows: ComparisonRows
+    explanations: Sequence[Explanation]
+    names: Sequence[str]
+    taken: Array
+    shown: Array
+
+
+def absorbed_effects(
+    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis
+) -> AbsorbedEffects | None:
+    """Return what further effects among the candidates `effects` would add, None if there are none.
+
+    Another name of a law that acts in the set has the shape with which it was fitted in place of
+    that name. A special case of an effect of the set is no further effect. Beside a free form there
+    is none, since its curve absorbs any similar effect.
     """
     train_data = hypotheses.train_data
     named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
     if any(effect.free for effect in named):
-        return []
+        return None
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
     asked = [
         effect for effect in effects
@@ -75,23 +88,38 @@ def detection_limits(
         is not None
     ]
     if not small:
-        return []
+        return None
     names, X = tangent(train_data, winner.fit)
     added = np.column_stack([rows.prediction(explanation) for explanation in small])
     taken = shortest(X, added, TRACE.rank_limit)
-    shown = added - X @ taken
+    return AbsorbedEffects(rows, small, names, taken, added - X @ taken)
+
+
+def detection_limits(
+    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis, model: Model
+) -> list[DetectionLimit]:
+    """Return the limits of effects that would change a parameter visibly, largest change first.
+
+    `effects` are the candidates; each name is returned once, at the place where it changes most.
+    `winner` is the set found and `model` the model identified with it. No effect is larger than
+    what changes a parameter by all of its value.
+    """
+    absorbed = absorbed_effects(hypotheses, effects, winner)
+    if absorbed is None:
+        return []
+    data = absorbed.rows.train_data
     known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
     found = []
-    for k, explanation in enumerate(small):
-        times = _largest_multiple(shown[:, k], winner.fit.residual)
-        moved = dict(zip(names, times * taken[:, k], strict=True))
-        shifts = _parameter_shifts(rows.train_data, moved, known)
+    for k, explanation in enumerate(absorbed.explanations):
+        times = _largest_multiple(absorbed.shown[:, k], winner.fit.residual)
+        moved = dict(zip(absorbed.names, times * absorbed.taken[:, k], strict=True))
+        shifts = _parameter_shifts(data, moved, known)
         most = max(shifts, key=lambda name: shifts[name], default="")
         if most and shifts[most] > 1.0:  # the parameter would be 0 or of the other sign
             times, shifts = times / shifts[most], {most: 1.0}
         if most and shifts[most] >= TRACE.noted_shift:
-            key, size = explanation.keys[0], _effect_size(rows.train_data, explanation, times)
-            possible = is_possible(train_data.rig, model, explanation, times)
+            key, size = explanation.keys[0], _effect_size(data, explanation, times)
+            possible = is_possible(hypotheses.train_data.rig, model, explanation, times)
             found.append(
                 DetectionLimit(
                     key["name"], key["where"], key["at"], *size, most, shifts[most], possible

@@ -452,6 +452,16 @@ def one_level_on_an_inclined_base_is_not_taken_for_two_levels(b: Benches) -> Non
     assert low < small_bench.TRUTH["W2"] < high
 
 
+def an_effect_too_small_to_be_named_widens_an_interval(b: Benches) -> None:
+    """Free air of 0.8 % leaves nothing above the noise's band and makes b 1.6 % smaller."""
+    result = b.traced(b.runs(alpha_air=0.008), "entrained_air", "base_inclination", "dead_volume")
+    assert (result.verdict, result.effects) == ("clean", ())
+    found = result.model_after.parameters["b"]
+    assert found.value < 0.99 * small_bench.TRUTH["b"]
+    assert found.ci95[0] < small_bench.TRUTH["b"] < found.ci95[1]
+    assert any("entrained_air at bench leaves too little to be named" in n for n in result.notes)
+
+
 def an_effect_with_which_the_free_run_diverges_is_not_named(b: Benches) -> None:
     """The leak is there and passes every other gate.
 
@@ -551,6 +561,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (equal_levels_by_direction_are_one_level, ("simpler name",)),
     (levels_whose_difference_the_weight_takes_up_are_confounded_with_one, ("open parameters",)),
     (one_level_on_an_inclined_base_is_not_taken_for_two_levels, ("two in place of one",)),
+    (an_effect_too_small_to_be_named_widens_an_interval, ("small effects",)),
     (an_effect_with_which_the_free_run_diverges_is_not_named, ("free run",)),
     (a_search_that_ended_beyond_the_spools_travel_is_begun_anew, ("begun anew",)),
     (of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first, ("tied sets",)),

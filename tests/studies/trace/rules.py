@@ -137,6 +137,8 @@ RULES: Final = (
          ((rivals, "moved_parameter", lambda *_: None),)),
     Rule("two in place of one", "two effects are no rival of one",
          ((rivals, "_tied_composites", lambda *_: iter(())),)),
+    Rule("small effects", "an effect too small to be named widens no interval",
+         ((engine, "sets_with_small_effect", lambda *_: []),)),
     Rule("open parameters", "a richer name that leaves another parameter open is no rival",
          (setting("open_share", math.inf),)),
     Rule("free run", "the held-out free run may fail with the effects or be far worse",

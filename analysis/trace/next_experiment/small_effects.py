@@ -1,0 +1,82 @@
+"""Effects too small to be named that change a parameter: they widen its interval and are noted.
+
+An effect may leave less in the residual than counts as something to explain, and yet far more than
+noise alone gives along its own direction: a base inclined by 0.03 rad left 1.02 times the noise and
+changed a weight by 3 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from analysis.effects.base import Effect
+from analysis.terms.base import Used
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge.held_out import held_out_residual
+from analysis.trace.judge.readings import loses_by_restriction
+from analysis.trace.judge.rivals import moved_parameter
+from analysis.trace.next_experiment.detection_limits import AbsorbedEffects, absorbed_effects
+from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import SEARCH, TRACE
+from rig.model.channels import place_in_words
+from rig.model.units import plain
+
+
+def sets_with_small_effect(
+    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis,
+    holdout_data: RegressionData,
+) -> list[Hypothesis]:  # fmt: skip
+    """Return the sets with the further effect that training and held-out rows show most clearly.
+
+    There are several where one effect fits as well as another. The effect is one of the candidates
+    `effects`, exceeds `TRACE.visible_deviations` of its noise, is possible, reduces the held-out
+    residual by more than noise and changes a parameter by more than its interval.
+    """
+    absorbed = absorbed_effects(hypotheses, effects, winner)
+    if absorbed is None:
+        return []
+    left, found = held_out_residual(holdout_data, winner.fit), []
+    for used in _clearest(absorbed, winner):
+        larger = hypotheses.refined([*winner.effects, used])
+        price = SEARCH.number_price * (larger.size[1] - winner.size[1])
+        if (
+            winner.fit.energy - larger.fit.energy > price
+            and not hypotheses.physical_problem(larger)
+            and loses_by_restriction(left, held_out_residual(holdout_data, larger.fit))
+            and moved_parameter(hypotheses.train_data, winner, larger)
+        ):
+            found.append(larger)
+    least = min((o.fit.energy for o in found), default=0.0)
+    return [o for o in found if o.fit.energy <= least + SEARCH.number_price]
+
+
+def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[Used]:
+    """Return the effects that exceed their noise most, in units of its standard deviation."""
+    size = np.linalg.norm(absorbed.shown, axis=0)
+    along = np.abs(absorbed.shown.T @ winner.fit.residual)
+    deviations = np.divide(along, size, out=np.zeros_like(along), where=size > 0)
+    order = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.visible_deviations]
+    return [absorbed.explanations[k].effects[0] for k in order[: TRACE.most_rivals]]
+
+
+def small_effect_notes(
+    train_data: RegressionData, winner: Hypothesis, larger: Sequence[Hypothesis]
+) -> list[str]:
+    """Name the further effects of larger sets, and the parameters that they change most."""
+    out = []
+    for hypothesis in larger:
+        moved = moved_parameter(train_data, winner, hypothesis)
+        assert moved is not None
+        parameter, change = moved
+        fresh = (u.term for u in hypothesis.effects)
+        (effect,) = (t for t in fresh if (t.name, t.where) not in winner.keys)
+        out.append(
+            f"{effect.name} at {place_in_words(effect.where)} leaves too little to be named, but "
+            f"the records suggest it or one like it: with it {parameter} would be "
+            f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}, and its "
+            "interval is wider for it"
+        )
+    return out
