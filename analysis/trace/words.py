@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
 from rig.model.units import RESIDUALS, display_unit, plain, typeset, with_interval
+
+LOPSIDED: Final = 1.3  # of an interval's shorter side, beyond which its ends are stated
 
 UNITS = {"torque": "N·m", "flow_cap": "m³/s", "flow_rod": "m³/s"}
 
@@ -141,8 +144,13 @@ def _curve_range(curve: Curve) -> str:
 
 
 def _undetermined(effect: JudgedEffect, name: str) -> bool:
-    """Return whether a number is less certain than the effect's largest one of its unit."""
+    """Return whether a number is less certain than the effect's largest one of its unit.
+
+    One whose interval excludes 0 is known to a factor.
+    """
     estimate = effect.parameters[name]
+    if estimate.ci95[0] * estimate.ci95[1] > 0.0:
+        return False
     alike = [e.value for e in effect.parameters.values() if e.unit == estimate.unit]
     return estimate.half > max(map(abs, alike))
 
@@ -206,8 +214,13 @@ def tolerated_error_notes(result: Trace) -> list[str]:
 
 
 def quantity(estimate: Estimate) -> str:
-    """Return value ± 95 % half-width with its unit."""
-    return with_interval(estimate.value, estimate.half, typeset(estimate.unit))
+    """Return value ± 95 % half-width with its unit, or value and ends of a lopsided interval."""
+    low, high = estimate.ci95
+    sides, unit = (estimate.value - low, high - estimate.value), typeset(estimate.unit)
+    if max(sides) > LOPSIDED * min(sides) > 0.0:
+        value, low_end, high_end = (plain(x, 2) for x in (estimate.value, low, high))
+        return f"{value} ({low_end} to {high_end}) {unit}".strip()
+    return with_interval(estimate.value, estimate.half, unit)
 
 
 def shot_in_words(effect: JudgedEffect) -> str:

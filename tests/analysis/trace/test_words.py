@@ -17,7 +17,7 @@ from analysis.trace.notes import undetermined_notes
 from analysis.trace.remaining import tolerance_words
 from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
-from analysis.trace.words import sentence, tolerated_error_notes
+from analysis.trace.words import quantity, sentence, tolerated_error_notes
 from rig.model.rig import Rig
 
 FLOOR = {"flow_cap_1": 3.5e-8, "torque_2": 0.14}
@@ -172,3 +172,9 @@ def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> 
     assert "1.40 times the training rms" in open_one.gates[-1].detail
     clear = replace(gain, rivals=(far,))
     assert tied_in_held_out(clear) is clear
+
+
+def test_a_lopsided_interval_is_stated_by_its_ends() -> None:
+    """A breakaway of unknown form is known to a factor."""
+    assert quantity(Estimate(96.0, "N", 50.0, (31.0, 196.0))) == "96 (31 to 200) N"
+    assert quantity(Estimate(96.0, "N", 10.0, (76.0, 117.0))) == "96 ± 20 N"
