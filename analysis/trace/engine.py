@@ -47,7 +47,12 @@ from analysis.trace.judge.rivals import alternatives_of, with_alternatives
 from analysis.trace.judge.scatter import form_shift, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
-from analysis.trace.next_experiment.detection_limits import detection_limit_notes, detection_limits
+from analysis.trace.next_experiment.detection_limits import (
+    AbsorbedEffects,
+    absorbed_effects,
+    detection_limit_notes,
+    detection_limits,
+)
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.next_experiment.small_effects import (
     sets_with_small_effect,
@@ -216,13 +221,15 @@ class _Fitted:
     """The set of effects with the shapes that are used, and the model with them.
 
     `effects` are those named, with intervals that hold every error; `notes` state what widens
-    intervals.
+    intervals. `absorbed` are further effects beside the set that was found, unless it explains
+    nothing.
     """
 
     winner: Hypothesis
     model: Model
     effects: tuple[JudgedEffect, ...]
     notes: tuple[str, ...]
+    absorbed: AbsorbedEffects | None
 
 
 def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
@@ -237,12 +244,13 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
         winner = shooting.winner
         after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
     others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
-    larger: list[Hypothesis] = []
+    absorbed = None
     if finding.verdict != UNEXPLAINED:
-        larger = sets_with_small_effect(
-            finding.hypotheses, prepared.candidates, finding.winner, rows.unseen.choosing
-        )
-        others += [(hypothesis, "") for hypothesis in larger]
+        absorbed = absorbed_effects(finding.hypotheses, prepared.candidates, finding.winner)
+    larger = sets_with_small_effect(
+        finding.hypotheses, absorbed, finding.winner, rows.unseen.choosing
+    )
+    others += [(hypothesis, "") for hypothesis in larger]
     alternatives = [
         (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
     ]
@@ -254,7 +262,7 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
     after = replace(after, parameters={**after.parameters, **shared})
     notes = small_effect_notes(rows.train, finding.winner, larger)
-    return _Fitted(winner, after, effects, tuple(notes))
+    return _Fitted(winner, after, effects, tuple(notes), absorbed)
 
 
 def _without_interval(estimate: Estimate) -> Estimate:
@@ -336,11 +344,12 @@ def _traced(
         records.noise_ratio,
     )  # fmt: skip
     verdict, kept = _final_verdict(rig, terms, records, finding, winner)
-    hidden = (
-        detection_limits(hypotheses, prepared.candidates, winner, after)
-        if verdict != UNEXPLAINED
-        else []
-    )
+    hidden = []
+    if verdict != UNEXPLAINED:
+        absorbed = fitted.absorbed
+        if winner is not finding.winner:
+            absorbed = absorbed_effects(hypotheses, prepared.candidates, winner)
+        hidden = detection_limits(absorbed, winner, after)
     undetermined = [n for n, e in before.parameters.items() if not e.identified]
     notes = [
         *unseen_load_notes(records.train, [*records.holdout, *records.judge]),

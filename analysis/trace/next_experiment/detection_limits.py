@@ -96,15 +96,14 @@ def absorbed_effects(
 
 
 def detection_limits(
-    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis, model: Model
+    absorbed: AbsorbedEffects | None, winner: Hypothesis, model: Model
 ) -> list[DetectionLimit]:
     """Return the limits of effects that would change a parameter visibly, largest change first.
 
-    `effects` are the candidates; each name is returned once, at the place where it changes most.
-    `winner` is the set found and `model` the model identified with it. No effect is larger than
-    what changes a parameter by all of its value.
+    `absorbed` are the further effects; each name is returned once, at the place where it changes
+    most. `winner` is the set found and `model` the model identified with it. No effect is larger
+    than what changes a parameter by all of its value.
     """
-    absorbed = absorbed_effects(hypotheses, effects, winner)
     if absorbed is None:
         return []
     data = absorbed.rows.train_data
@@ -119,7 +118,7 @@ def detection_limits(
             times, shifts = times / shifts[most], {most: 1.0}
         if most and shifts[most] >= TRACE.noted_shift:
             key, size = explanation.keys[0], _effect_size(data, explanation, times)
-            possible = is_possible(hypotheses.train_data.rig, model, explanation, times)
+            possible = is_possible(data.rig, model, explanation, times)
             found.append(
                 DetectionLimit(
                     key["name"], key["where"], key["at"], *size, most, shifts[most], possible

@@ -11,13 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loses_by_restriction
 from analysis.trace.judge.rivals import moved_parameter
-from analysis.trace.next_experiment.detection_limits import AbsorbedEffects, absorbed_effects
+from analysis.trace.next_experiment.detection_limits import AbsorbedEffects
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
@@ -26,16 +25,15 @@ from rig.model.units import plain
 
 
 def sets_with_small_effect(
-    hypotheses: HypothesisSet, effects: Sequence[Effect], winner: Hypothesis,
+    hypotheses: HypothesisSet, absorbed: AbsorbedEffects | None, winner: Hypothesis,
     holdout_data: RegressionData,
 ) -> list[Hypothesis]:  # fmt: skip
     """Return the sets with the further effect that training and held-out rows show most clearly.
 
-    There are several where one effect fits as well as another. The effect is one of the candidates
-    `effects`, exceeds `TRACE.visible_deviations` of its noise, is possible, reduces the held-out
-    residual by more than noise and changes a parameter by more than its interval.
+    There are several where one effect fits as well as another. The effect is one of `absorbed`,
+    exceeds `TRACE.visible_deviations` of its noise, is possible, reduces the held-out residual by
+    more than noise and changes a parameter by more than its interval.
     """
-    absorbed = absorbed_effects(hypotheses, effects, winner)
     if absorbed is None:
         return []
     left, found = held_out_residual(holdout_data, winner.fit), []
