@@ -319,7 +319,10 @@ class SearchSettings:
     """Number of points of an effect's shape grid from which a search for its shapes begins."""
     # Refinement.
     tolerance: float = 1e-4
-    """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
+    """Relative change of the energy at which a refinement ends (arithmetic)."""
+    shape_tolerance: float = 1e-6
+    """Step over the length of all shapes, each between 0 and 1, at which a refinement ends: an edge
+    may be a thousandth of its range (arithmetic)."""
     steps: int = 20
     """Largest number of steps of a refinement."""
     first_steps: int = 3

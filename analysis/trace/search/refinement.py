@@ -331,10 +331,12 @@ def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: in
             for u, v in zip(terms, shapes, strict=True)
         )
 
+    # Scaled by the derivatives: an edge of a thousandth of the spool's range would take tiny steps
+    # beside a shape in the middle of its own.
     search = minimise(
         lambda x: fit_coefficients(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6),
-        bounds=(0.0, 1.0), diff_step=1e-3, xtol=SEARCH.tolerance, ftol=SEARCH.tolerance, gtol=1e-12,
-        max_nfev=steps,
+        bounds=(0.0, 1.0), diff_step=1e-3, x_scale="jac", xtol=SEARCH.shape_tolerance,
+        ftol=SEARCH.tolerance, gtol=1e-12, max_nfev=steps,
     )  # fmt: skip
     return fit_coefficients(data, at(search.x))
 
