@@ -125,7 +125,7 @@ def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> 
         before, rows = (side[segment.equation] for side in built[segment.group])
         here, there = in_common(before, rows)
         size = 1.0
-        if rescaled:  # about the mean, which is the difference of two large forces
+        if rescaled and rows.rhs[there].size:  # about the mean, a difference of two large forces
             size = float(np.std(before.rhs[here])) / max(float(np.std(rows.rhs[there])), 1e-300)
         weight = np.sqrt(segment.repeats) / segment.noise * size
         own = np.arange(start, start + len(before.rhs))

@@ -86,6 +86,15 @@ def test_the_search_of_a_set_that_leaves_too_much_ends_where_it_leads_nowhere(
     assert most in steps
 
 
+def test_a_crosstalk_that_leaves_no_row_has_an_energy_all_the_same(rig: Rig) -> None:
+    """It puts every pressure of the chamber below zero, where no flow can be compared."""
+    records = conditioned_records(rig, [bench.run(rig, bench.Wrong.of(), 0.03, 1)])
+    train_data = regression_data(rig, tuple(map(Used, baseline())), records)
+    wild = Used(make("sensor_crosstalk", "joint 2 rod"), (3.0,))
+    fit = refinement.fit_coefficients(train_data, (*train_data.terms, wild))
+    assert np.isfinite(fit.energy)
+
+
 @pytest.mark.parametrize("stiffening", [0.0, 60.0])
 def test_a_contact_stiffens_in_the_model_where_it_does_on_the_bench_and_else_says_nothing_of_it(
     rig: Rig, stiffening: float
