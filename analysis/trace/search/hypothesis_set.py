@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import functools
 import logging
-import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 
@@ -124,14 +123,15 @@ class HypothesisSet:
                 return problem if used is first else whose + problem
         return negative_body(rig, hypothesis.fit, self.empty.fit)
 
-    def refined(self, effects: Sequence[Used], limit: float = math.inf) -> Hypothesis:
+    def refined(self, effects: Sequence[Used], instead_of: Hypothesis | None = None) -> Hypothesis:
         """Return the exact fit of a set of effects, computed once for its names and places.
 
-        The search of its shapes ends early where they leave more than the energy `limit`.
+        The search of its shapes ends early where it is no better than the set `instead_of`.
         """
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.fitted:
-            fit = refine(self.train_data, (*self.base, *effects), limit)
+            rival = None if instead_of is None else instead_of.fit
+            fit = refine(self.train_data, (*self.base, *effects), rival)
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
@@ -413,8 +413,7 @@ class HypothesisSet:
         """
         seen = {now.keys}
         while sets := self._confusable_sets(now):
-            limit = SEARCH.unpromising_ratio * now.fit.energy
-            pruned = self.prune(self.best([now, *(self.refined(s, limit) for s in sets)]))
+            pruned = self.prune(self.best([now, *(self.refined(s, now) for s in sets)]))
             other = self.best([now, pruned])  # one that lost an effect again may be worse
             if other.keys in seen:
                 break

@@ -9,7 +9,7 @@ back to the right side's size before the change.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -191,19 +191,26 @@ def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
 
 
 def refine(
-    data: RegressionData, terms: Sequence[Used], limit: float = math.inf, steps: int = SEARCH.steps
+    data: RegressionData,
+    terms: Sequence[Used],
+    instead_of: ExactFit | None = None,
+    steps: int = SEARCH.steps,
 ) -> ExactFit:
     """Return the fit with the shapes of all effects that are not among the data's own terms.
-
-    One that leaves more than the energy `limit` and little less than `SEARCH.first_steps` before is
-    returned as it is.
 
     The search starts from the shapes given. Of the forms of an effect the one that leaves least, at
     a price for each free number, is used. Then details of the form are added that remove more than
     chance (`SEARCH.number_price`) and more than `SEARCH.detail_share` of the remaining energy above
     noise.
+
+    A set that may only replace the fit `instead_of` is not searched further where it leaves over
+    `SEARCH.unpromising_ratio` times as much and little less than `SEARCH.first_steps` before. Where
+    it leaves more than that fit, its terms that are in it keep the forms that they have.
     """
-    if math.isfinite(limit):
+    kept: Collection[int] = ()
+    if instead_of is not None:
+        kept = [k for k, used in enumerate(terms) if used in instead_of.terms]
+        limit = SEARCH.unpromising_ratio * instead_of.energy
         first = _with_searched_shapes(data, terms, SEARCH.first_steps)
         terms = first.terms
         if first.energy > limit:
@@ -216,27 +223,32 @@ def refine(
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        fit = _in_best_form(data, fit, k, steps)
-        used = fit.terms[k]
-        assert isinstance(used.term, Effect)
-        starts = used.term.in_detail(data.rig, used.shape)
-        opened = [Used(used.term, start) for start in starts if start != used.shape]
-        asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
-        # Half, since the linear prediction is less than what a detail removes.
-        searched = [
-            _with_searched_shapes(data, _with_term(fit.terms, used, start), steps)
-            for start in opened
-            if _predicted_gain(data, fit, used, start) >= 0.5 * asked
-        ]
-        more = min(searched, key=lambda model: model.energy, default=fit)
-        if fit.energy - more.energy <= asked:
+        if instead_of is not None and k in kept and fit.energy > instead_of.energy:
             continue
-        # A form that fitted better without the details need not do so with them.
-        if not _determines_shapes(data, more, more.terms[k]):
-            more = _in_best_form(data, more, k, steps)
-        if _determines_shapes(data, more, more.terms[k]):
-            fit = more
+        fit = _with_details(data, _in_best_form(data, fit, k, steps), k, steps)
     return fit
+
+
+def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
+    """Return the fit with details of the form of term number `place`, where they remove enough."""
+    used = fit.terms[place]
+    assert isinstance(used.term, Effect)
+    starts = used.term.in_detail(data.rig, used.shape)
+    opened = [Used(used.term, start) for start in starts if start != used.shape]
+    asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
+    # Half, since the linear prediction is less than what a detail removes.
+    searched = [
+        _with_searched_shapes(data, _with_term(fit.terms, used, start), steps)
+        for start in opened
+        if _predicted_gain(data, fit, used, start) >= 0.5 * asked
+    ]
+    more = min(searched, key=lambda model: model.energy, default=fit)
+    if fit.energy - more.energy <= asked:
+        return fit
+    # A form that fitted better without the details need not do so with them.
+    more = _in_best_form(data, more, place, steps)
+    earned = fit.energy - more.energy > asked
+    return more if earned and _determines_shapes(data, more, more.terms[place]) else fit
 
 
 def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:

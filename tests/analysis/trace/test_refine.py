@@ -71,18 +71,21 @@ def test_the_search_of_a_set_that_leaves_too_much_ends_where_it_leads_nowhere(
         searches.append(max_nfev)
         return whole(*arguments, max_nfev=max_nfev, **named)
 
-    def refined(edge: float, limit: float = np.inf) -> tuple[float, list[int]]:
+    def refined(
+        edge: float, instead_of: refinement.ExactFit | None = None
+    ) -> tuple[refinement.ExactFit, list[int]]:
         searches.clear()
         band = Used(make("valve_deadband", "joint 2"), (edge, edge, 0.0028))
-        fit = refinement.refine(train_data, (*train_data.terms, band), limit)
-        return fit.energy, list(searches)
+        fit = refinement.refine(train_data, (*train_data.terms, band), instead_of)
+        return fit, list(searches)
 
     monkeypatch.setattr(refinement, "minimise", counted)
+    monkeypatch.setattr(refinement, "SEARCH", replace(SEARCH, unpromising_ratio=1.1))
     least, _ = refined(6e-3)
     first, most = SEARCH.first_steps, SEARCH.steps
-    assert refined(0.5, 1.1 * least)[1] == [first, first]
-    energy, steps = refined(0.02, 1.1 * least)
-    assert energy == pytest.approx(least, rel=1e-3)
+    assert refined(0.5, least)[1] == [first, first]
+    fit, steps = refined(0.02, least)
+    assert fit.energy == pytest.approx(least.energy, rel=1e-3)
     assert most in steps
 
 
