@@ -77,8 +77,8 @@ from analysis.trace.result import (
     JudgedEffect,
     Trace,
 )
-from analysis.trace.search.hypothesis import Hypothesis
-from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
+from analysis.trace.search.hypothesis import Hypothesis, effect_of
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError

@@ -39,8 +39,8 @@ from analysis.trace.result import (
     JudgedEffect,
 )
 from analysis.trace.search.exact_trials import improved_by_exact_trials
-from analysis.trace.search.hypothesis import Hypothesis, within_band
-from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
+from analysis.trace.search.hypothesis import Hypothesis, effect_of, within_band
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
 from rig.model.parse import InputError
 from rig.model.records import Record, Run

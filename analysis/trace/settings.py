@@ -325,6 +325,9 @@ class SearchSettings:
     may be a thousandth of its range (arithmetic)."""
     steps: int = 20
     """Largest number of steps of a refinement."""
+    start_shares: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
+    """Shares of its size by first-order columns at one of which a new effect begins
+    (arithmetic)."""
     first_steps: int = 3
     """Number of steps of a refinement, and of its continuation, after which it is asked whether the
     set is promising."""

@@ -26,11 +26,12 @@ from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
+    effect_of,
     energy_above_noise,
     of_one_law,
     parameter_values,
 )
-from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig

@@ -23,11 +23,12 @@ from analysis.trace.judge.scatter import form_shift
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
+    effect_of,
     may_grow,
     of_one_law,
     parameter_values,
 )
-from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]

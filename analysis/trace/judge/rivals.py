@@ -21,6 +21,7 @@ from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
 from analysis.trace.judge.scatter import with_errors
 from analysis.trace.result import JudgedEffect, Rival
+from analysis.trace.search import confounders
 from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
@@ -263,7 +264,7 @@ def _tied_composites(
     From levels of friction by direction one level and an offset torque differ by the lever arm
     only. The ratio yielded is that of `TieTest`; the two effects are the last of the set's.
     """
-    for effects in hypotheses.composites(winner, used):
+    for effects in confounders.composites(hypotheses.train_data, hypotheses.effects, winner, used):
         both = hypotheses.refined(effects)
         if hypotheses.physical_problem(both):
             continue

@@ -1,11 +1,15 @@
-"""Candidates that are easily confused with an effect, by mechanism and place."""
+"""Candidates that are easily confused with an effect, and the sets with them in its place."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.search.hypothesis import Hypothesis, effect_of, is_special_case, may_grow
+from analysis.trace.search.starts import at_best_point
 
 BENCH: Final = "bench"
 
@@ -37,3 +41,47 @@ def _joint(effect: Effect) -> str:
     """Return the part of an effect's place that names its joint, or the bench."""
     place = effect.where
     return BENCH if place.startswith(BENCH) else " ".join(place.split()[:2])
+
+
+def confusable_sets(
+    data: RegressionData, candidates: Sequence[Effect], now: Hypothesis
+) -> list[tuple[Used, ...]]:
+    """Return the sets with one effect exchanged for another candidate or for two."""
+    sets = [effects for used in now.effects for effects in composites(data, candidates, now, used)]
+    for used in now.effects if len(now.effects) > 1 else ():
+        others = tuple(u for u in now.effects if u is not used)
+        for effect in candidates:
+            if (effect.name, effect.where) in now.keys or not is_confusable(effect, used):
+                continue
+            fresh = at_best_point(data, effect, others)
+            sets.append((*others, fresh))
+            assert isinstance(used.term, Effect)
+            if is_special_case(used.term, effect):
+                # Another effect may only have made up for what the simpler law lacks.
+                sets += [(*(u for u in others if u is not one), fresh) for one in others]
+    return sets
+
+
+def composites(
+    data: RegressionData, candidates: Sequence[Effect], now: Hypothesis, used: Used
+) -> list[tuple[Used, ...]]:
+    """Return the sets with a simpler name of an effect's law and a confounder in its place.
+
+    The confounder has another mechanism and is at the effect's joint. Friction of one level with
+    the offset of a pressure is nearly friction of two levels, but for the flows.
+    """
+    own = used.term
+    assert isinstance(own, Effect)
+    known = now.keys | {(u.term.name, u.term.where) for u in data.terms}
+    others = tuple(u for u in now.effects if u is not used)
+    if not may_grow(others, by=2):
+        return []
+    simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
+    confounders = [
+        e for e in candidates
+        if is_confounder(e, own) and e.mechanism != own.mechanism and (e.name, e.where) not in known
+    ]  # fmt: skip
+    return [
+        (*others, *(Used(e, e.shape_of(data.rig, ())) for e in (simple, other)))
+        for simple in simpler for other in confounders
+    ]  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.refinement import ExactFit
@@ -134,3 +135,10 @@ def noise_band(data: RegressionData) -> NoiseBand:
 def within_band(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
     """Return whether every equation's energy above noise lies within its band."""
     return all(value <= limit.by_equation[e] for e, value in excess_energy.items())
+
+
+def effect_of(name: str, where: str) -> Effect:
+    """Return an effect of the catalogue at a place."""
+    effect = make(name, where)
+    assert isinstance(effect, Effect)
+    return effect

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.signals.conditioning import Signals
-from analysis.terms import make
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import Variant, complexity, shape_grid, variants
+from analysis.trace.data.candidates import Variant, complexity, variants
 from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
@@ -29,20 +28,22 @@ from analysis.trace.data.regression_data import (
     variant_columns,
 )
 from analysis.trace.search import linear_fit
-from analysis.trace.search.confounders import BENCH, is_confounder, is_confusable
+from analysis.trace.search.confounders import BENCH, confusable_sets
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
+    effect_of,
     energy_above_noise,
-    is_special_case,
     law_of,
     may_grow,
     negative_body,
     noise_band,
+    of_one_law,
     parameter_values,
     within_band,
 )
 from analysis.trace.search.refinement import ExactFit, fit_coefficients, jacobian, rebased, refine
+from analysis.trace.search.starts import at_best_size
 from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
@@ -369,14 +370,47 @@ class HypothesisSet:
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
-        return [self._extended(now, effects) for effects in out.values()]
+        larger = [self._extended(now, effects) for effects in out.values()]
+        if free:
+            return larger
+        with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
+        for hypothesis in (now, *filter(self.physical_problem, larger)):
+            for effects in self._with_parts_beside(hypothesis, equations):
+                with_parts.setdefault(
+                    frozenset((u.term.name, u.term.where) for u in effects), effects
+                )
+        return larger + [self._extended(now, effects) for effects in with_parts.values()]
+
+    def _with_parts_beside(
+        self, hypothesis: Hypothesis, equations: Collection[str]
+    ) -> Iterator[tuple[Used, ...]]:
+        """Yield the set with another part of an effect's law beside it, with both at their start.
+
+        A breakaway alone is fitted far from its size beside Coulomb friction, so that columns of
+        first order do not show that, and each of the two alone may be physically impossible.
+        """
+        rig = self.train_data.rig
+        if not may_grow(hypothesis.effects):
+            return
+        for used in hypothesis.effects:
+            own, others = used.term, [u for u in hypothesis.effects if u is not used]
+            assert isinstance(own, Effect)
+            for effect in self.effects:
+                key = effect.name, effect.where
+                part = of_one_law(effect, own) and (effect.beside or own.beside)
+                acts = not equations or not self._acting.get(key, set()).isdisjoint(equations)
+                if part and acts and key not in hypothesis.keys:
+                    yield (*others, *(Used(e, e.shape_of(rig, ())) for e in (own, effect)))
 
     def _extended(self, now: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
         """Return the exact fit of a set that extends `now`, with its shapes as starting points.
 
-        Where an equation keeps more than under `now`, an earlier search of the shapes, which had
-        begun elsewhere, ended in a local minimum.
+        A new effect begins at the size that leaves least. Where an equation keeps more than under
+        `now`, an earlier search of the shapes, which had begun elsewhere, ended in a local minimum.
         """
+        fresh = [u for u in effects if (u.term.name, u.term.where) not in now.keys]
+        others = [u for u in effects if u not in fresh]
+        effects = [*others, *(at_best_size(self.train_data, u, others) for u in fresh)]
         known = self.refined(effects)
         band, before = self.noise_band.by_equation, now.excess_energy
         worse = any(v > before[e] + band[e] for e, v in known.excess_energy.items())
@@ -409,10 +443,10 @@ class HypothesisSet:
         """Return the set, or a better one with an effect exchanged for one that is easily confused.
 
         An effect that was chosen before the last one was added may be wrong beside it, and one
-        effect may be chosen in place of two (`composites`).
+        effect may be chosen in place of two (`confounders.composites`).
         """
         seen = {now.keys}
-        while sets := self._confusable_sets(now):
+        while sets := confusable_sets(self.train_data, self.effects, now):
             pruned = self.prune(self.best([now, *(self.refined(s, now) for s in sets)]))
             other = self.best([now, pruned])  # one that lost an effect again may be worse
             if other.keys in seen:
@@ -421,64 +455,12 @@ class HypothesisSet:
             seen.add(now.keys)
         return now
 
-    def _confusable_sets(self, now: Hypothesis) -> list[tuple[Used, ...]]:
-        """Return the sets with one effect exchanged for another or for two."""
-        sets = [effects for used in now.effects for effects in self.composites(now, used)]
-        for used in now.effects if len(now.effects) > 1 else ():
-            others = tuple(u for u in now.effects if u is not used)
-            for effect in self.effects:
-                if (effect.name, effect.where) in now.keys or not is_confusable(effect, used):
-                    continue
-                fresh = self._started(effect, others)
-                sets.append((*others, fresh))
-                assert isinstance(used.term, Effect)
-                if is_special_case(used.term, effect):
-                    # Another effect may only have made up for what the simpler law lacks.
-                    sets += [(*(u for u in others if u is not one), fresh) for one in others]
-        return sets
-
-    def composites(self, now: Hypothesis, used: Used) -> list[tuple[Used, ...]]:
-        """Return the sets with a simpler name of an effect's law and a confounder in its place.
-
-        The confounder has another mechanism and is at the effect's joint. Friction of one level
-        with the offset of a pressure is nearly friction of two levels, but for the flows.
-        """
-        own, rig = used.term, self.train_data.rig
-        assert isinstance(own, Effect)
-        known = now.keys | {(u.term.name, u.term.where) for u in self.base}
-        others = tuple(u for u in now.effects if u is not used)
-        if not may_grow(others, by=2):
-            return []
-        simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
-        confounders = [
-            e for e in self.effects
-            if is_confounder(e, own) and e.mechanism != own.mechanism
-            and (e.name, e.where) not in known
-        ]  # fmt: skip
-        return [
-            (*others, *(Used(e, e.shape_of(rig, ())) for e in (simple, other)))
-            for simple in simpler for other in confounders
-        ]  # fmt: skip
-
-    def _started(self, effect: Effect, others: Sequence[Used]) -> Used:
-        """Return an effect at the point of its grid that leaves least beside others.
-
-        From another point, the search of a shape of either sign may end at the wrong bound.
-        """
-        data, rig = self.train_data, self.train_data.rig
-        signed = any(s.neutral is not None and s.low < s.neutral for s in effect.shapes(rig))
-        if not signed:
-            return Used(effect, effect.shape_of(rig, ()))
-        return min(
-            (Used(effect, point) for point in shape_grid(effect, rig)),
-            key=lambda used: fit_coefficients(data, (*self.base, *others, used)).energy,
-        )
-
     def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect that removes most from `equations`, None where none does.
 
         Counted over all equations, the form error of a large effect in one equation would hide a
-        small effect in another.
+        small effect in another. A set that leaves as little there with fewer effects is returned
+        in its place.
         """
         if not may_grow(now.effects):
             return None
@@ -495,13 +477,28 @@ class HypothesisSet:
 
         tried = self.extensions(now, equations)
         tried += self._simpler_sets(tried)
+        tried += self._smaller_sets(now, tried)
         more = [o for o in tried if earned(o) and not self.physical_problem(o)]
         if not more:
             return None
         best = min(map(residual, more))
         slack = max((SEARCH.simpler_ratio - 1.0) * max(0.0, best), SEARCH.number_price)
         near = [o for o in more if residual(o) <= best + slack]
-        return min(near, key=lambda o: (o.size[1], residual(o)))
+        return min(near, key=lambda o: (sum(o.size), residual(o)))
+
+    def _smaller_sets(self, now: Hypothesis, tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the fitted sets of fewer effects than `tried`, and no larger in all.
+
+        None of them leaves more of an equation than `now`, but for noise.
+        """
+        band, before = self.noise_band.by_equation, now.excess_energy
+        least = min(((o.size[0], sum(o.size)) for o in tried), default=(0, 0))
+        return [
+            o
+            for o in self.fitted.values()
+            if 0 < o.size[0] < least[0] and sum(o.size) <= least[1]
+            and all(v <= before[e] + band[e] for e, v in o.excess_energy.items())
+        ]  # fmt: skip
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:
         """Return the set without effects that are not needed or remove too little."""
@@ -524,10 +521,3 @@ class HypothesisSet:
     def removes_too_little(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
         return self.log_energy_ratio(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
-
-
-def effect_of(name: str, where: str) -> Effect:
-    """Return an effect of the catalogue at a place."""
-    effect = make(name, where)
-    assert isinstance(effect, Effect)
-    return effect

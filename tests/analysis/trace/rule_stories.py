@@ -452,6 +452,25 @@ def one_level_on_an_inclined_base_is_not_taken_for_two_levels(b: Benches) -> Non
     assert low < small_bench.TRUTH["W2"] < high
 
 
+def two_quiet_levels_are_not_one_level_and_a_torque(b: Benches) -> None:
+    """4 and 2 N: one level with an offset has as many numbers, but two effects."""
+    hidden = foreign_bench.Hidden(4.0, 2.0)
+    runs = b.kept("quiet levels", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    names = ("coulomb_friction", "asymmetric_friction", "torque_offset", "sensor_offset")
+    s = b.searched(runs, *names)
+    larger = s.hypotheses.extended_in(s.set_of("coulomb_friction"), {"torque_2"})
+    assert larger is not None
+    assert {name for name, _ in larger.keys} == {"asymmetric_friction"}
+
+
+def a_breakaway_is_found_with_the_level_below_it_beside_a_lag(b: Benches) -> None:
+    """Alone, the level would need negative viscous friction, and the breakaway too high a speed."""
+    runs = b.runs(Fc=50.0, Fs=120.0, v_stribeck=0.06, fall=1.0, tau_spool=2e-3)
+    names = {"coulomb_friction", "stribeck_friction", "spool_lag"}
+    result = b.traced(runs, *names)
+    assert (result.verdict, {e.name for e in result.effects}) == ("explained", names)
+
+
 def an_effect_too_small_to_be_named_widens_an_interval(b: Benches) -> None:
     """Free air of 0.8 % leaves nothing above the noise's band and makes b 1.6 % smaller."""
     result = b.traced(b.runs(alpha_air=0.008), "entrained_air", "base_inclination", "dead_volume")
@@ -496,6 +515,18 @@ def a_search_that_ended_beyond_the_spools_travel_is_begun_anew(b: Benches) -> No
     assert again.total < 1e-3 * far.total
     (found,) = again.effects
     assert found.shape[:2] == pytest.approx((0.0018, 0.014), rel=0.02)
+
+
+def a_small_overlap_is_found_from_a_start_far_above_it(b: Benches) -> None:
+    """Overlaps of 3 mV beside a search that begins at 0.5 V."""
+    s = b.searched(b.runs(w_ahead=0.003, w_astern=0.003), "valve_deadband")
+    band, hypotheses = ValveDeadband("joint 2"), s.hypotheses
+    known = hypotheses.fitted.pop(frozenset({(band.name, band.where)}))
+    try:
+        found = hypotheses._extended(hypotheses.empty, [Used(band, (0.5, 0.5, 0.003))])
+    finally:
+        hypotheses.fitted[known.keys] = known
+    assert found.effects[0].shape[:2] == pytest.approx((0.003, 0.003), rel=0.05)
 
 
 def wrong_volumes_at_one_joint_name_nothing_at_the_other(b: Benches) -> None:
@@ -561,9 +592,12 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (equal_levels_by_direction_are_one_level, ("simpler name",)),
     (levels_whose_difference_the_weight_takes_up_are_confounded_with_one, ("open parameters",)),
     (one_level_on_an_inclined_base_is_not_taken_for_two_levels, ("two in place of one",)),
+    (two_quiet_levels_are_not_one_level_and_a_torque, ("fewer effects",)),
+    (a_breakaway_is_found_with_the_level_below_it_beside_a_lag, ("parts of a law",)),
     (an_effect_too_small_to_be_named_widens_an_interval, ("small effects",)),
     (an_effect_with_which_the_free_run_diverges_is_not_named, ("free run",)),
     (a_search_that_ended_beyond_the_spools_travel_is_begun_anew, ("begun anew",)),
+    (a_small_overlap_is_found_from_a_start_far_above_it, ("nearer start",)),
     (of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first, ("tied sets",)),
     (what_a_cubic_spring_adds_is_no_error_of_an_offsets_form, ("exact forms",)),
     (noise_above_the_stated_one_is_noise_where_nothing_repeats, ("unstated noise",)),

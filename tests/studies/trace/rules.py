@@ -22,7 +22,7 @@ from analysis.regression import solve
 from analysis.trace import engine, finding, in_motion, remaining
 from analysis.trace.data import noise_floor, regression_data
 from analysis.trace.judge import gates, held_out, inference, removal, rivals
-from analysis.trace.search import linear_fit
+from analysis.trace.search import confounders, hypothesis_set, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
 
@@ -165,9 +165,15 @@ RULES: Final = (
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
     Rule("two for one", "no effect is exchanged for two that leave less",
-         ((HypothesisSet, "composites", lambda *_: []),)),
+         ((confounders, "composites", lambda *_: []),)),
+    Rule("fewer effects", "an effect is added where another set of fewer leaves as little",
+         ((HypothesisSet, "_smaller_sets", lambda *_: []),)),
+    Rule("parts of a law", "a breakaway and the level below it are tried one by one",
+         ((HypothesisSet, "_with_parts_beside", lambda *_: iter(())),)),
     Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
          ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),)),
+    Rule("nearer start", "a further effect begins at its size by first-order columns",
+         ((hypothesis_set, "at_best_size", lambda _, used, _others: used),)),
     Rule("exact columns", "first-order columns alone find the effects",
          ((finding, "improved_by_exact_trials", lambda _sets, now: now),)),
     Rule("unknown cause", "names beside an unknown cause need no more than other names do",
