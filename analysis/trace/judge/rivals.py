@@ -175,10 +175,23 @@ def best_tied_set(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect],
     holdout_data: RegressionData,
 ) -> Hypothesis:  # fmt: skip
-    """Return the winner, or the set with a tied rival that training and held-out rows prefer."""
-    tied = tied_sets(hypotheses, winner, effects)
+    """Return the winner, or the set with a tied rival that training and held-out rows prefer.
+
+    A richer name of a law is left out: `readings.best_readings` has found that none is needed.
+    """
+    tied = [o for o in tied_sets(hypotheses, winner, effects) if not _is_richer(o, winner)]
     best = min(tied, key=lambda o: _cost(o, holdout_data), default=winner)
     return best if _is_cheaper(best, winner, holdout_data) else winner
+
+
+def _is_richer(hypothesis: Hypothesis, winner: Hypothesis) -> bool:
+    """Return whether a set has a richer name of one of the winner's laws."""
+    names = {(u.term.name, u.term.where) for u in winner.effects}
+    return any(
+        (name, used.term.where) in names
+        for used in hypothesis.effects
+        for name in used.term.includes  # type: ignore[attr-defined]
+    )
 
 
 def _is_cheaper(hypothesis: Hypothesis, winner: Hypothesis, holdout_data: RegressionData) -> bool:

@@ -10,11 +10,12 @@ import pytest
 from analysis.simulation.model import Model
 from analysis.trace.judge import rivals
 from analysis.trace.judge.rivals import with_alternatives
-from analysis.trace.settings import TRACE
+from analysis.trace.result import Rival
+from analysis.trace.settings import SEARCH, TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
-from tests.analysis.trace.gate_cases import traced
+from tests.analysis.trace.gate_cases import searched, traced
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,20 @@ def test_levels_by_direction_are_listed_where_another_law_fits_as_well_anyway(
     (effect,) = result.effects
     assert effect.name == "coulomb_friction"
     assert {r.name for r in effect.rivals if r.tied} == tied
+
+
+def test_a_richer_name_of_a_named_law_is_not_preferred_to_it_for_less_energy(
+    rig: Rig,
+) -> None:
+    """Of 22 and 19 N the difference fits an error of the form: it is listed as a rival only."""
+    runs = pair_of_runs(rig, Hidden(22.0, 19.0), repeats=2)
+    s = searched(rig, *runs, "coulomb_friction", "asymmetric_friction")
+    one, two = s.set_of("coulomb_friction"), s.set_of("asymmetric_friction")
+    assert two.fit.energy < one.fit.energy - 5 * SEARCH.number_price
+    rival = Rival("asymmetric_friction", "joint 2", 1.0, 1.0, tied=True, at="joint 2")
+    (judged,) = s.judged("coulomb_friction")
+    effects = [replace(judged, rivals=(rival,))]
+    assert rivals.best_tied_set(s.hypotheses, one, effects, s.holdout_data) is one
 
 
 def test_an_interval_reaches_what_a_richer_form_of_the_named_effect_gives(
