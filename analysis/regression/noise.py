@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows, in_common, record_rows
+from analysis.signals.filters import Smoother, bridged
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.parts import AnySensor
@@ -39,13 +40,31 @@ def sensor_variance(sensor: AnySensor) -> float:
 def repeated_rounding(sensor: AnySensor) -> float:
     """Return the variance [SI^2] of the rounding error that is the same in every repeat.
 
-    With noise of standard deviation s before a converter of step q, the mean over repeats of the
-    rounding error of x is a sum of (q / (pi k)) exp(-2 (pi k s / q)^2) sin(2 pi k x / q) (Widrow
-    and Kollar, Quantization Noise, 2008, ch. 4); without noise its variance is q^2 / 12.
+    It is that of `mean_rounding` at values evenly over a step; without noise it is q^2 / 12.
     """
-    step, k = _converter_step(sensor), np.arange(1, _HARMONICS + 1)
-    amplitudes = step / (np.pi * k) * np.exp(-2.0 * (np.pi * k * sensor.noise / step) ** 2)
+    amplitudes = _rounding_amplitudes(sensor)
     return float(0.5 * amplitudes @ amplitudes)
+
+
+def mean_rounding(sensor: AnySensor, x: Array) -> Array:
+    """Return the mean over repeats of the rounding error [SI] at values x (n,) before a converter.
+
+    With noise of standard deviation s before a converter of step q it is the sum over k >= 1 of
+    (-1)^k (q / (pi k)) exp(-2 (pi k s / q)^2) sin(2 pi k x / q), for steps at (j + 1/2) q (Widrow
+    and Kollar, Quantization Noise, 2008, ch. 4).
+    """
+    amplitudes = _rounding_amplitudes(sensor)
+    phase, total = 2.0 * np.pi * x / _converter_step(sensor), np.zeros_like(x)
+    for k, amplitude in enumerate(amplitudes, start=1):
+        if amplitude > 1e-3 * amplitudes[0]:
+            total += (-1) ** k * amplitude * np.sin(k * phase)
+    return total
+
+
+def _rounding_amplitudes(sensor: AnySensor) -> Array:
+    step, k = _converter_step(sensor), np.arange(1, _HARMONICS + 1)
+    scale = np.exp(-2.0 * (np.pi * k * sensor.noise / step) ** 2)
+    return np.asarray(step / (np.pi * k) * scale)
 
 
 def _converter_step(sensor: AnySensor) -> float:
@@ -53,19 +72,37 @@ def _converter_step(sensor: AnySensor) -> float:
     return float((high - low) / ((1 << sensor.bits) - 1))
 
 
-def with_added_noise(
-    rig: Rig,
-    record: Record,
-    rng: np.random.Generator,
-    variance: Callable[[AnySensor], float] = sensor_variance,
+def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
+    """Return the record with noise of the rig file's sensors added, rounding included."""
+
+    def noise(sensor: AnySensor, x: Array) -> Array:
+        return np.asarray(np.sqrt(sensor_variance(sensor)) * rng.standard_normal(len(x)))
+
+    return _disturbed(rig, record, noise)
+
+
+def with_added_rounding(
+    rig: Rig, record: Record, rng: np.random.Generator, smoother: Smoother
 ) -> Record:
-    """Return the record with noise added, of a variance [SI^2] by sensor of the rig file."""
+    """Return the record with rounding errors that are the same in every repeat added.
+
+    They are those of the record's own motion, which the `smoother` frees of its rounding, with the
+    converters' steps moved at random: a slow signal has slow errors, which no filter takes out.
+    """
+
+    def error(sensor: AnySensor, x: Array) -> Array:
+        moved = rng.uniform() * _converter_step(sensor)
+        return mean_rounding(sensor, smoother.apply(bridged(x)) + moved)
+
+    return _disturbed(rig, record, error)
+
+
+def _disturbed(rig: Rig, record: Record, error: Callable[[AnySensor, Array], Array]) -> Record:
     channels = dict(record.channels)
     for name in rig.channels:
         if name in channels:
-            sensor = rig.sensors.of(ch.kind_of(name)[0])
-            noise = np.sqrt(variance(sensor)) * rng.standard_normal(record.samples)
-            channels[name] = channels[name] + noise
+            x = np.asarray(channels[name], dtype=np.float64)
+            channels[name] = x + error(rig.sensors.of(ch.kind_of(name)[0]), x)
     return replace(record, channels=channels)
 
 

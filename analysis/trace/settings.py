@@ -172,6 +172,8 @@ class DataSettings:
     least_rounding: float = 1e-3
     """Least share of a sensor's variance by rounding that repeats: below it noise dithers the
     converter (arithmetic)."""
+    rounding_draws: int = 4
+    """Number of draws of where the converters' steps lie (arithmetic)."""
     unrepeated_ratio: float = 5.0
     """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
     note says that something else acts (tuned: clean benches stay below 2)."""

@@ -18,7 +18,7 @@ same in every repeat counts as noise too, up to its size by the rig file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,13 +26,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.noise import repeated_rounding, sensor_variance, with_added_noise
+from analysis.regression.noise import (
+    repeated_rounding,
+    sensor_variance,
+    with_added_noise,
+    with_added_rounding,
+)
 from analysis.regression.rows import Rows, in_common
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.settings import DATA
 from rig.model import channels as ch
-from rig.model.parts import AnySensor
+from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -98,7 +103,7 @@ def floors(
     for group, indices in groups.items():
         stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
         rounding = (
-            stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta, repeated_rounding)
+            _repeated_rounding(rig, terms, members[indices[0]], rows[indices[0]], beta)
             if coarse
             else {}
         )
@@ -262,15 +267,43 @@ def stated_noise(
     conditioned: ConditionedRecord,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
-    variance: Callable[[AnySensor], float] = sensor_variance,
 ) -> dict[str, float]:
-    """Return the rms that noise of the rig's sensors alone puts into each residual.
-
-    `variance` [SI^2] is that of a sample of each sensor, by default all of its stated noise.
-    """
+    """Return the rms that noise of the rig's sensors alone puts into each residual."""
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
-    noisy = with_added_noise(rig, conditioned.record, rng, variance)
-    again = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
+    noisy = with_added_noise(rig, conditioned.record, rng)
+    return _rms_changes(rig, terms, conditioned, rows, beta, noisy)
+
+
+def _repeated_rounding(
+    rig: Rig,
+    terms: Sequence[Used],
+    conditioned: ConditionedRecord,
+    rows: Mapping[str, Rows],
+    beta: Mapping[str, float],
+) -> dict[str, float]:
+    """Return the rms that rounding errors which repeat put into each residual."""
+    rng, filtering = np.random.default_rng(0), conditioned.filtering
+    smoother = filtering.channels if filtering.rows is None else filtering.rows
+    draws = [
+        _rms_changes(
+            rig, terms, conditioned, rows, beta,
+            with_added_rounding(rig, conditioned.record, rng, smoother),
+        )
+        for _ in range(DATA.rounding_draws)
+    ]  # fmt: skip
+    return {e: float(np.sqrt(np.mean([draw[e] ** 2 for draw in draws]))) for e in rows}
+
+
+def _rms_changes(
+    rig: Rig,
+    terms: Sequence[Used],
+    conditioned: ConditionedRecord,
+    rows: Mapping[str, Rows],
+    beta: Mapping[str, float],
+    record: Record,
+) -> dict[str, float]:
+    """Return the rms change of each residual by another record in place of the conditioned one."""
+    again = model_rows(rig, terms, conditioned.condition_alike(rig, record))
     out = {}
     for name, before in rows.items():
         a, b = in_common(before, again[name])

@@ -13,7 +13,8 @@ import pytest
 from scipy.signal import lombscargle
 
 from analysis.effects.friction import CoulombFriction
-from analysis.regression.noise import repeated_rounding
+from analysis.regression.noise import mean_rounding, repeated_rounding, with_added_rounding
+from analysis.signals.filters import row_filter
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
@@ -215,6 +216,34 @@ def test_rounding_that_repeats_has_the_variance_of_rounded_samples(rig: Rig, noi
     values = rng.uniform(0.0, 100.0, 1000)
     averages = np.mean(np.round(values + noise * rng.standard_normal((5000, 1000))), axis=0)
     assert np.var(averages - values) == pytest.approx(repeated_rounding(sensor), rel=0.15)
+    missed = averages - values - mean_rounding(sensor, values)
+    assert np.sqrt(np.mean(missed**2)) < 0.2 * np.std(averages - values)
+
+
+@pytest.mark.parametrize(("frequency", "cutoff"), [(0.5, 8.0), (8.0, 12.0)])
+def test_the_rounding_of_a_slow_signal_is_as_slow(
+    multisine_run: Run, frequency: float, cutoff: float
+) -> None:
+    """Behind a filter, errors that are added are as large as those of the signal itself."""
+    taken, rig = multisine_run.records[0], multisine_run.rig
+    spool = rig.sensors.spool.model_copy(update={"range": (0.0, 1023.0), "bits": 10, "noise": 0.1})
+    coarse = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"spool": spool})})
+    x = 500.0 + 6.0 * np.sin(2 * np.pi * frequency * taken.time)
+    noise, smoother = np.random.default_rng(1), row_filter(taken.sample_rate, cutoff)
+    channel = np.round(x + 0.1 * noise.standard_normal(len(x)))
+    measured, rng = replace(taken, channels={"spool_1": channel}), np.random.default_rng(2)
+    drawn = [with_added_rounding(coarse, measured, rng, smoother) for _ in range(4)]
+
+    def slow(errors: Sequence[np.ndarray]) -> float:
+        return float(np.sqrt(np.mean([np.mean(smoother.apply(e) ** 2) for e in errors])))
+
+    def repeated(true: np.ndarray) -> np.ndarray:
+        draws = true + 0.1 * noise.standard_normal((200, len(true)))
+        return np.asarray(np.round(draws).mean(axis=0) - true)
+
+    own = [repeated(x + shift) for shift in np.linspace(0.0, 0.75, 4)]
+    added = slow([y.channels["spool_1"] - channel for y in drawn])
+    assert added == pytest.approx(slow(own), rel=0.25)
 
 
 def test_what_a_coarse_converter_rounds_alike_in_every_repeat_is_no_residual(rig: Rig) -> None:
