@@ -215,7 +215,10 @@ class SpoolLag(ValveEffect):
     With a damping ratio zeta, a detail of the form, the lag is of second order: with the natural
     frequency w = 2 zeta / tau, so that tau remains the delay of slow motion, d2x/dt2 + 2 zeta w
     dx/dt + w^2 x = w^2 u (Merritt 1967, as data sheets of valves state it). x and dx/dt are hidden
-    states; the rows use the exact response to the sampled spool, linear between samples.
+    states; the rows use the exact response to the sampled spool, linear between samples. The input
+    of a shape that is `held` is constant until the next sample, as a command recorded in place of
+    the spool is. Holding for T is (1 - exp(-s T)) / (s T) = 1 - s T / 2 + (s T)^2 / 6 - ...: it is
+    applied to x, of first order without the last of these.
     """
 
     mechanism: ClassVar[str] = "spool_dynamics"
@@ -236,32 +239,60 @@ class SpoolLag(ValveEffect):
         return _lag
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the time constant and the damping ratio."""
-        return (f"tau_spool_{self.joint + 1}", f"zeta_spool_{self.joint + 1}")
+        """Name the time constant, the damping ratio and whether the input is held (1)."""
+        return tuple(f"{name}_spool_{self.joint + 1}" for name in ("tau", "zeta", "held"))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the time constant [s] and the damping ratio [-]."""
-        tau, zeta = self.shape_names()
+        """Return the time constant [s], the damping ratio [-] and whether the input is held (1)."""
+        tau, zeta, held = self.shape_names()
         grid = (5e-4, 2e-3, 1e-2, 4e-2)
         return (
             Shape(tau, "s", 0.0, longest_lag(rig), grid, 0.0),
             Shape(zeta, "", *DAMPING_BOUNDS, (DAMPING_START,), saturates=True, detail=True),
+            Shape(held, "", 1.0, 1.0, (1.0,), detail=True, fixed=True),
         )
+
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the shape with a damping ratio."""
+        tau, zeta, _ = self.whole(rig, shape)
+        return ((tau, zeta or DAMPING_START, *shape[2:]),)
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the lag of an input held between samples, or of one linear between them.
+
+        A lag below a sample is too short for half a sample to be small beside it.
+        """
+        tau, zeta, held = self.whole(rig, shape)
+        if held:
+            return ((tau, zeta) if zeta else (tau,),)
+        return ((tau, zeta, 1.0),) if tau * rig.sample_rate >= 1.0 else ()
 
     def hidden(self, rig: Rig) -> int:
         """Return 2: the opening and its rate."""
         return 2
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Delay the spool's signal by the lag."""
-        return self.with_opening(signals, self.hidden_path(rig, signals, {}, shape)[:, 0])
+        """Delay the spool's signal by the lag, and by half a sample where the input is held."""
+        tau, zeta, held = self.whole(rig, shape)
+        x, rate = self.hidden_path(rig, signals, {}, shape).T
+        if held:
+            tau = max(tau, QUICKEST)
+            apart, bend = signals.u[:, self.joint] - x, 0.0
+            if zeta:
+                frequency = 2.0 * zeta / tau
+                bend = frequency * (frequency * apart - 2.0 * zeta * rate)
+            else:
+                rate = apart / tau
+            T = 1.0 / rig.sample_rate
+            x = x - T / 2.0 * rate + T**2 / 6.0 * bend
+        return self.with_opening(signals, x)
 
     def hidden_path(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return the opening [V] and its rate [V/s], (n, 2); the rate of a first order as 0."""
         u = np.ascontiguousarray(signals.u[:, self.joint])
-        tau, zeta = self.whole(rig, shape)
+        tau, zeta, _ = self.whole(rig, shape)
         samples = tau * signals.rate
         if zeta:
             path: Array = second_order(u, samples, zeta) * (1.0, signals.rate)
@@ -275,15 +306,21 @@ class SpoolLag(ValveEffect):
         )
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State the natural frequency and the damping ratio of a lag of second order."""
-        tau, zeta = self.whole(rig, shape)
-        if not zeta:
-            return ""
-        return (
-            f"the spool's lag is of second order, with a natural frequency of "
-            f"{zeta / (math.pi * tau):.3g} Hz and a damping ratio of {zeta:.2g}; "
-            f"tau_spool_{self.joint + 1} is its delay in slow motion"
-        )
+        """State natural frequency and damping ratio of a second order, and that input is held."""
+        tau, zeta, held = self.whole(rig, shape)
+        remarks = []
+        if zeta:
+            remarks.append(
+                f"the spool's lag is of second order, with a natural frequency of "
+                f"{zeta / (math.pi * tau):.3g} Hz and a damping ratio of {zeta:.2g}; "
+                f"tau_spool_{self.joint + 1} is its delay in slow motion"
+            )
+        if held:
+            remarks.append(
+                f"the lag fits better with spool_{self.joint + 1} constant between samples, as a "
+                "recorded command is, than linear"
+            )
+        return "; ".join(remarks)
 
     def fastest(self, shape: Sequence[float]) -> float:
         """Return the rate [1/s] of the quickest pole, as simulated."""
@@ -294,9 +331,9 @@ class SpoolLag(ValveEffect):
         return max(1.0, 2.0 * zeta, quicker) / max(shape[0], QUICKEST)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, time constant, kept above what the integrator can follow, and damping."""
-        tau, zeta = self.whole(rig, shape)
-        return np.array([self.joint, max(tau, QUICKEST), zeta])
+        """Return joint, time constant that can be integrated, damping, time [s] of holding."""
+        tau, zeta, held = self.whole(rig, shape)
+        return np.array([self.joint, max(tau, QUICKEST), zeta, held / rig.sample_rate])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the spool's velocity [V/s]."""
@@ -440,7 +477,7 @@ def _lag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
         else:
             dz[0] = (x[U, i] - z[0]) / par[1]
             dz[1] = -z[1] / par[1]
-        x[U, i] = z[0]
+        x[U, i] = z[0] - par[3] / 2.0 * dz[0] + par[3] ** 2 / 6.0 * dz[1]
 
 
 @kernel

@@ -178,7 +178,7 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         distance, *stiffening = shape[4:5] if e.name == "friction_curve" else shape
         path = worked(s, signals.sd[:, e.joint], sum(stiffening[:1]))
         return np.asarray(distance * contact_state(path, distance))
-    if e.name in ("spool_lag", "spool_hysteresis"):
+    if e.name == "spool_hysteresis":
         return e.prepare(rig, signals, shape).u[:, e.joint]
     return np.zeros(len(signals.t))
 
@@ -201,9 +201,12 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
         memory = np.zeros(len(signals.t))
         if e.remembers(shape):
             memory = hidden_state(e, rig, signals, shape)
+        states = np.tile(memory, (e.hidden(rig), 1)).T
+        if e.name == "spool_lag":
+            states = e.hidden_path(rig, signals, {}, shape)
         for k in range(40, 400, 45):
             x, bench = observed(signals, k)
-            z, dz = np.full(e.hidden(rig), memory[k]), np.zeros(e.hidden(rig))
+            z, dz = states[k].copy(), np.zeros(e.hidden(rig))
             out, M = np.zeros((base.OUT_ROWS, 2)), np.zeros((2, 2))
             phases = (base.PREPARE, base.CONTRIBUTE) if e.prepares else (base.CONTRIBUTE,)
             for phase in phases:
@@ -324,6 +327,24 @@ def test_a_lag_of_second_order_is_that_of_another_library(zeta: float) -> None:
     assert 1e3 * path[:, 1] == pytest.approx(w * w * states[:, 0], abs=1e-6)
     ramp = second_order(time, tau * 1e3, zeta)[:, 0]
     assert time[-1] - ramp[-1] == pytest.approx(tau, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(12e-3, 0.0, 1.0), (12e-3, 0.7, 1.0)])
+def test_a_command_held_between_samples_delays_the_opening_by_half_of_one(
+    rig: Rig, state: Signals, shape: tuple[float, float, float]
+) -> None:
+    """The lag's equation, stepped by another library at a fiftieth of a sample."""
+    lag = effect("spool_lag", "joint 1")
+    tau, zeta, _ = shape
+    w = 2.0 * zeta / tau
+    fine, time = 50, np.arange(50 * len(state.t)) / (50 * rig.sample_rate)
+    held = np.repeat(state.u[:, 0], fine)
+    law = ([w * w], [1.0, 2.0 * zeta * w, w * w]) if zeta else ([1.0], [tau, 1.0])
+    _, x, _ = lsim(law, held - held[0], time, interp=False)
+    path = x[::fine] + held[0]
+    opening, linear = (lag.prepare(rig, state, s).u[:, 0] for s in (shape, shape[:2]))
+    error, late = (float(np.std(a[50:] - path[50:])) for a in (opening, linear))
+    assert error < 0.15 * late
 
 
 REFUSED = [
