@@ -18,8 +18,9 @@ same in every repeat counts as noise too, up to its size by the rig file.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,8 @@ from analysis.regression.noise import (
     with_added_noise,
     with_added_rounding,
 )
-from analysis.regression.rows import Rows, in_common
+from analysis.regression.rows import Filtering, Rows, in_common
+from analysis.signals.filters import Smoother
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.settings import DATA
@@ -103,7 +105,15 @@ def floors(
     for group, indices in groups.items():
         stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
         rounding = (
-            _repeated_rounding(rig, terms, members[indices[0]], rows[indices[0]], beta)
+            stated_noise(
+                rig,
+                terms,
+                members[indices[0]],
+                rows[indices[0]],
+                beta,
+                partial(with_added_rounding, smoother=_smoother(members[indices[0]].filtering)),
+                DATA.rounding_draws,
+            )
             if coarse
             else {}
         )
@@ -267,49 +277,30 @@ def stated_noise(
     conditioned: ConditionedRecord,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
+    disturbed: Callable[[Rig, Record, np.random.Generator], Record] = with_added_noise,
+    draws: int = 1,
 ) -> dict[str, float]:
-    """Return the rms that noise of the rig's sensors alone puts into each residual."""
+    """Return the rms that noise of the rig's sensors alone puts into each residual.
+
+    `disturbed` adds that noise to a record, by default all that the rig file states; the rms is
+    that of so many `draws`.
+    """
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
-    noisy = with_added_noise(rig, conditioned.record, rng)
-    return _rms_changes(rig, terms, conditioned, rows, beta, noisy)
+    squares: dict[str, list[float]] = {name: [] for name in rows}
+    for _ in range(draws):
+        noisy = disturbed(rig, conditioned.record, rng)
+        again = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
+        for name, before in rows.items():
+            a, b = in_common(before, again[name])
+            change = row_residual(again[name], beta)[b] - row_residual(before, beta)[a]
+            if len(change):
+                squares[name].append(float(np.mean(change**2)))
+    return {n: float(np.sqrt(np.mean(drawn))) if drawn else NO_ROWS for n, drawn in squares.items()}
 
 
-def _repeated_rounding(
-    rig: Rig,
-    terms: Sequence[Used],
-    conditioned: ConditionedRecord,
-    rows: Mapping[str, Rows],
-    beta: Mapping[str, float],
-) -> dict[str, float]:
-    """Return the rms that rounding errors which repeat put into each residual."""
-    rng, filtering = np.random.default_rng(0), conditioned.filtering
-    smoother = filtering.channels if filtering.rows is None else filtering.rows
-    draws = [
-        _rms_changes(
-            rig, terms, conditioned, rows, beta,
-            with_added_rounding(rig, conditioned.record, rng, smoother),
-        )
-        for _ in range(DATA.rounding_draws)
-    ]  # fmt: skip
-    return {e: float(np.sqrt(np.mean([draw[e] ** 2 for draw in draws]))) for e in rows}
-
-
-def _rms_changes(
-    rig: Rig,
-    terms: Sequence[Used],
-    conditioned: ConditionedRecord,
-    rows: Mapping[str, Rows],
-    beta: Mapping[str, float],
-    record: Record,
-) -> dict[str, float]:
-    """Return the rms change of each residual by another record in place of the conditioned one."""
-    again = model_rows(rig, terms, conditioned.condition_alike(rig, record))
-    out = {}
-    for name, before in rows.items():
-        a, b = in_common(before, again[name])
-        change = row_residual(again[name], beta)[b] - row_residual(before, beta)[a]
-        out[name] = float(np.sqrt(np.mean(change**2))) if len(change) else NO_ROWS
-    return out
+def _smoother(filtering: Filtering) -> Smoother:
+    """Return the filter of the rows, or of the channels where rows have none."""
+    return filtering.channels if filtering.rows is None else filtering.rows
 
 
 def _has_coarse_converters(rig: Rig) -> bool:
