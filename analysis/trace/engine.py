@@ -250,7 +250,7 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     larger = sets_with_small_effect(
         finding.hypotheses, absorbed, finding.winner, rows.unseen.choosing
     )
-    others += [(hypothesis, "") for hypothesis in larger]
+    others += [(hypothesis, "") for hypothesis, _ in larger]
     alternatives = [
         (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
     ]
@@ -261,7 +261,7 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     after = with_effect_values(after, effects)
     shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
     after = replace(after, parameters={**after.parameters, **shared})
-    notes = small_effect_notes(rows.train, finding.winner, larger)
+    notes = small_effect_notes(finding.winner, larger)
     return _Fitted(winner, after, effects, tuple(notes), absorbed)
 
 

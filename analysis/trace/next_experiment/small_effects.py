@@ -23,12 +23,16 @@ from analysis.trace.settings import SEARCH, TRACE
 from rig.model.channels import place_in_words
 from rig.model.units import plain
 
+Moved = tuple[str, float]
+
 
 def sets_with_small_effect(
     hypotheses: HypothesisSet, absorbed: AbsorbedEffects | None, winner: Hypothesis,
     holdout_data: RegressionData,
-) -> list[Hypothesis]:  # fmt: skip
+) -> list[tuple[Hypothesis, Moved]]:  # fmt: skip
     """Return the sets with the further effect that training and held-out rows show most clearly.
+
+    Each is returned with the parameter that it moves most, and its relative change.
 
     There are several where one effect fits as well as another. The effect is one of `absorbed`,
     exceeds `TRACE.visible_deviations` of its noise, is possible, reduces the held-out residual by
@@ -44,11 +48,11 @@ def sets_with_small_effect(
             winner.fit.energy - larger.fit.energy > price
             and not hypotheses.physical_problem(larger)
             and loses_by_restriction(left, held_out_residual(holdout_data, larger.fit))
-            and moved_parameter(hypotheses.train_data, winner, larger)
+            and (moved := moved_parameter(hypotheses.train_data, winner, larger))
         ):
-            found.append(larger)
-    least = min((o.fit.energy for o in found), default=0.0)
-    return [o for o in found if o.fit.energy <= least + SEARCH.number_price]
+            found.append((larger, moved))
+    least = min((o.fit.energy for o, _ in found), default=0.0)
+    return [(o, moved) for o, moved in found if o.fit.energy <= least + SEARCH.number_price]
 
 
 def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[Used]:
@@ -60,15 +64,10 @@ def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[Used]:
     return [absorbed.explanations[k].effects[0] for k in order[: TRACE.most_rivals]]
 
 
-def small_effect_notes(
-    train_data: RegressionData, winner: Hypothesis, larger: Sequence[Hypothesis]
-) -> list[str]:
+def small_effect_notes(winner: Hypothesis, larger: Sequence[tuple[Hypothesis, Moved]]) -> list[str]:
     """Name the further effects of larger sets, and the parameters that they change most."""
     out = []
-    for hypothesis in larger:
-        moved = moved_parameter(train_data, winner, hypothesis)
-        assert moved is not None
-        parameter, change = moved
+    for hypothesis, (parameter, change) in larger:
         fresh = (u.term for u in hypothesis.effects)
         (effect,) = (t for t in fresh if (t.name, t.where) not in winner.keys)
         out.append(
