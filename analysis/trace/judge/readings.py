@@ -24,6 +24,7 @@ from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
     effect_of,
+    keys_of,
     may_grow,
     of_one_law,
     parameter_values,
@@ -211,5 +212,5 @@ def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypo
             if not may_grow(kept):
                 continue
             effects = (*kept, Used(effect, effect.shape_of(rig, ())))
-            sets[frozenset((u.term.name, u.term.where) for u in effects)] = effects
+            sets[keys_of(effects)] = effects
     return [hypotheses.refined(effects) for effects in sets.values()]

@@ -186,12 +186,10 @@ def best_tied_set(
 
 def _is_richer(hypothesis: Hypothesis, winner: Hypothesis) -> bool:
     """Return whether a set has a richer name of one of the winner's laws."""
-    names = {(u.term.name, u.term.where) for u in winner.effects}
-    return any(
-        (name, used.term.where) in names
-        for used in hypothesis.effects
-        for name in used.term.includes  # type: ignore[attr-defined]
+    named, others = (
+        [u.term for u in one.effects if isinstance(u.term, Effect)] for one in (winner, hypothesis)
     )
+    return any(is_special_case(effect, other) for effect in named for other in others)
 
 
 def _is_cheaper(hypothesis: Hypothesis, winner: Hypothesis, holdout_data: RegressionData) -> bool:

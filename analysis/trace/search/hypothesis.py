@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ class Hypothesis:
     @property
     def keys(self) -> frozenset[Key]:
         """Names and places of its effects."""
-        return frozenset((u.term.name, u.term.where) for u in self.effects)
+        return keys_of(self.effects)
 
     @property
     def laws(self) -> frozenset[Key]:
@@ -46,6 +46,11 @@ class Hypothesis:
     def total(self) -> float:
         """Energy above noise of all equations, each counted as at least zero."""
         return sum(max(0.0, e) for e in self.excess_energy.values())
+
+
+def keys_of(effects: Iterable[Used]) -> frozenset[Key]:
+    """Return the names and places of effects."""
+    return frozenset((u.term.name, u.term.where) for u in effects)
 
 
 def may_grow(effects: Sequence[Used], by: int = 1) -> bool:

@@ -34,6 +34,7 @@ from analysis.trace.search.hypothesis import (
     Key,
     effect_of,
     energy_above_noise,
+    keys_of,
     law_of,
     may_grow,
     negative_body,
@@ -129,7 +130,7 @@ class HypothesisSet:
 
         The search of its shapes ends early where it is no better than the set `instead_of`.
         """
-        key = frozenset((u.term.name, u.term.where) for u in effects)
+        key = keys_of(effects)
         if key not in self.fitted:
             rival = None if instead_of is None else instead_of.fit
             fit = refine(self.train_data, (*self.base, *effects), rival)
@@ -376,9 +377,7 @@ class HypothesisSet:
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
         for hypothesis in (now, *filter(self.physical_problem, larger)):
             for effects in self._with_parts_beside(hypothesis, equations):
-                with_parts.setdefault(
-                    frozenset((u.term.name, u.term.where) for u in effects), effects
-                )
+                with_parts.setdefault(keys_of(effects), effects)
         return larger + [self._extended(now, effects) for effects in with_parts.values()]
 
     def _with_parts_beside(
@@ -412,9 +411,12 @@ class HypothesisSet:
         others = [u for u in effects if u not in fresh]
         effects = [*others, *(at_best_size(self.train_data, u, others) for u in fresh)]
         known = self.refined(effects)
+        return self._refined_anew(effects) if self._spoils_equation(known, now) else known
+
+    def _spoils_equation(self, hypothesis: Hypothesis, now: Hypothesis) -> bool:
+        """Return whether an equation keeps more than under `now`, by more than noise."""
         band, before = self.noise_band.by_equation, now.excess_energy
-        worse = any(v > before[e] + band[e] for e, v in known.excess_energy.items())
-        return self._refined_anew(effects) if worse else known
+        return any(v > before[e] + band[e] for e, v in hypothesis.excess_energy.items())
 
     def may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
         """Return whether a candidate may have columns in some of the equations (any if none).
@@ -487,17 +489,13 @@ class HypothesisSet:
         return min(near, key=lambda o: (sum(o.size), residual(o)))
 
     def _smaller_sets(self, now: Hypothesis, tried: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return the fitted sets of fewer effects than `tried`, and no larger in all.
-
-        None of them leaves more of an equation than `now`, but for noise.
-        """
-        band, before = self.noise_band.by_equation, now.excess_energy
+        """Return the fitted sets of fewer effects than `tried`, no larger in all, none worse."""
         least = min(((o.size[0], sum(o.size)) for o in tried), default=(0, 0))
         return [
             o
             for o in self.fitted.values()
             if 0 < o.size[0] < least[0] and sum(o.size) <= least[1]
-            and all(v <= before[e] + band[e] for e, v in o.excess_energy.items())
+            and not self._spoils_equation(o, now)
         ]  # fmt: skip
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:

@@ -9,7 +9,7 @@ back to the right side's size before the change.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -207,10 +207,12 @@ def refine(
     `SEARCH.unpromising_ratio` times as much and little less than `SEARCH.first_steps` before. Where
     it leaves more than that fit, its terms that are in it keep the forms that they have.
     """
-    kept: Collection[int] = ()
+    shared: Sequence[int] = ()
+    enough = math.inf
     if instead_of is not None:
-        kept = [k for k, used in enumerate(terms) if used in instead_of.terms]
-        limit = SEARCH.unpromising_ratio * instead_of.energy
+        shared = [k for k, used in enumerate(terms) if used in instead_of.terms]
+        enough = instead_of.energy
+        limit = SEARCH.unpromising_ratio * enough
         first = _with_searched_shapes(data, terms, SEARCH.first_steps)
         terms = first.terms
         if first.energy > limit:
@@ -223,7 +225,7 @@ def refine(
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        if instead_of is not None and k in kept and fit.energy > instead_of.energy:
+        if k in shared and fit.energy > enough:
             continue
         fit = _with_details(data, _in_best_form(data, fit, k, steps), k, steps)
     return fit
