@@ -34,6 +34,7 @@ class Outputs:
         self.driver = driver
         self._rig = rig
         self._connected = False
+        self._at_zero = True
         self._silent = False
         self._told = False  # whether an unconfirmed zero has been logged
         self._armed_from: int | None = None  # tick from which on a law may output a voltage
@@ -43,11 +44,20 @@ class Outputs:
         """Whether the device has answered, so that its outputs may not be zero."""
         return self._connected
 
+    @property
+    def at_zero(self) -> bool:
+        """Whether no device has answered yet, or the last one has confirmed its outputs at zero.
+
+        It stays False after a device is lost, also while the wire is closed to connect again.
+        """
+        return self._at_zero
+
     def connect(self) -> DeviceInfo:
         """Open the wire, compare device and rig, zero the outputs; raises DeviceError."""
         info = self.driver.connect()
-        self._connected = True
+        self._connected, self._at_zero = True, False
         self.driver.zero_outputs()
+        self._at_zero = True
         for what, actual, wanted in (
             ("joints", info.joints, len(self._rig.joints)),
             ("measured channels", info.channels, len(self._rig.channels)),
@@ -73,7 +83,9 @@ class Outputs:
                 problem = error
             else:
                 self._silent = self._told = False
+                self._at_zero = True
                 return True
+        self._at_zero = False
         if not self._told:
             log.error(
                 "%s (%s); the device's own watchdog should zero them in %g s: keep away from the "
@@ -107,6 +119,7 @@ class Outputs:
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool) -> int:
         """Set the laws of all joints at one tick and return it; zero the outputs on failure."""
+        self._at_zero = False
         tick = self.safely(lambda: self.driver.apply(laws, restart=restart))
         self._armed_from = tick if any(law.limit > 0.0 for law in laws) else None
         return tick
@@ -130,7 +143,8 @@ class Outputs:
 
         After a trip the driver, if it can, closes the wire so that the device latches the trip too.
         """
-        zeroed = self.zero() or not self._connected
+        if self._connected:
+            self.zero()
         if tripped and not self._silent and isinstance(self.driver, LatchesTrip):
             self.driver.close_tripped()
         else:
@@ -139,7 +153,7 @@ class Outputs:
                     self.driver.stop()
             self.driver.close()
         self._connected = False
-        return zeroed
+        return self._at_zero
 
 
 def _bounded(law: OutputLaw, most: float) -> OutputLaw:

@@ -156,6 +156,22 @@ def test_that_zero_is_not_confirmed_is_said_before_that_the_device_is_lost(
     assert lost.value.__notes__ == ["outputs not confirmed at zero"]
 
 
+def test_a_device_that_does_not_come_back_leaves_its_outputs_unconfirmed(tmp_path: Path) -> None:
+    """The wire is closed before it is opened again: that proves nothing about the valve."""
+    driver = FakeDriver(RIG)
+    run = tmp_path / "run"
+    with (  # noqa: PT012
+        pytest.raises(DeviceLost) as lost,
+        Bench(RIG, driver, Recorder(run, RIG)) as bench,
+    ):
+        bench.apply(MOVE)
+        bench.run_for(0.1)
+        driver.dead = True
+        bench.reconnect(0.0)
+    assert lost.value.__notes__ == ["outputs not confirmed at zero"]
+    assert "not confirmed" in read_events(run)[-1]["message"]
+
+
 def test_a_device_lost_at_the_very_end_is_no_success(tmp_path: Path) -> None:
     driver = FakeDriver(RIG)
     run = tmp_path / "run"
