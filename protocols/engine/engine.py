@@ -17,6 +17,7 @@ from protocols.engine.run_inputs import RunInputs
 from protocols.engine.session import BenchSession
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded
 from protocols.files.plan import Plan
+from protocols.files.schema import Retry
 from protocols.steps.base import PlannedStep
 from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed, SafetyTrip
@@ -71,10 +72,7 @@ def _all(plan: Plan, runner: PlanRunner) -> None:
         try:
             runner.do(part)
         except DeviceLost as error:
-            lost += 1
-            if retry is None or lost > retry.times:
-                raise
-            _reconnect(runner, error, retry.wait, retry.times - lost)
+            lost = _reconnect(runner, error, retry, lost)
             continue
         except RunEnded:
             raise
@@ -88,13 +86,25 @@ def _all(plan: Plan, runner: PlanRunner) -> None:
         waiting = waiting[1:]
 
 
-def _reconnect(runner: PlanRunner, error: DeviceLost, wait: float, left: int) -> None:
-    """Zero the outputs and reconnect; the caller counts further losses."""
-    log.warning("%s; connecting again in %g s, %d more allowed", error, wait, left)
-    runner.rest_now("the device was lost", confirmed=False)
-    runner.bench.event("device lost", runner.bench.tick, message=str(error), retries=left)
-    runner.reconnect(wait)
-    runner.bench.event("device back", runner.bench.tick)
+def _reconnect(runner: PlanRunner, error: DeviceLost, retry: Retry | None, lost: int) -> int:
+    """Zero the outputs and reconnect; return the attempts of the whole run, of which `lost` before.
+
+    Raises DeviceLost where no attempt is left.
+    """
+    while retry is not None and lost < retry.times:
+        lost += 1
+        left = retry.times - lost
+        log.warning("%s; connecting again in %g s, %d more allowed", error, retry.wait, left)
+        runner.rest_now("the device was lost", confirmed=False)
+        runner.bench.event("device lost", runner.bench.tick, message=str(error), retries=left)
+        try:
+            runner.reconnect(retry.wait)
+        except DeviceLost as again:  # a device that restarts may need longer than one wait
+            error = again
+            continue
+        runner.bench.event("device back", runner.bench.tick)
+        return lost
+    raise error
 
 
 def _trip(plan: Plan, runner: PlanRunner, trip: SafetyTrip) -> None:

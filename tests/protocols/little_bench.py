@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import DeviceInfo, OutputLaw, SampleBlock
+from drivers.base import DeviceInfo, DeviceLost, OutputLaw, SampleBlock
 from rig.bench.guard import JointRole
 from rig.bench.screens.commands import Judge
 from rig.model import channels as ch
@@ -100,6 +100,7 @@ class LittleBench:
         self.events: list[dict[str, Any]] = []
         self.shown: dict[str, Any] = {}
         self.reconnected = 0
+        self.unreachable = 0  # attempts to reconnect that fail
         self.judge: Judge | None = None
         self.happenings: dict[int, Callable[[], None]] = {}  # what befalls the bench, by tick
 
@@ -110,6 +111,8 @@ class LittleBench:
     def reconnect(self, wait: float) -> None:
         self.zero_outputs()
         self.reconnected += 1
+        if self.reconnected <= self.unreachable:
+            raise DeviceLost("connection refused")
 
     def listen(self, judge: Judge) -> None:
         self.judge = judge

@@ -242,6 +242,28 @@ def test_only_a_lost_device_is_tried_again_within_its_budget(rig: Rig, losses: i
     assert sheet.bench.reconnected == 2
 
 
+@pytest.mark.parametrize("attempts", [1, 2])
+def test_a_device_that_restarts_slowly_is_asked_again_as_often_as_allowed(
+    rig: Rig, attempts: int
+) -> None:
+    """The first attempt finds no device; a second one does, where the protocol allows two."""
+    body = f"retry: {{times: {attempts}, wait: 1 s}}\nsteps:\n" + STEP.replace("NAME", "one")
+    sheet = Attended(rig, body)
+
+    def lose() -> None:
+        raise DeviceLost("the wire is silent")
+
+    sheet.on("record", 1, lose)
+    sheet.bench.unreachable = 1
+    if attempts == 1:
+        with pytest.raises(DeviceLost, match="connection refused"):
+            sheet.run()
+    else:
+        sheet.run()
+        assert [r.meta.name for r in sheet.bench.complete] == ["one_r1", "one_r2", "one_r3"]
+    assert sheet.bench.reconnected == attempts
+
+
 def test_a_hold_records_the_creep_with_every_valve_closed(rig: Rig) -> None:
     body = (
         "steps:\n  - hold: 5 s\n    name: still\n    lock: [{joint: 1, at: closed, piston: 5 mm}]\n"
