@@ -25,6 +25,7 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 TRIAL_SECONDS = 3.0  # drift is judged over about this long, or one period if that is longer
+LOCK_DEVIATIONS = 6.0  # of the noise of a position: one sample of 10^9 is farther off
 LONGEST_RECORD = 86400.0  # [s]
 
 
@@ -297,6 +298,14 @@ def _lock(part: Lock, step: str, rig: Rig) -> LockPlan:
         piston = part.piston
     else:
         piston = half if part.at == END_MAX else -half
+    noise = rig.sensors.of(rig.position_kind).noise
+    if part.tolerance < LOCK_DEVIATIONS * noise:
+        raise InputError(
+            f"step {step!r}: the lock of joint {part.joint} has a tolerance of "
+            f"{1e3 * part.tolerance:g} mm, and the noise of its sensor is {1e3 * noise:g} mm, so "
+            "that noise alone would trip the bench; expected at least "
+            f"{1e3 * LOCK_DEVIATIONS * noise:g} mm"
+        )
     return LockPlan(part.joint - 1, part.at, piston, part.tolerance)
 
 
