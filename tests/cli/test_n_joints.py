@@ -182,3 +182,17 @@ def test_three_joints_speak_over_the_wire(tmp_path: Path, planned: Protocol, dig
     result = identify([run])
     near(result, {name: digger.nominal[name] for name in ("R33", "W3", "C_pp_3", "b")}, 2.0)
     assert not result.estimates["R11"].identified
+
+
+def test_a_protocol_that_leaves_a_parameter_open_is_not_proved(tmp_path: Path) -> None:
+    """A script reads it from the exit code, a person from the last line."""
+    sheet = tmp_path / "short.yaml"
+    sheet.write_text(
+        "name: short\njoints: 2\nsteps:\n  - name: one\n    lock: [{joint: 1, at: closed}]\n"
+        "    excite: [{joint: 2, signal: {kind: sine, frequency: 1 Hz, amplitude: 1 V}}]\n"
+        "    duration: 3 s\n    repeats: 1\n"
+    )
+    found = bramah("plan", "--rig", "shinshu-2dof", "--prove", sheet)
+    assert found.returncode == 1
+    assert "does not determine" in found.stderr.splitlines()[-1]
+    assert "R12" in found.stderr.splitlines()[-1]

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.errors import WorkError
 from rig.cli.options import JsonOption, RigOption, writable_file
 from rig.cli.text.output import progress, write_json
 
@@ -28,6 +29,7 @@ def plan(
 ) -> None:
     """Generate a rig's lock-and-excite steps and prove that they determine all parameters.
 
+    Ends with 1 where they do not.
     Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
     """
     from rig.cli.proof.step_planning import PlanRequest, plan_steps
@@ -38,3 +40,6 @@ def plan(
     write_json(json, proof.as_dict())
     if json != Path("-"):
         typer.echo(proof_text(proof))
+    if not proof.complete:
+        lost = [n for v in proof.verdicts.values() for n in v.lost]
+        raise WorkError(f"{proof.protocol}: does not determine {' '.join(lost)}")
