@@ -102,7 +102,10 @@ class AsymmetricViscousFriction(Effect):
                 return f"a slope of {slope:.3g} N s/m {way} would drive the joint"
         beside_dry = any(f"{name}{self.joint + 1}" in values for name in DRY)
         least = BESIDE_DRY if beside_dry else DIFFERENCE
-        if abs(slopes[0] - slopes[1]) < least * 0.5 * sum(slopes):
+        # Equal slopes of the piston beside the joint's own are no asymmetry either: they follow the
+        # lever arm, and with it a friction that changes along the stroke.
+        both = [abs(values[name]) for name in self._names(rig)]
+        if abs(slopes[0] - slopes[1]) < least * max(0.5 * sum(slopes), min(both)):
             return f"the slopes of the two directions differ by less than {100 * least:.0f} %"
         return ""
 
