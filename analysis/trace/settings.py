@@ -343,6 +343,8 @@ class SearchSettings:
     contacts that stiffen have 0.01 to 0.07, noise at rest that passes for one 0.4 to 1)."""
     detail_share: float = 0.05
     """Share of the remaining energy above noise that a detail of the form must remove (tuned)."""
+    detail_starts: int = 2
+    """Number of values of a detail, those that leave least, from which a search begins."""
     # Free forms.
     free_forms_judged: int = 4
     """Largest number of free forms that are put through the gates."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares as minimise
 
-from analysis.effects.base import Effect, Shape, shapes_of
+from analysis.effects.base import Effect, Shape, shape_values, shapes_of
 from analysis.regression.rows import in_common, matrix_of, parameters_of
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.conditioned_record import acting_on, shared_rows
@@ -239,26 +239,29 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -
     opened = [Used(used.term, start) for start in starts if start != used.shape]
     asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
     # Half, since the linear prediction is less than what a detail removes.
-    searched = [
-        _with_searched_shapes(data, _with_term(fit.terms, used, start), steps)
+    promising = [
+        fit_coefficients(data, _with_term(fit.terms, used, start))
         for start in opened
         if _predicted_gain(data, fit, used, start) >= 0.5 * asked
     ]
+    nearest = sorted(promising, key=lambda model: model.energy)[: SEARCH.detail_starts]
+    searched = [_with_searched_shapes(data, model.terms, steps) for model in nearest]
     more = min(searched, key=lambda model: model.energy, default=fit)
     if fit.energy - more.energy <= asked:
         return fit
     # A form that fitted better without the details need not do so with them.
     more = _in_best_form(data, more, place, steps)
     earned = fit.energy - more.energy > asked
-    return more if earned and _determines_shapes(data, more, more.terms[place]) else fit
+    return more if earned and _determines_shapes(data, more, more.terms[place], used) else fit
 
 
-def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
+def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, before: Used) -> bool:
     """Return whether the rows determine an effect's shapes beside the details of its form.
 
-    Each shape must have a relative standard error of at most `SEARCH.shape_error`, and neither it
-    nor a detail may lie at its bound. Otherwise the detail fits something else: noise that reverses
-    a contact at rest looks like a long presliding distance that shrinks with speed.
+    Each shape that is larger than `before`, without the details, must have a relative standard
+    error of at most `SEARCH.shape_error`, and no shape or detail may lie at its bound. Otherwise
+    the detail fits something else: noise that reverses a contact at rest looks like a long
+    presliding distance that shrinks with speed.
     """
     assert isinstance(used.term, Effect)
     shapes = shapes_of(data.rig, used)
@@ -266,8 +269,10 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
         return False
     names, columns = tangent(data, fit)
     misfit = math.sqrt(max(1.0, fit.energy / len(fit.residual)))
+    simpler = shape_values(data.rig, before)
     for shape, value in zip(shapes, used.shape, strict=True):
-        if shape.detail or shape.fixed or not shape.given(value):
+        larger = abs(value) > abs(simpler.get(shape.parameter, 0.0))
+        if shape.detail or shape.fixed or not shape.given(value) or not larger:
             continue
         own = names.index(shape.parameter)
         basis = orthonormal(np.delete(columns, own, axis=1))

@@ -167,16 +167,17 @@ def test_a_detail_at_its_bound_or_one_that_leaves_the_shape_open_is_no_form(rig:
     train_data = regression_data(rig, tuple(map(Used, baseline())), records)
     friction = make("coulomb_friction", "joint 2")
 
-    def shaped(*shape: float) -> bool:
+    def shaped(*shape: float, before: float = 1e-6) -> bool:
         used = Used(friction, shape)
-        return refinement._determines_shapes(
-            train_data, refinement.fit_coefficients(train_data, (*train_data.terms, used)), used
-        )
+        fit = refinement.fit_coefficients(train_data, (*train_data.terms, used))
+        return refinement._determines_shapes(train_data, fit, used, Used(friction, (before,)))
 
     assert shaped(100e-6, 30.0)
     assert not shaped(100e-6, 3e3)
     # So short a distance that no sample lies within a reversal says nothing of how it shortens.
     assert not shaped(2e-6, 30.0)
+    # A distance that was no shorter without the detail is not what the detail fits.
+    assert shaped(2e-6, 30.0, before=2e-6)
 
 
 def test_shapes_are_searched_again_from_those_of_a_larger_set(rig: Rig) -> None:
