@@ -347,15 +347,21 @@ def _try_free_forms(
 ) -> Judgement | None:  # fmt: skip
     """Return an explanation by a free form, None where none is needed or none explains.
 
-    One is needed where named effects do not explain, or explain with several mechanisms and leave
-    more than noise.
+    One is needed where named effects do not explain, leave more than the tolerance for their forms,
+    or explain with several mechanisms and leave more than noise.
     """
     hypotheses, winner = found.hypotheses, found.winner
     explained = found.verdict != UNEXPLAINED
-    to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
-    if explained and (len(winner.laws) < 2 or to_noise):
+    if explained and not (winner.effects and _may_be_replaced(hypotheses, winner)):
         return None
     return explained_by_free_form(hypotheses, free, winner, holdout_data, rng, explained)
+
+
+def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
+    """Return whether a set that explains leaves enough for a free form in its place."""
+    to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
+    several = len(winner.laws) > 1
+    return not to_noise and (several or not hypotheses.within_form_tolerance(winner))
 
 
 def _refused_as_unphysical(

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 def explained_by_free_form(
     hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis,
-    holdout_data: RegressionData, rng: np.random.Generator, fewer: bool = False,
+    holdout_data: RegressionData, rng: np.random.Generator, explained: bool,
 ) -> Judgement | None:  # fmt: skip
     """Return the first set with a free form that explains the records, None where none does.
 
@@ -34,15 +34,13 @@ def explained_by_free_form(
     joins these effects, or replaces those of one mechanism; it never joins a name of its own
     mechanism at the same place. Every gate of every effect must hold
     with it, no remainder may speak against the set, and no named effect may fit as well as the
-    free form. With `fewer` the named effects explain within the tolerance of their forms, but with
-    several mechanisms: a set in their place must need fewer and leave at most
-    `SEARCH.free_form_ratio` of their energy.
+    free form. Where the named effects have `explained` the records, `_is_better` must hold too.
     """
     if not free:
         return None
     extended = hypotheses.with_candidates(free)
     named = {kind.name for kind in extended.effects if not kind.free}
-    for hypothesis in _simplest_first(_sets_with_free_form(extended, winner, fewer)):
+    for hypothesis in _simplest_first(_sets_with_free_form(extended, winner, explained)):
         compared = rows_within_curves(holdout_data, hypothesis.fit)
         effects = gates.judge_effects(extended, hypothesis, compared, rng)
         left = remainders(extended, hypothesis, compared)
@@ -60,20 +58,36 @@ def _ties_with_name(effects: Sequence[JudgedEffect], named: set[str]) -> bool:
     return any(r.tied and r.name in named for f in effects if f.free for r in f.rivals)
 
 
-def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
+def _sets_with_free_form(
+    wide: HypothesisSet, winner: Hypothesis, explained: bool
+) -> list[Hypothesis]:
     """Return the physical sets with a free form that leave little enough (see the caller)."""
     out: list[Hypothesis] = []
-    for start in _sets_to_extend(wide, winner, fewer):
+    for start in _sets_to_extend(wide, winner, explained):
         for single in wide.extensions(start, free=True):
             if wide.removes_too_little(start, single):  # a further effect would make it needless
                 continue
             for hypothesis in (single, _with_further_effect(wide, single)):
-                simpler = len(hypothesis.laws) < len(winner.laws)
-                less = simpler and hypothesis.total < SEARCH.free_form_ratio * winner.total
                 explains = _explains_what_it_alters(wide, start, hypothesis)
-                if explains and not wide.physical_problem(hypothesis) and (less or not fewer):
+                better = not explained or _is_better(wide, winner, hypothesis)
+                if explains and better and not wide.physical_problem(hypothesis):
                     out.append(wide.prune(hypothesis))
     return out
+
+
+def _is_better(wide: HypothesisSet, winner: Hypothesis, hypothesis: Hypothesis) -> bool:
+    """Return whether a set with a free form may replace one that explains by names alone.
+
+    With fewer mechanisms it must leave at most `SEARCH.free_form_ratio` of the energy. With as many
+    it must leave `SEARCH.free_form_ratio_alike`, and the names more than the tolerance for their
+    forms: a level of friction that changes along the stroke misses what the curve follows.
+    """
+    ratio = SEARCH.free_form_ratio
+    if len(hypothesis.laws) >= len(winner.laws):
+        if len(hypothesis.laws) > len(winner.laws) or wide.within_form_tolerance(winner):
+            return False
+        ratio = SEARCH.free_form_ratio_alike
+    return hypothesis.total < ratio * winner.total
 
 
 def _explains_what_it_alters(wide: HypothesisSet, start: Hypothesis, other: Hypothesis) -> bool:
@@ -122,14 +136,13 @@ def _curves_share_a_balance(wide: HypothesisSet, hypothesis: Hypothesis) -> bool
     )
 
 
-def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
+def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, explained: bool) -> list[Hypothesis]:
     """Return the sets that a free form may join: the winner, and it without one mechanism.
 
-    With `fewer` the free form is tried alone, beside no effect.
+    Where the winner has `explained` the records, the free form is tried in place of a mechanism or
+    of all.
     """
-    if fewer:
-        return [wide.empty]
-    out = [winner]
+    out = [wide.empty] if explained else [winner]
     for law in dict.fromkeys(map(law_of, winner.effects)):
         kept = [u for u in winner.effects if law_of(u) != law]
         out.append(wide.refined(kept) if kept else wide.empty)

@@ -351,6 +351,10 @@ class SearchSettings:
     free_form_ratio: float = 0.5
     """Largest remaining energy of a free form over that of the several named mechanisms which it
     replaces (tuned)."""
+    free_form_ratio_alike: float = 0.25
+    """Largest remaining energy of a free form over that of names of as many mechanisms that leave
+    more than the tolerance for their forms (tuned: friction that changes by a third along the
+    stroke leaves 0.01, on a plant written apart from the study's)."""
     altered_share: float = 0.1
     """Share of an equation's energy above noise that a set removes, from which a free form must
     explain that equation (tuned)."""
