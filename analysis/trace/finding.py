@@ -271,6 +271,19 @@ def search_and_judge(
     return replace(finding_of(rows, found, notes), held_out_only=not found.winner.effects)
 
 
+def with_free_form(finding: Finding, free: Sequence[Effect], seed: int) -> Finding:
+    """Return the finding, or an explanation by a free form where one is needed and explains."""
+    found = Judgement(
+        finding.hypotheses, finding.effects, finding.winner, finding.verdict, finding.remainders
+    )
+    choosing, rng = finding.rows.unseen.choosing, np.random.default_rng(seed)
+    by_free_form = _try_free_forms(found, free, choosing, rng)
+    if by_free_form is None:
+        return finding
+    notes = remainder_notes(by_free_form.verdict, by_free_form.remainders, False, True)
+    return finding_of(finding.rows, by_free_form, notes)
+
+
 def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) -> list[str]:
     """Say why only held-out records keep too much: what does not repeat, or little excitation."""
     above = sorted({r.equation for r in left if r.veto})

@@ -17,6 +17,7 @@ from analysis.trace.finding import (
     TraceRuns,
     search_and_judge,
     trace_rows,
+    with_free_form,
     without_unnamed_effects,
 )
 from analysis.trace.judge import gates, removal
@@ -36,13 +37,17 @@ def find(
 ) -> Finding:  # fmt: skip
     """Return what the model lacks: `search_and_judge`, in motion only where that is needed.
 
-    Torques at `records.lines` are judged beside the effects found. Where one is refused, nothing is
-    taken out of the rows, and all is searched again.
+    No curve of the speed meets the rows of a joint that rests: there free forms are tried in motion
+    first. Torques at `records.lines` are judged beside the effects found. Where one is refused,
+    nothing is taken out of the rows, and all is searched again.
     """
-    found = search_and_judge(rows, candidates, free, seed, done)
-    found = without_unnamed_effects(
-        searched_in_motion(rig, terms, records, candidates, free, seed, found)
-    )
+    joints = {e.joint for e in candidates if e.family == "friction"}
+    rest = any(_rests(rows.train.records, joint) for joint in joints)
+    on_all_rows = search_and_judge(rows, candidates, () if rest else free, seed, done)
+    found = searched_in_motion(rig, terms, records, candidates, free, seed, on_all_rows)
+    if rest and found is on_all_rows:
+        found = with_free_form(found, free, seed)
+    found = without_unnamed_effects(found)
     if not records.lines:
         return found
     judged = _judged_lines(rig, records, found)
