@@ -41,6 +41,7 @@ from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import (
     beyond_curve_notes,
     curves_that_limit,
+    equations_beyond_curves,
     rows_within_curves,
 )
 from analysis.trace.judge.rivals import alternatives_of, with_alternatives
@@ -444,23 +445,25 @@ def _final_verdict(
     """
     if finding.verdict == UNEXPLAINED:
         return UNEXPLAINED, []
-    kept, words = _judging_rows_above_band(
+    kept, words = judging_rows_above_band(
         finding.rows.unseen.judging, finding.hypotheses.empty, winner
     )
     joints = joints_with_friction(winner, kept)
     if joints and not finding.rows.in_motion:
         rows, hypotheses, moving = fitted_in_motion(rig, terms, records, winner, joints)
-        if not _judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
+        if not judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
             kept, words = set(), rest_phase_notes(joints, included=True)
     return (UNEXPLAINED if kept else finding.verdict), words
 
 
-def _judging_rows_above_band(
+def judging_rows_above_band(
     judge_data: RegressionData, before: Hypothesis, after: Hypothesis
 ) -> tuple[set[str], list[str]]:
     """Return the equations whose judging rows keep more than the band, and notes on them."""
     known = rows_within_curves(judge_data, after.fit)
-    kept = gates.held_out_above_band(known, before.fit, after.fit)
+    beyond = equations_beyond_curves(judge_data, after.fit)
+    above = gates.held_out_above_band(known, before.fit, after.fit)
+    kept = [(e, figure) for e, figure in above if e not in beyond]
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
     return {e for e, _ in kept}, [*words, *beyond_curve_notes(judge_data, after.fit)]
 

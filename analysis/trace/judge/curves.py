@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,16 +50,30 @@ def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return the data with only the rows within the outermost knots of a model's free curves.
 
     Beyond them a curve is extrapolated by a straight line, which is no evidence on the mechanism.
-    All rows are returned where an equation would keep fewer than `TRACE.least_rows`.
+    Equations that would keep too few (`equations_beyond_curves`) keep all.
     """
-    inside = _within_knots(data, model)
-    return data.at(inside) if not inside.all() and _enough_within(data, inside) else data
+    inside, beyond = _within_knots(data, model), equations_beyond_curves(data, model)
+    for s in data.segments:
+        inside[s.where] |= s.equation in beyond
+    return data if inside.all() else data.at(inside)
 
 
-def curves_that_limit(data: RegressionData, model: ExactFit) -> tuple[Used, ...]:
-    """Return the free curves of a model beyond which `rows_within_curves` leaves rows out."""
-    curves = _free_curves(model)
-    return curves if _enough_within(data, _within_knots(data, model)) else ()
+def equations_beyond_curves(data: RegressionData, model: ExactFit) -> set[str]:
+    """Return the equations of which too few rows lie within the knots of a model's free curves.
+
+    Fewer than `TRACE.least_rows` cannot judge, and the others would judge an extrapolation.
+    """
+    kept = _rows_inside(data, _within_knots(data, model))
+    return {e for e, n in data.row_counts.items() if kept[e] < min(n, TRACE.least_rows)}
+
+
+def curves_that_limit(data: RegressionData, model: ExactFit) -> Mapping[str, tuple[Used, ...]]:
+    """Return by equation the free curves beyond which rows are left out of its error.
+
+    An equation without any row within them has the error of the extrapolated curves.
+    """
+    curves, kept = _free_curves(model), _rows_inside(data, _within_knots(data, model))
+    return {e: curves for e in data.row_counts if kept[e]}
 
 
 def rows_within(
@@ -71,14 +85,14 @@ def rows_within(
 
 def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
     """Return a note for every equation of which judging rows lie beyond a model's free curves."""
-    inside = _within_knots(data, model)
-    kept = _rows_inside(data, inside)
-    role = "they speak neither for nor against it, and are left out of the errors"
-    if not _enough_within(data, inside):
-        role = "too few remain without them, so that they judge the extrapolated curve"
+    kept = _rows_inside(data, _within_knots(data, model))
+    beyond = equations_beyond_curves(data, model)
+    left_out = "they speak neither for nor against it, and are left out of the errors"
+    too_few = "too few remain within it to judge it, so that only the rows that choose do"
     return [
         f"{e}: {plain(100 * (rows - kept[e]) / rows, 2)} % of the judging rows lie beyond the "
-        f"range of the fitted curve: {role}; train with motions at least as large"
+        f"range of the fitted curve: {too_few if e in beyond else left_out}; train with motions at "
+        "least as large"
         for e, rows in data.row_counts.items()
         if kept[e] < rows
     ]
@@ -102,12 +116,6 @@ def _rows_inside(data: RegressionData, inside: NDArray[np.bool_]) -> Counter[str
     for s in data.segments:
         kept[s.equation] += int(np.count_nonzero(inside[s.where]))
     return kept
-
-
-def _enough_within(data: RegressionData, inside: NDArray[np.bool_]) -> bool:
-    """Return whether each equation keeps at least `TRACE.least_rows` of its rows inside (M,)."""
-    kept = _rows_inside(data, inside)
-    return all(kept[e] >= min(rows, TRACE.least_rows) for e, rows in data.row_counts.items())
 
 
 def _within_all(

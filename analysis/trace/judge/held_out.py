@@ -116,16 +116,16 @@ def errors(
     before: ExactFit,
     after: ExactFit,
     divided: Collection[Group] = (),
-    curves: Sequence[Used] = (),
+    curves: Mapping[str, Sequence[Used]] | None = None,
     others: Sequence[Floor] = (),
     noise_ratio: Mapping[str, float] | None = None,
 ) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
     `members` are the records, each repeat by itself; of those in `divided` groups only the judging
-    rows count, and only rows within the outermost knots of `curves`. The noise floor is that of the
-    residual under the model `after`. A record without repeats has a floor by its periods or
-    neighbouring states, for which all its rows are used, or by `others` or `noise_ratio`
+    rows count, and only rows within the outermost knots of the equation's `curves`. The noise floor
+    is that of the residual under the model `after`. A record without repeats has a floor by its
+    periods or neighbouring states, for which all its rows are used, or by `others` or `noise_ratio`
     (`noise_floor.floors`).
     Sines that are taken out of the rows are part of what the model `before` leaves.
     """
@@ -147,7 +147,7 @@ def errors(
     floor = {(f.group, f.equation): f.noise for f in split}
     first, other = (
         [
-            {e: rows_within(rig, curves, c, rows) for e, rows in rows_of.items()}
+            {e: rows_within(rig, (curves or {}).get(e, ()), c, rows) for e, rows in rows_of.items()}
             for c, rows_of in zip(members, built, strict=True)
         ]
         for built in (first, other)

@@ -14,9 +14,11 @@ from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.engine import with_effect_values
+from analysis.trace.engine import judging_rows_above_band, with_effect_values
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
+from analysis.trace.judge.gates import held_out_above_band
 from analysis.trace.result import JudgedEffect
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import fit_coefficients
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -49,7 +51,7 @@ def test_a_model_with_an_undetermined_value_of_a_curve_can_be_simulated(rig: Rig
 
 
 @pytest.mark.parametrize(
-    ("reach", "says"), [(0.9, "neither for nor against"), (0.01, "the extrapolated curve")]
+    ("reach", "says"), [(0.9, "neither for nor against"), (0.01, "only the rows that choose")]
 )
 def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
     rig: Rig, reach: float, says: str
@@ -69,3 +71,23 @@ def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
     known = rows_within_curves(data, fit).row_counts
     assert (known["torque_2"] < data.row_counts["torque_2"]) is (reach > 0.1)
     assert known["flow_cap_2"] == data.row_counts["flow_cap_2"]
+
+
+@pytest.mark.parametrize("reach", [0.9, 0.01])
+def test_an_extrapolated_curve_does_not_change_the_verdict(rig: Rig, reach: float) -> None:
+    """A spring that is too soft speaks against the set only within the range of its curve."""
+    run = experiment(rig, Hidden(spring=20.0), repeats=1, seed=1, rms=RMS)
+    terms = [Used(term) for term in baseline_of(rig)]
+    data = regression_data(rig, terms, conditioned_records(rig, [run]))
+    s = data.records[0].signals.s[:, 1]
+    middle, half = 0.5 * (s.min() + s.max()), 0.5 * reach * np.ptp(s)
+    knots = np.linspace(middle - half, middle + half, 6)
+    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(6)[0]))
+    fit = fit_coefficients(data, (*terms, curve))
+    empty = HypothesisSet(data, []).empty
+    wrong = {n: 0.3 * v if n.startswith("F_position") else v for n, v in fit.beta.items()}
+    after = replace(empty, effects=(curve,), fit=replace(fit, beta=wrong))
+    assert [e for e, _ in held_out_above_band(data, empty.fit, after.fit)] == ["torque_2"]
+    against, words = judging_rows_above_band(data, empty, after)
+    assert against == ({"torque_2"} if reach > 0.1 else set())
+    assert any("beyond the range of the fitted curve" in said for said in words)

@@ -225,7 +225,7 @@ FAULTS: Final = (
          ((remaining, "remainders", lambda *_: []), (finding, "remainders", lambda *_: []),
           (gates, "held_out_above_band", lambda *_: []))),
     Rule("judging rows unread", "nobody asks what the judging rows keep",
-         ((engine, "_judging_rows_above_band", lambda *_: (set(), [])),)),
+         ((engine, "judging_rows_above_band", lambda *_: (set(), [])),)),
 )  # fmt: skip
 
 
