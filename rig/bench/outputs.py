@@ -33,24 +33,11 @@ class Outputs:
     def __init__(self, rig: Rig, driver: Driver) -> None:
         self.driver = driver
         self._rig = rig
-        self._connected = False
-        self._at_zero = True
+        self._connected = False  # whether the device has answered, so that its outputs may not be 0
+        self._at_zero = True  # no device has answered yet, or the last one has confirmed zero
         self._silent = False
         self._told = False  # whether an unconfirmed zero has been logged
         self._armed_from: int | None = None  # tick from which on a law may output a voltage
-
-    @property
-    def connected(self) -> bool:
-        """Whether the device has answered, so that its outputs may not be zero."""
-        return self._connected
-
-    @property
-    def at_zero(self) -> bool:
-        """Whether no device has answered yet, or the last one has confirmed its outputs at zero.
-
-        It stays False after a device is lost, also while the wire is closed to connect again.
-        """
-        return self._at_zero
 
     def connect(self) -> DeviceInfo:
         """Open the wire, compare device and rig, zero the outputs; raises DeviceError."""
@@ -98,6 +85,13 @@ class Outputs:
         self._silent = self._told = True
         return False
 
+    def surely_zero(self) -> bool:
+        """Zero the outputs of a connected device; return whether the outputs are known to be zero.
+
+        They are not after a device was lost, also while the wire is closed to connect again.
+        """
+        return self.zero() if self._connected else self._at_zero
+
     def safely(self, call: Callable[[], Result]) -> Result:
         """Return the result of `call`; on any error zero the outputs before raising it."""
         with self:
@@ -143,8 +137,7 @@ class Outputs:
 
         After a trip the driver, if it can, closes the wire so that the device latches the trip too.
         """
-        if self._connected:
-            self.zero()
+        zeroed = self.surely_zero()
         if tripped and not self._silent and isinstance(self.driver, LatchesTrip):
             self.driver.close_tripped()
         else:
@@ -153,7 +146,7 @@ class Outputs:
                     self.driver.stop()
             self.driver.close()
         self._connected = False
-        return self._at_zero
+        return zeroed
 
 
 def _bounded(law: OutputLaw, most: float) -> OutputLaw:

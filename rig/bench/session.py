@@ -185,7 +185,7 @@ class Bench:
         unsure = f"{message}; {UNSURE}".lstrip("; ")
         sure = False
         try:
-            sure = self._outputs.zero() if self._outputs.connected else self._outputs.at_zero
+            sure = self._outputs.surely_zero()
             # Published first because a screen waits for it, and writing the data can take seconds.
             lost = isinstance(error, DeviceLost)
             self._display.ended(state, message if sure else unsure, lost=lost)
