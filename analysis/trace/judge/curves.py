@@ -52,7 +52,8 @@ def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     Beyond them a curve is extrapolated by a straight line, which is no evidence on the mechanism.
     Equations that would keep too few (`equations_beyond_curves`) keep all.
     """
-    inside, beyond = _within_knots(data, model), equations_beyond_curves(data, model)
+    inside = _within_knots(data, model)
+    beyond = _equations_beyond(data, _rows_inside(data, inside))
     for s in data.segments:
         inside[s.where] |= s.equation in beyond
     return data if inside.all() else data.at(inside)
@@ -63,7 +64,10 @@ def equations_beyond_curves(data: RegressionData, model: ExactFit) -> set[str]:
 
     Fewer than `TRACE.least_rows` cannot judge, and the others would judge an extrapolation.
     """
-    kept = _rows_inside(data, _within_knots(data, model))
+    return _equations_beyond(data, _rows_inside(data, _within_knots(data, model)))
+
+
+def _equations_beyond(data: RegressionData, kept: Mapping[str, int]) -> set[str]:
     return {e for e, n in data.row_counts.items() if kept[e] < min(n, TRACE.least_rows)}
 
 
@@ -86,7 +90,7 @@ def rows_within(
 def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
     """Return a note for every equation of which judging rows lie beyond a model's free curves."""
     kept = _rows_inside(data, _within_knots(data, model))
-    beyond = equations_beyond_curves(data, model)
+    beyond = _equations_beyond(data, kept)
     left_out = "they speak neither for nor against it, and are left out of the errors"
     too_few = "too few remain within it to judge it, so that only the rows that choose do"
     return [

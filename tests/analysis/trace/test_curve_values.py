@@ -13,18 +13,30 @@ from analysis.simulation.simulate import compiled
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.regression_data import regression_data
+from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.engine import judging_rows_above_band, with_effect_values
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
 from analysis.trace.judge.gates import held_out_above_band
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import fit_coefficients
+from analysis.trace.search.refinement import ExactFit, fit_coefficients
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment
 
 KNOTS = (0.0, 0.02, 0.06, 0.12, 2e-5)  # [m/s] of |s'|, then the presliding distance [m]
+
+
+def sprung(rig: Rig, reach: float) -> tuple[RegressionData, Used, ExactFit]:
+    """Return rows of a joint with a spring, a curve over `reach` of its travel, and the fit."""
+    run = experiment(rig, Hidden(spring=20.0), repeats=1, seed=1, rms=RMS)
+    terms = [Used(term) for term in baseline_of(rig)]
+    data = regression_data(rig, terms, conditioned_records(rig, [run]))
+    s = data.records[0].signals.s[:, 1]
+    middle, half = 0.5 * (s.min() + s.max()), 0.5 * reach * np.ptp(s)
+    knots = np.linspace(middle - half, middle + half, 6)
+    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(6)[0]))
+    return data, curve, fit_coefficients(data, (*terms, curve))
 
 
 def test_a_model_with_an_undetermined_value_of_a_curve_can_be_simulated(rig: Rig) -> None:
@@ -57,14 +69,7 @@ def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
     rig: Rig, reach: float, says: str
 ) -> None:
     """The knots span `reach` of the piston's travel; too few rows within them cannot judge."""
-    run = experiment(rig, Hidden(spring=20.0), repeats=1, seed=1, rms=RMS)
-    terms = [Used(term) for term in baseline_of(rig)]
-    data = regression_data(rig, terms, conditioned_records(rig, [run]))
-    s = data.records[0].signals.s[:, 1]
-    middle, half = 0.5 * (s.min() + s.max()), 0.5 * reach * np.ptp(s)
-    knots = np.linspace(middle - half, middle + half, 6)
-    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(6)[0]))
-    fit = fit_coefficients(data, (*terms, curve))
+    data, _, fit = sprung(rig, reach)
     notes = beyond_curve_notes(data, fit)
     assert [note.partition(":")[0] for note in notes] == ["torque_2"]
     assert says in notes[0]
@@ -76,14 +81,7 @@ def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
 @pytest.mark.parametrize("reach", [0.9, 0.01])
 def test_an_extrapolated_curve_does_not_change_the_verdict(rig: Rig, reach: float) -> None:
     """A spring that is too soft speaks against the set only within the range of its curve."""
-    run = experiment(rig, Hidden(spring=20.0), repeats=1, seed=1, rms=RMS)
-    terms = [Used(term) for term in baseline_of(rig)]
-    data = regression_data(rig, terms, conditioned_records(rig, [run]))
-    s = data.records[0].signals.s[:, 1]
-    middle, half = 0.5 * (s.min() + s.max()), 0.5 * reach * np.ptp(s)
-    knots = np.linspace(middle - half, middle + half, 6)
-    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(6)[0]))
-    fit = fit_coefficients(data, (*terms, curve))
+    data, curve, fit = sprung(rig, reach)
     empty = HypothesisSet(data, []).empty
     wrong = {n: 0.3 * v if n.startswith("F_position") else v for n, v in fit.beta.items()}
     after = replace(empty, effects=(curve,), fit=replace(fit, beta=wrong))
