@@ -30,6 +30,7 @@ def plan(
     """Generate a rig's lock-and-excite steps and prove that they determine all parameters.
 
     Ends with 1 where they do not.
+
     Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
     """
     from rig.cli.proof.step_planning import PlanRequest, plan_steps
