@@ -141,7 +141,7 @@ def information(
     # the analysis includes that piston's noise in the rows; so does the prediction.
     moving = np.ones(len(rig.joints), dtype=bool)
     filters = filtering(record)
-    signals = condition(exact, record, filters.channels, moving)
+    signals = condition(exact, record, filters.channels, np.full(len(rig.joints), np.inf))
     run = Run(exact, (record,), source="twin")
     (built,) = build_rows(exact, [run], terms, filtering)
     rows = built.rows

@@ -26,8 +26,8 @@ from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
 from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import RowCluster, Solution, solve
-from analysis.signals.conditioning import Mask, condition, lost_samples
-from analysis.signals.locks import moving_joints
+from analysis.signals.conditioning import condition, lost_samples
+from analysis.signals.locks import motion_bands
 from analysis.signals.settings import SIGNALS
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model import channels as ch
@@ -69,7 +69,7 @@ class RecordTask:
     filtering: Callable[[Record], Filtering]
     with_noise: bool
     stretch: int = REGRESSION.chunk_samples
-    moving: tuple[bool, ...] | None = None
+    bands: tuple[float, ...] | None = None
 
 
 def reduce_task(task: RecordTask) -> RecordReduction:
@@ -79,7 +79,7 @@ def reduce_task(task: RecordTask) -> RecordReduction:
         source: Source = InMemory(reader.read()) if short else reader
         return reduce_record(
             task.rig, task.run, source, task.terms, task.filtering, task.with_noise, task.stretch,
-            None if task.moving is None else np.array(task.moving),
+            None if task.bands is None else np.array(task.bands),
         )  # fmt: skip
 
 
@@ -107,8 +107,8 @@ def steps_of(rig: Rig, path: str, heads: Sequence[RecordHead]) -> list[StepTask]
     return [StepTask(rig, path, step, tuple(n)) for step, n in names.items() if step in locked]
 
 
-def moving_task(task: StepTask) -> tuple[bool, ...]:
-    """Return which joints (N,) move in a step; only positions are kept in memory."""
+def bands_task(task: StepTask) -> tuple[float, ...]:
+    """Return the band (N,) [Hz] in which each joint moves in a step; keeps only positions."""
     repeats = []
     for name in task.records:
         with open_record(task.path, name) as reader:
@@ -116,7 +116,7 @@ def moving_task(task: StepTask) -> tuple[bool, ...]:
             places = [ch.channel(task.rig.position_kind, i) for i in record.locked]
             channels = {n: x for n, x in record.channels.items() if n in places}
             repeats.append(replace(record, channels=channels))
-    return tuple(map(bool, moving_joints(task.rig, repeats)))
+    return tuple(map(float, motion_bands(task.rig, repeats)))
 
 
 def path_of(task: RecordTask | StepTask) -> str:
@@ -160,26 +160,26 @@ def reduce_record(
     filtering: Callable[[Record], Filtering],
     with_noise: bool,
     stretch: int = REGRESSION.chunk_samples,
-    moving: Mask | None = None,
+    bands: Array | None = None,
 ) -> RecordReduction:
     """Reduce one record, a long one chunk by chunk; raises InputError for an unusable one.
 
-    `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
-    of this record alone.
+    `bands` (N,) [Hz] is the decision for all repeats of its step (`analysis.signals.locks`), by
+    default of this record alone.
     """
     head = source.head
     filters = filtering(source.read(0, min(head.samples, stretch)))
     lost, clipped = _inspect(rig, source, stretch)
-    if moving is None:
-        moving = moving_joints(rig, [source.read(0, min(head.samples, SIGNALS.deciding_samples))])
-    chunks = source_rows(rig, terms, source, filters, moving, stretch)
+    if bands is None:
+        bands = motion_bands(rig, [source.read(0, min(head.samples, SIGNALS.deciding_samples))])
+    chunks = source_rows(rig, terms, source, filters, bands, stretch)
     parts, masked = _folded(rig, terms, chunks, head.samples / head.sample_rate)
     noise = None
     if with_noise:
         # The first chunk represents a long record.
         count = min(head.samples, stretch) if divisible(filters) else head.samples
         part = source.read(0, count)
-        signals = condition(rig, part, filters.channels, moving)
+        signals = condition(rig, part, filters.channels, bands)
         rows = record_rows(rig, terms, signals, filters)
         moments = record_moments(rig, terms, ConditionedRecord(run, part, signals, filters), rows)
         noise = {family: moment * (head.samples / count) for family, moment in moments.items()}

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from analysis.regression.rows import Filtering, Rows, record_rows
 from analysis.regression.settings import REGRESSION
-from analysis.signals.conditioning import Mask, align_reach, condition
+from analysis.signals.conditioning import align_reach, condition
 from analysis.signals.filters import FirSmoother
-from analysis.signals.locks import held_positions
+from analysis.signals.locks import band_reach, held_positions
 from analysis.terms.base import FAMILIES, Term, Used
 from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
@@ -55,16 +55,17 @@ class InMemory:
 
 @dataclass(frozen=True)
 class Locks:
-    """Which joints (N,) move, and the position (N,) [m] of the others, for a whole record."""
+    """The bands (N,) [Hz] in which joints move, and positions (N,) [m], for a whole record."""
 
-    moving: Mask
+    bands: Array
     held: Array
 
 
-def overlap(rig: Rig, rate: float, filtering: Filtering) -> int:
+def overlap(rig: Rig, rate: float, filtering: Filtering, bands: Array) -> int:
     """Return the samples on either side that a row depends on, plus one grid step."""
     rows = 0 if filtering.rows is None else filtering.rows.reach
-    return filtering.channels.reach + rows + align_reach(rig, rate) + filtering.step
+    reach = filtering.channels.reach + rows + align_reach(rig, rate) + band_reach(rate, bands)
+    return reach + filtering.step
 
 
 def divisible(filtering: Filtering) -> bool:
@@ -89,7 +90,7 @@ def stretch_rows(
     """
     rate = part.sample_rate
     within = ((own[0] - offset - 0.5) / rate, (own[1] - offset - 0.5) / rate)
-    signals = condition(rig, part, filtering.channels, locks.moving, locks.held)
+    signals = condition(rig, part, filtering.channels, locks.bands, locks.held)
     stretch = record_rows(rig, terms, signals, filtering, families, within)
     if offset == 0:
         return stretch
@@ -101,23 +102,23 @@ def source_rows(
     terms: Sequence[Used],
     source: Source,
     filtering: Filtering,
-    moving: Mask,
+    bands: Array,
     stretch: int = REGRESSION.chunk_samples,
 ) -> Iterator[dict[str, Rows]]:
     """Yield the rows of a record by chunks of `stretch` samples; together they are all its rows.
 
-    `moving` (N,) is the decision for all repeats of the step (`analysis.signals.locks`). A term
+    `bands` (N,) [Hz] is the decision for all repeats of the step (`analysis.signals.locks`). A term
     that prepares signals may look back any time, and so does a filter of infinite length: then the
     record is read at once.
     """
     n = source.head.samples
     parts = (source.read(a, min(a + stretch, n)) for a in range(0, n, stretch))
-    locks = Locks(moving, held_positions(rig, parts))
+    locks = Locks(bands, held_positions(rig, parts))
     prepares = any(type(used.term).prepare is not Term.prepare for used in terms)
     if n <= stretch or prepares or not divisible(filtering):
         yield stretch_rows(rig, terms, source.read(), 0, (0, n), filtering, locks)
         return
-    spare = overlap(rig, source.head.sample_rate, filtering)
+    spare = overlap(rig, source.head.sample_rate, filtering, bands)
     for first in range(0, n, stretch):
         last = min(first + stretch, n)
         offset = max(0, first - spare) // filtering.step * filtering.step

@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.regression.rows import Array, Filtering, Indices, default_filtering
 from analysis.signals.conditioning import Signals, condition, without_rests
-from analysis.signals.locks import moving_by_step
+from analysis.signals.locks import bands_by_step
 from analysis.terms.base import FAMILIES
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -30,7 +30,7 @@ class ConditionedRecord:
 
     def condition_alike(self, rig: Rig, record: Record) -> ConditionedRecord:
         """Condition another record (averaged repeats, added noise) with this one's settings."""
-        signals = condition(rig, record, self.filtering.channels, self.signals.moving)
+        signals = condition(rig, record, self.filtering.channels, self.signals.bands)
         weight = self.signals.weight
         if weight is not None:
             signals = replace(signals, weight=weight[: record.samples])
@@ -56,10 +56,10 @@ def condition_runs(
     """Condition every record of the runs, in their order; raises InputError as `condition` does."""
     out = []
     for number, run in enumerate(runs):
-        moving = moving_by_step(rig, run.records)
+        bands = bands_by_step(rig, run.records)
         for record in run.records:
             filters = filtering(record)
-            signals = condition(rig, record, filters.channels, moving[record.step])
+            signals = condition(rig, record, filters.channels, bands[record.step])
             if filters.in_motion:
                 signals = without_rests(signals, filters.in_motion)
             out.append(ConditionedRecord(number, record, signals, filters, families))

@@ -49,8 +49,8 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
             channels[name] = np.full(n, steady)
     record = Record("twin", "twin", tuple(locked), 1, rig.sample_rate, channels)
     filters = Filtering(channel_filter(rig.sample_rate), None, REGRESSION.sample_step)
-    moving = np.array([i + 1 not in locked for i in range(len(rig.joints))])
-    rows = record_rows(ideal, used, condition(ideal, record, filters.channels, moving), filters)
+    bands = np.array([0.0 if i + 1 in locked else np.inf for i in range(len(rig.joints))])
+    rows = record_rows(ideal, used, condition(ideal, record, filters.channels, bands), filters)
     stacked: dict[str, list[Array]] = {}
     for name, part in rows.items():
         stacked.setdefault(family_of(name), []).append(part.matrix)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.filters import Smoother, align, bridged, channel_filter
-from analysis.signals.locks import held_positions, moving_joints
+from analysis.signals.locks import held_positions, motion_bands, within_band
 from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -33,10 +33,10 @@ class Signals:
     `excited` (N,) marks the joints whose rows may be used; `valid` (n, N) is false where a sensor
     of the joint was clipped within the filter's reach or the filter runs over the record's edge.
     `lost` (n, N) is true where a sample within that reach never arrived: it was interpolated, and
-    no row may use it. `moving` (N,) marks the joints whose motion is the measured one; the others
-    stand still. `weight` (n, N), if given, weights each joint's torque balance (see
-    `without_rests`). `loaded` states whether the last link carries a load that it does not carry
-    in other records; None: not known.
+    no row may use it. `bands` (N,) [Hz] are those in which the joints move, 0 for one that stands
+    still (see `analysis.signals.locks.motion_bands`). `weight` (n, N), if given, weights each
+    joint's torque balance (see `without_rests`). `loaded` states whether the last link carries a
+    load that it does not carry in other records; None: not known.
     """
 
     rate: float
@@ -61,7 +61,7 @@ class Signals:
     excited: Mask
     valid: Mask
     lost: Mask | None = None
-    moving: Mask | None = None
+    bands: Array | None = None
     weight: Array | None = None
     loaded: bool | None = None
 
@@ -69,6 +69,11 @@ class Signals:
     def joints(self) -> int:
         """N."""
         return int(self.s.shape[1])
+
+    @property
+    def moving(self) -> Mask | None:
+        """The joints (N,) whose motion is the measured one; the others stand still."""
+        return None if self.bands is None else self.bands > 0.0
 
     @property
     def excited_joints(self) -> list[int]:
@@ -141,12 +146,12 @@ def condition(
     rig: Rig,
     record: Record,
     smoother: Smoother | None = None,
-    moving: Mask | None = None,
+    bands: Array | None = None,
     held: Array | None = None,
 ) -> Signals:
     """Turn a record into signals through one zero-phase filter (default `channel_filter`).
 
-    `moving` (N,) is what `analysis.signals.locks.moving_joints` decided for all repeats of the
+    `bands` (N,) [Hz] is what `analysis.signals.locks.motion_bands` decided for all repeats of the
     record's step; without it the record counts as the only repeat. `held` (N,) [m] overrides
     `held_positions`, for a record that is a part of a longer one. Lost samples (NaN) are marked in
     `Signals.lost`. Raises InputError naming record and channel where one is missing or not finite.
@@ -167,8 +172,14 @@ def condition(
     def bench(name: str, constant: float) -> Array:
         return smoother.apply(channels[name]) if name in channels else np.full(n, constant)
 
+    bands = motion_bands(rig, [record]) if bands is None else bands
+    moving = bands > 0.0
+    for i, band in zip(joints, map(float, bands), strict=True):
+        name = ch.channel(rig.position_kind, i)
+        if name in channels:
+            channels[name] = within_band(channels[name], record.sample_rate, band)
+
     supply, oil = (0.0, 0.0) if rig.electric else (rig.supply.pressure, rig.oil.temperature)
-    moving = moving_joints(rig, [record]) if moving is None else moving
     held = held_positions(rig, [record]) if held is None else held
     s, sd, sdd = filtered(rig.position_kind, 2)
     # A joint that does not move stands at `held`.
@@ -189,7 +200,7 @@ def condition(
         lost=_spread(
             lost_samples(rig, record), smoother.reach + align_reach(rig, record.sample_rate)
         ),
-        moving=moving,
+        bands=bands,
         loaded=record.loaded,
     )  # fmt: skip
 

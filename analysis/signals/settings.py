@@ -17,10 +17,13 @@ class SignalSettings:
     attenuation: float = 80.0
     # Half-width [samples] of the kernel that interpolates a multiplexed channel.
     align_half_width: int = 16
-    # A locked joint moves where the rms of its acceleration within `moving_band` [Hz] exceeds
-    # `moving_ratio` times that of sensor noise alone; the first `deciding_samples` decide.
+    # A locked joint moves where the rms of its acceleration within the widest of `moving_bands`
+    # [Hz] exceeds `moving_ratio` times that of the stated sensor noise, or within any of them
+    # `common_ratio` times that of the noise as measured by the repeats, if smaller: a narrow band
+    # has few independent samples. The first `deciding_samples` decide.
+    moving_bands: tuple[float, ...] = (15.0, 5.0, 2.0)
     moving_ratio: float = 1.2
-    moving_band: float = 15.0
+    common_ratio: float = 2.0
     deciding_samples: int = 120_000
 
 

@@ -18,7 +18,7 @@ from analysis.effects.measurement import corrected_channels
 from analysis.regression.rows import default_filtering
 from analysis.signals.conditioning import Mask, Signals, aligned_channels, condition, lost_samples
 from analysis.signals.filters import Smoother
-from analysis.signals.locks import moving_by_step
+from analysis.signals.locks import bands_by_step
 from analysis.simulation.model import Model, as_loaded, finite, refuse_other_rig
 from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import (
@@ -77,9 +77,9 @@ def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
     out = []
     for run in runs:
         refuse_other_rig(model, run.rig, run.source or "the run")
-        moving = moving_by_step(run.rig, run.records)
+        bands = bands_by_step(run.rig, run.records)
         out += [
-            validate_record(model, run.rig, record, moving=moving[record.step])
+            validate_record(model, run.rig, record, bands=bands[record.step])
             for record in run.records
         ]
     if not out:
@@ -88,17 +88,17 @@ def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
 
 
 def validate_record(
-    model: Model, rig: Rig, record: Record, moving: Mask | None = None
+    model: Model, rig: Rig, record: Record, bands: Array | None = None
 ) -> RecordValidation:
     """Validate on one record (see `validate`).
 
-    `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
-    of this record alone.
+    `bands` (N,) [Hz] is the decision for all repeats of its step (`analysis.signals.locks`), by
+    default of this record alone.
     """
     model = as_loaded(model, record.loaded)
     smoother = default_filtering(record).channels
     here = arrived(rig, record)
-    signals = sensor_corrected(rig, model.terms, condition(rig, record, smoother, moving))
+    signals = sensor_corrected(rig, model.terms, condition(rig, record, smoother, bands))
     # Sensors are corrected by the model's sensor effects before anything is compared.
     channels = aligned_channels(rig, record)
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)

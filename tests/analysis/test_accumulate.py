@@ -22,7 +22,7 @@ from analysis.regression.chunks import InMemory, source_rows
 from analysis.regression.qr import Accumulator
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.regression.solve import triangle
-from analysis.signals.locks import held_positions, moving_joints
+from analysis.signals.locks import held_positions, motion_bands
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.records import Record, Run
@@ -152,9 +152,9 @@ def test_a_long_record_in_stretches_has_the_rows_of_the_whole(
     record = replace(record, channels=lost)
     filters = filtering(record)  # type: ignore[operator]
     source = InMemory(record)
-    moving = moving_joints(rig, [record])
-    (whole,) = source_rows(rig, TERMS, source, filters, moving)
-    parts = list(source_rows(rig, TERMS, source, filters, moving, stretch))
+    bands = motion_bands(rig, [record])
+    (whole,) = source_rows(rig, TERMS, source, filters, bands)
+    parts = list(source_rows(rig, TERMS, source, filters, bands, stretch))
     assert len(parts) == -(-40_000 // stretch)
     for name, rows in whole.items():
         found = [part[name] for part in parts]
@@ -186,13 +186,31 @@ def test_long_records_reduce_to_the_same_solution(multisine_run: Run, rig: Rig) 
         assert cut[family].rows == one.rows
 
 
+def test_a_lock_that_gives_slowly_has_the_rows_of_the_whole_in_stretches(
+    multisine_run: Run, rig: Rig
+) -> None:
+    """Its wide filter depends on more samples on either side of a stretch than the others."""
+    record = long_record(multisine_run, "step1")
+    t = np.arange(record.samples) / record.sample_rate
+    slow = record.channels["piston_1"] + 50e-6 * np.sin(2 * np.pi * 1.7 * t)
+    record = replace(record, channels={**record.channels, "piston_1": slow})
+    bands, filters = motion_bands(rig, [record]), default_filtering(record)
+    assert 0.0 < bands[0] < bands[1]
+    (whole,) = source_rows(rig, TERMS, InMemory(record), filters, bands)
+    parts = list(source_rows(rig, TERMS, InMemory(record), filters, bands, 12_000))
+    for name, rows in whole.items():
+        matrix = np.vstack([part[name].matrix for part in parts])
+        size = np.abs(rows.matrix).max(axis=0)
+        assert (np.abs(matrix - rows.matrix).max(axis=0) <= 1e-10 * size).all()
+
+
 def test_what_a_lock_does_is_found_in_stretches_too(multisine_run: Run, rig: Rig) -> None:
     record = long_record(multisine_run, "step1")
     t = np.arange(record.samples) / record.sample_rate
     shaken = record.channels["piston_1"] + 20e-6 * np.sin(2 * np.pi * 8 * t)
     for piston, gives in ((record.channels["piston_1"], False), (shaken, True)):
         whole = replace(record, channels={**record.channels, "piston_1": piston})
-        assert moving_joints(rig, [whole]).tolist() == [gives, True]
+        assert (motion_bands(rig, [whole]) > 0).tolist() == [gives, True]
         parts = [InMemory(whole).read(a, a + 6_000) for a in range(0, whole.samples, 6_000)]
         expected = held_positions(rig, [whole])
         assert held_positions(rig, parts) == pytest.approx(expected, rel=1e-12)

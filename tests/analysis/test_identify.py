@@ -13,7 +13,7 @@ from analysis.identify.result import Identification, to_json
 from analysis.regression.rows import FILTERINGS, Filtering
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter, row_filter, row_step
-from analysis.signals.locks import accelerates
+from analysis.signals.locks import accelerates, motion_bands
 from analysis.simulation.synthetic import multisine, synthetic_run
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError
@@ -195,6 +195,28 @@ def test_the_give_of_a_lock_is_seen_and_a_perfect_lock_is_not_invented(rig: Rig)
     still = noise * rng.standard_normal(10_000)
     assert not accelerates(still, 1000.0, noise)
     assert accelerates(still + 20e-6 * np.sin(2 * np.pi * 8 * t), 1000.0, noise)
+
+
+def test_a_lock_that_gives_slowly_is_seen_in_a_narrow_band_and_filtered_to_it(
+    multisine_run: Run, rig: Rig
+) -> None:
+    """A heavy boom on a closed valve: 0.2 mm at 1.3 Hz under the noise of a fast sampled sensor."""
+    record = next(r for r in multisine_run.records if r.step == "step1")
+    assert record.locked == (1,)
+    t, size = record.time, 20 * rig.sensors.piston.noise
+    slow = changed(record, piston_1=record.channels["piston_1"] + size * np.sin(2.6 * np.pi * t))
+    assert motion_bands(rig, [record]).tolist() == [0.0, np.inf]
+    bands = motion_bands(rig, [slow])
+    assert 0.0 < bands[0] < 15.0
+    truth = -((2.6 * np.pi) ** 2) * size * np.sin(2.6 * np.pi * t)
+
+    def error(bands: np.ndarray) -> float:
+        signals, inner = condition(rig, slow, bands=bands), slice(1000, -1000)
+        acceleration = signals.qdd[inner, 0] * signals.G[inner, 0]
+        return float(np.std(acceleration - truth[inner]) / np.std(truth))
+
+    assert error(bands) < 0.5
+    assert error(np.array([np.inf, np.inf])) > 3.0
 
 
 def test_a_parameter_that_rests_on_sensor_noise_is_no_parameter(

@@ -43,7 +43,7 @@ def test_torque_rows_are_the_batch_s_of_joints_that_move_as_measured(
 ) -> None:
     tracker = Tracker(rig, families=("mechanical",))
     stacked = []
-    locks = Locks(np.ones(2, dtype=bool), np.zeros(2))
+    locks = Locks(np.full(2, np.inf), np.zeros(2))
     for record in multisine_run.records[::4]:
         track(tracker, record)
         own = (0, record.samples)

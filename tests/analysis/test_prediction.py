@@ -105,13 +105,13 @@ def test_a_shifted_piston_moves_everything_that_follows_from_it(
     """The pointwise sensitivities rest on this: geometry follows the piston, and nothing else."""
     record = played[1].record
     filters = default_filtering(record)
-    moving = np.array([True, True])
-    signals = condition(ideal(rig), record, filters.channels, moving)
+    bands = np.full(2, np.inf)
+    signals = condition(ideal(rig), record, filters.channels, bands)
     from analysis.design.sensor_noise import Input
 
     by = 1e-4
     shifted = {**record.channels, "piston_1": record.channels["piston_1"] + by}
-    other = condition(ideal(rig), replace(record, channels=shifted), filters.channels, moving)
+    other = condition(ideal(rig), replace(record, channels=shifted), filters.channels, bands)
     changed = moved(rig, signals, Input("piston_1", 0, "s", 0), by)
     inner = slice(200, -200)
     for name in ("s", "sd", "q", "qd", "qdd", "G", "theta", "V_cap", "V_rod", "p_cap"):

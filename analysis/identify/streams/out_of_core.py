@@ -11,8 +11,8 @@ from analysis.identify.geometry import shifts_of_reductions
 from analysis.identify.reduction import (
     RecordReduction,
     RecordTask,
+    bands_task,
     first_of_steps,
-    moving_task,
     path_of,
     reduce_tasks,
     steps_of,
@@ -64,10 +64,8 @@ def identify_folders(
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
         for repeats in steps_of(rig, folder, head.records)
     ]
-    decisions = workers.map(moving_task, [repeats for _, repeats in steps], reads=path_of)
-    moving = {
-        (n, repeats.step): moves for (n, repeats), moves in zip(steps, decisions, strict=True)
-    }
+    decisions = workers.map(bands_task, [repeats for _, repeats in steps], reads=path_of)
+    bands = {(n, repeats.step): band for (n, repeats), band in zip(steps, decisions, strict=True)}
     rigs = [rig, *map(rig.with_moved, rig.uncertain_numbers)]
     tasks = [
         RecordTask(
@@ -78,7 +76,7 @@ def identify_folders(
             used,
             filtering,
             changed is rig and record.name in first,
-            moving=moving.get((number, record.step)),
+            bands=bands.get((number, record.step)),
         )
         for changed in rigs
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))

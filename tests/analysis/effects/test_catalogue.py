@@ -111,13 +111,13 @@ def test_knots_are_placed_where_the_joint_is_excited(rig: Rig, state: Signals) -
     yielding = replace(
         state,
         excited=np.array([True, False]),
-        moving=np.array([True, True]),
+        bands=np.array([np.inf, np.inf]),
         s=state.s + 0.03,
         sd=1e-3 * state.sd,
     )
     for e in effects(rig):
         if e.by_data and e.where.startswith("joint 2"):
-            alone = e.points(rig, Evidence([replace(state, moving=yielding.moving)], []))
+            alone = e.points(rig, Evidence([replace(state, bands=yielding.bands)], []))
             both = e.points(rig, Evidence([state, yielding], []))
             assert np.array(both) == pytest.approx(np.array(alone)), e
 
