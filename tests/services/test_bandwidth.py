@@ -109,6 +109,16 @@ def test_records_that_are_analysed_together_pass_alike_filters(rig: Rig, tmp_pat
     )
 
 
+@pytest.mark.parametrize("times", [1.0, 30.0])
+def test_noise_of_the_sensor_is_no_motion(rig: Rig, times: float) -> None:
+    """Differentiated, the noise of a quiet record has more power than its motion."""
+    channels = moved(rig, 0.3, 1.3)
+    noise = times * rig.sensors.piston.noise
+    added = noise * np.random.default_rng(5).standard_normal(len(channels["piston_1"]))
+    noisy = {**channels, "piston_1": channels["piston_1"] + added}
+    assert motion_bandwidth(rig, (2,), noisy, RATE) == pytest.approx(1.3, abs=0.2)
+
+
 def test_what_has_no_bandwidth(rig: Rig) -> None:
     """No joint that moves, and records too short to lose rows to a narrow filter."""
     assert motion_bandwidth(rig, (1, 2), moved(rig, 1.0), RATE) is None

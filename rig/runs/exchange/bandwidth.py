@@ -23,17 +23,33 @@ def motion_bandwidth(
     for a record shorter than `EXCHANGE.bandwidth_seconds`, which needs all its rows.
     """
     free = [i for i in range(1, len(rig.joints) + 1) if i not in locked]
-    positions = [channels[ch.channel(rig.position_kind, i)] for i in free]
+    positions = [_whole(channels[ch.channel(rig.position_kind, i)]) for i in free]
     moving = [x for x in positions if np.ptp(x) > 0.0]
     if not moving or len(moving[0]) < EXCHANGE.bandwidth_seconds * rate:
         return None
     return max(_bandwidth(x, rate) for x in moving)
 
 
+def _whole(x: Array) -> Array:
+    """Return samples (n,) with lost ones (NaN) interpolated."""
+    known = np.isfinite(x)
+    if known.all() or not known.any():
+        return np.nan_to_num(x)
+    return np.interp(np.arange(len(x)), np.flatnonzero(known), x[known])
+
+
 def _bandwidth(position: Array, rate: float) -> float:
-    """Return the bandwidth [Hz] of a position (n,), by a periodogram with Hann's window."""
-    spectrum = np.fft.rfft((position - np.mean(position)) * np.hanning(len(position)))
+    """Return the bandwidth [Hz] of a position (n,), by a periodogram with Hann's window.
+
+    Lines that noise may cause do not count. White noise is measured in the upper half of the
+    spectrum, where its power is exponentially distributed about the mean, median / ln 2.
+    """
+    power = np.abs(np.fft.rfft((position - np.mean(position)) * np.hanning(len(position)))) ** 2
     f = np.fft.rfftfreq(len(position), 1.0 / rate)
+    noise = float(np.median(power[f > 0.25 * rate])) / np.log(2.0)
     inside = f <= EXCHANGE.highest
-    power = np.cumsum((np.abs(spectrum[inside]) * f[inside]) ** 2)
-    return float(f[inside][np.searchsorted(power, EXCHANGE.velocity_share * power[-1])])
+    seen = np.where(power > EXCHANGE.above_noise * noise, power, 0.0)[inside]
+    if not seen.any():
+        return EXCHANGE.highest
+    velocity = np.cumsum(seen * f[inside] ** 2)
+    return float(f[inside][np.searchsorted(velocity, EXCHANGE.velocity_share * velocity[-1])])

@@ -20,8 +20,11 @@ class ExchangeSettings:
     trip_seconds: float = 2.0  # [s] before the offending sample, and after it
 
     # Bandwidth of the motion in records without excited lines: the share of the velocity's power
-    # below it, the highest frequency looked at [Hz], and the shortest record [s] that states one.
-    velocity_share: float = 0.99
+    # below it, how many times the noise's mean power a spectral line must have (noise exceeds 10
+    # times once in 22 000 lines), the highest frequency looked at [Hz], and the shortest record [s]
+    # that states one.
+    velocity_share: float = 0.998
+    above_noise: float = 10.0
     highest: float = 30.0
     bandwidth_seconds: float = 6.0
 
