@@ -384,6 +384,26 @@ def test_a_healthy_sensor_is_not_spoken_of(tmp_path: Path, values: np.ndarray) -
     assert report.warnings == ()
 
 
+@pytest.mark.parametrize("fill", [1.0, 1e20, -1e300])
+def test_a_fill_value_of_a_logger_is_a_lost_sample(tmp_path: Path, fill: float) -> None:
+    """A filter would spread it over the samples about it."""
+    data = np.tile(DATA, (4, 1))
+    data[70, NAMES.index("piston_2")] = fill
+    report = bring(tmp_path, ONE, a__csv=csv(data=data))
+    assert any("taken as lost" in warning for warning in report.warnings)
+    (record,) = load_run(tmp_path / "run").records
+    piston = record.channels["piston_2"]
+    assert np.flatnonzero(np.isnan(piston)).tolist() == [70]
+    assert not np.isnan(record.channels["piston_1"]).any()
+
+
+def test_a_channel_in_another_unit_is_kept_and_spoken_of(tmp_path: Path) -> None:
+    report = bring(tmp_path, ONE, a__csv=csv(data=moving(cap_pressure_2=1e5 * PRESSURE)))
+    assert any("is the unit another" in warning for warning in report.warnings)
+    (record,) = load_run(tmp_path / "run").records
+    assert not np.isnan(record.channels["cap_pressure_2"]).any()
+
+
 def test_channels_of_a_locked_joint_may_stand_still(tmp_path: Path) -> None:
     still = np.zeros(4000)
     data = moving(spool_1=still, piston_1=still, oil_temperature=np.full(4000, 40.0))

@@ -79,7 +79,8 @@ def _beyond(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str
         return []
     return [
         f"{name}: goes from {low:g} to {high:g} {rig.unit_of(name)}, to an end of the range "
-        f"{ends[0]:g} to {ends[1]:g} of the rig's sensor; is it clipped, or is the unit another?"
+        f"{ends[0]:g} to {ends[1]:g} of the rig's sensor; is it clipped, or is the unit another? A "
+        "few samples beyond it are taken as lost"
     ]
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import BANDWIDTH, common_bandwidth
 from rig.model.rig import Rig
@@ -80,8 +81,9 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
     except InputError as error:
         raise InputError(f"{path}:{lines.get(('rig',), 1)}: rig: {error}") from error
     source = _Source(path, manifest, rig, check_against_rig(manifest, lines, path, rig))
-    records = _with_bandwidth(rig, [_read(source, entry) for entry in manifest.records])
+    records = [_read(source, entry) for entry in manifest.records]
     warnings = _warnings(source, records)
+    records = _with_bandwidth(rig, [_without_outliers(rig, r) for r in records])
     _write(source, records, folder, warnings)
     samples = sum(len(next(iter(r.channels.values()))) for r in records)
     return ImportReport(folder, len(records), samples, warnings)
@@ -110,6 +112,23 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     part = _part(entry, file, rate, first, last)
     channels = {n: by_channel[n][part] for n in every if n in by_channel}
     return _Imported(entry, rate, start + part.start / rate, channels)
+
+
+def _without_outliers(rig: Rig, imported: _Imported) -> _Imported:
+    """Return a record whose few samples beyond the range of their sensor are lost (NaN).
+
+    A logger's fill value would go through the filters into the samples about it. Where many are
+    beyond, the range or the unit is another than the data's, and they are kept.
+    """
+    channels = dict(imported.channels)
+    for name in filter(channels.__contains__, rig.channels):
+        x, (low, high) = channels[name], rig.sensors.of(ch.kind_of(name)[0]).range
+        margin = EXCHANGE.end * (high - low)
+        beyond = (x < low - margin) | (x > high + margin)
+        few = 0 < np.count_nonzero(beyond) <= EXCHANGE.outliers * len(x)
+        if few:
+            channels[name] = np.where(beyond, np.nan, x)
+    return replace(imported, channels=channels)
 
 
 def _with_bandwidth(rig: Rig, records: list[_Imported]) -> list[_Imported]:

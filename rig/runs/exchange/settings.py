@@ -34,6 +34,7 @@ class ExchangeSettings:
     share: float = 0.5  # of the samples near an extreme with its exact value; a parabola: a third
     least: int = 10  # samples at one value before it is reported
     end: float = 1e-3  # of a sensor's range, from its end
+    outliers: float = 0.01  # of a channel's samples: so few beyond the range are taken as lost
     stuck_travel: float = 0.2  # of the piston's travel, while a pressure keeps one exact value
     least_travel: float = 2e-3  # of a position sensor's range: a joint that is free moves more
 
