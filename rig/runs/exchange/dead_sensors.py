@@ -53,7 +53,7 @@ def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
     begins, ends = np.r_[0, changes], np.r_[changes, len(values)]
     k = int(np.argmax(ends - begins))
     during = slice(int(begins[k]), int(ends[k]))
-    if np.ptp(piston[during]) < EXCHANGE.stuck_travel * np.ptp(piston):
+    if np.ptp(piston[during]) <= EXCHANGE.stuck_travel * np.ptp(piston):
         return []
     return [
         f"{name}: samples {during.start} to {during.stop - 1} are all {values[during.start]:g} "
