@@ -1,7 +1,7 @@
-"""Effects between the spool's LVDT and the metering edges: dead band, null, lag, hysteresis.
+"""Effects between the spool's LVDT and the metering edges: dead band, null, lag.
 
 They change the opening u in the orifices' equations, so that all of them are shapes: dq =
-C(u_effective) sqrt(dp). (Underlap: `underlap.py`.)
+C(u_effective) sqrt(dp). (Underlap: `underlap.py`; hysteresis: `hysteresis.py`.)
 """
 
 from __future__ import annotations
@@ -201,7 +201,6 @@ class SpoolOffset(ValveEffect):
         return (("sensor_offset", f"joint {self.joint + 1} spool"),)
 
 
-TAKEN_UP: Final = 5e-4  # [s] time constant of the play in simulation
 QUICKEST: Final = 1e-4  # [s] time constant that the integrator can follow
 # Damping ratios of spools: with a larger one the quicker of two poles hardly shows.
 DAMPING_BOUNDS: Final = (0.3, 1.5)
@@ -360,70 +359,6 @@ def second_order(u: Array, tau: float, zeta: float) -> Array:
     return np.asarray(_second_order(u, np.ascontiguousarray(expm(rates)[:2])))
 
 
-@dataclass(frozen=True)
-class SpoolHysteresis(ValveEffect):
-    """The opening follows the LVDT with play: |u - x| <= w / 2, x moves only when pushed.
-
-    Backlash of a feedback spring or a linkage (the play operator: Krasnosel'skii and Pokrovskii
-    1989). x is a hidden state.
-    """
-
-    name: ClassVar[str] = "spool_hysteresis"
-    least_shape: ClassVar[tuple[float, ...]] = (2e-3,)  # [V]
-    mechanism: ClassVar[str] = "spool_dynamics"
-    element: ClassVar[str] = "valve"
-    stage: ClassVar[int] = LAG
-    variable: ClassVar[str] = "the sign of the spool's velocity"
-    confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "valve_deadband", "channel_delay")
-    separated_by: ClassVar[str] = (
-        "two frequencies of one amplitude: hysteresis stays the same, a lag grows with the rate"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _play
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the width."""
-        return (f"w_hysteresis_{self.joint + 1}",)
-
-    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the width [V], up to a quarter of the spool's stroke."""
-        stroke = rig.joints[self.joint].valve.spool_stroke
-        grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke)
-        return (Shape(self.shape_names()[0], "V", 0.0, 0.25 * stroke, grid, 0.0),)
-
-    def hidden(self, rig: Rig) -> int:
-        """Return 1: the opening."""
-        return 1
-
-    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Remove the play from the spool's signal."""
-        return self.with_opening(signals, self.hidden_path(rig, signals, {}, shape)[:, 0])
-
-    def hidden_path(
-        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
-    ) -> Array:
-        """Return the opening (n, 1) [V]."""
-        u = np.ascontiguousarray(signals.u[:, self.joint])
-        return np.asarray(play_output(u, 0.5 * self.shape_of(rig, shape)[0]))[:, None]
-
-    def fastest(self, shape: Sequence[float]) -> float:
-        """Return the rate at which the simulated play follows the spool."""
-        return 1.0 / TAKEN_UP
-
-
-@njit(cache=True)
-def play_output(u, half):  # type: ignore[no-untyped-def]
-    """Return the output (n,) of a play operator with input u (n,) and half width `half`."""
-    x = np.empty_like(u)
-    x[0] = u[0]
-    for k in range(1, len(u)):
-        x[k] = min(max(x[k - 1], u[k] - half), u[k] + half)
-    return x
-
-
 @njit(cache=True)
 def _lagged(u, tau):  # type: ignore[no-untyped-def]
     # Exact for u linear between samples: x lags a ramp by tau times its slope.
@@ -480,13 +415,4 @@ def _lag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
         x[U, i] = z[0] - par[3] / 2.0 * dz[0] + par[3] ** 2 / 6.0 * dz[1]
 
 
-@kernel
-def _play(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        i = int(par[0])
-        pushed = min(max(z[0], x[U, i] - 0.5 * par[1]), x[U, i] + 0.5 * par[1])
-        dz[0] = (pushed - z[0]) / TAKEN_UP
-        x[U, i] = pushed
-
-
-TERMS = (ValveDeadband, SpoolOffset, SpoolLag, SpoolHysteresis)
+TERMS = (ValveDeadband, SpoolOffset, SpoolLag)

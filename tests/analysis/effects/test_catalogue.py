@@ -42,6 +42,7 @@ CONTRACT = {
 # Forms of edge, line and seal, no sizes.
 DETAILS = (
     "return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition", "exponent",
+    "spread", "steepness",
 )  # fmt: skip
 
 
@@ -178,8 +179,6 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         distance, *stiffening = shape[4:5] if e.name == "friction_curve" else shape
         path = worked(s, signals.sd[:, e.joint], sum(stiffening[:1]))
         return np.asarray(distance * contact_state(path, distance))
-    if e.name == "spool_hysteresis":
-        return e.prepare(rig, signals, shape).u[:, e.joint]
     return np.zeros(len(signals.t))
 
 
@@ -202,7 +201,7 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
         if e.remembers(shape):
             memory = hidden_state(e, rig, signals, shape)
         states = np.tile(memory, (e.hidden(rig), 1)).T
-        if e.name == "spool_lag":
+        if e.name in ("spool_lag", "spool_hysteresis"):
             states = e.hidden_path(rig, signals, {}, shape)
         for k in range(40, 400, 45):
             x, bench = observed(signals, k)

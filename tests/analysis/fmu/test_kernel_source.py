@@ -23,7 +23,7 @@ from analysis.terms.base import CONTRIBUTE, OUT_ROWS, PREPARE, X_ROWS, Kernel, k
 from tests.drivers.firmware import compiler
 
 N = 2
-STATES, PARAMETERS = 3, 128
+STATES, PARAMETERS = 8, 128
 
 
 def every_kernel() -> dict[str, Kernel]:

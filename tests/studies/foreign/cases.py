@@ -184,9 +184,11 @@ def _spool_lag(rng: np.random.Generator, i: int) -> Wrong:
 
 
 def _play(rng: np.random.Generator, i: int) -> Wrong:
-    play = _size(rng, 1e-3, 1e-2)
-    return Wrong("spool_hysteresis", f"joint {i + 1}", f"{1e3 * play:.2g} mV",
-                 joint=(i, {"play": play}))  # fmt: skip
+    play, form = _size(rng, 1e-3, 1e-2), int(rng.integers(3))
+    own = {"play": play, "play_form": form, "play_travel": 0.2 * play}
+    text = f"{1e3 * play:.2g} mV {('backlash', 'linkage', 'magnet')[form]}"
+    return Wrong("spool_hysteresis", f"joint {i + 1}", text, joint=(i, own),
+                 sizes={"w_hysteresis": play} if form == 0 else {})  # fmt: skip
 
 
 def _leak(rng: np.random.Generator) -> tuple[str, int, float]:

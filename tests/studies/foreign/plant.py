@@ -3,7 +3,7 @@
 Sources: H. E. Merritt, *Hydraulic Control Systems*, 1967 (orifices, edges, chambers, leakage, line
 drop); M. Jelali, A. Kroll, *Hydraulic Servo-systems*, 2003 (bulk modulus with air, spool dynamics,
 friction of seals); C. Canudas de Wit et al., IEEE TAC 40, 1995 (LuGre); P. Dahl, 1968; D. Karnopp,
-1985. Neither `hil_sim` nor `analysis` was read for it.
+1985; R. Bouc, 1967; Y. K. Wen, 1976 (hysteresis). Neither `hil_sim` nor `analysis` was read for it.
 
 The command is held between samples; the spool follows it as a first-order or a second-order lag,
 or is the continuous waveform itself. A Runge-Kutta of fixed step integrates; the step divides the
@@ -43,8 +43,8 @@ JOINT: Final = (
     "width", "taper", "slope_ahead", "slope_astern", "square",
     "stiffness", "rest", "cubic", "torque", "hum", "hum_hertz",
     "edge_ahead", "edge_astern", "edge_form", "edge_rounding", "underlap", "null", "play",
-    "spool_lag", "internal", "internal_form", "cap_leak", "rod_leak", "external_form", "worn",
-    "spool_form", "spool_time", "spool_hertz", "spool_damping",
+    "play_form", "play_travel", "spool_lag", "internal", "internal_form", "cap_leak", "rod_leak",
+    "external_form", "worn", "spool_form", "spool_time", "spool_hertz", "spool_damping",
 )  # fmt: skip
 (
     A, C, MID, BETA, CAP_AREA, ROD_AREA, CAP_VOLUME, ROD_VOLUME, HALF,
@@ -53,11 +53,12 @@ JOINT: Final = (
     WIDTH, TAPER, SLOPE_AHEAD, SLOPE_ASTERN, SQUARE,
     STIFFNESS, REST, CUBIC, TORQUE, HUM, HUM_HERTZ,
     EDGE_AHEAD, EDGE_ASTERN, EDGE_FORM, EDGE_ROUNDING, UNDERLAP, NULL, PLAY,
-    SPOOL_LAG, INTERNAL, INTERNAL_FORM, CAP_LEAK, ROD_LEAK, EXTERNAL_FORM, WORN,
-    SPOOL_FORM, SPOOL_TIME, SPOOL_HERTZ, SPOOL_DAMPING,
+    PLAY_FORM, PLAY_TRAVEL, SPOOL_LAG, INTERNAL, INTERNAL_FORM, CAP_LEAK, ROD_LEAK,
+    EXTERNAL_FORM, WORN, SPOOL_FORM, SPOOL_TIME, SPOOL_HERTZ, SPOOL_DAMPING,
 ) = range(len(JOINT))  # fmt: skip
 TANH, DAHL, LUGRE, KARNOPP = range(4)
 SHARP, ROUNDED, NOTCH = range(3)
+BACKLASH, LINKAGE, MAGNET = range(3)
 LAMINAR, TURBULENT = range(2)
 QUADRATIC, LINEAR, LAGGED, ACCUMULATOR = range(4)
 CONTINUOUS, FIRST_ORDER, SECOND_ORDER = range(3)
@@ -288,6 +289,24 @@ def asked(t: float, s: float, i: int, waves: Any, bias: Any, centring: Any) -> A
 
 
 @njit(cache=True)
+def follows(u: float, x: float, before: float, j: Array) -> float:
+    """Travel [V] of the edge at x behind a spool that moves from `before` to u [V].
+
+    Backlash: the edge is pushed by half of the play. A linkage of some elasticity whose friction
+    builds up along a travel (Dahl): it holds the edge back by at most half of the play. A magnet
+    (Bouc 1967; Wen 1976, exponent 2, half of the loss on the way back).
+    """
+    half, moved = 0.5 * j[PLAY], u - before
+    if j[PLAY_FORM] == BACKLASH:
+        return float(min(max(x, u - half), u + half) - x)
+    way = 1.0 if moved >= 0.0 else -1.0
+    held = (before - x) / half
+    if j[PLAY_FORM] == LINKAGE:
+        return float(moved / (1.0 + half * (1.0 - way * held) / j[PLAY_TRAVEL]))
+    return float(moved * held * held * (0.5 + 0.5 * (way if held >= 0.0 else -way)))
+
+
+@njit(cache=True)
 def integrated(
     start: Array, steps: int, held: Any, m: Array, joints: Array, locked: Any, waves: Any,
     bias: Any, centring: Any, first: int,
@@ -301,6 +320,7 @@ def integrated(
     spools = np.zeros((steps - first, 2))
     a, b, c, d = np.zeros(SIZE), np.zeros(SIZE), np.zeros(SIZE), np.zeros(SIZE)
     u0, u1, u2 = np.zeros(2), np.zeros(2), np.zeros(2)
+    before = y[OPENING : OPENING + 2].copy()
     for k in range(steps):
         t = k * STEP
         for i in range(2):
@@ -314,8 +334,8 @@ def integrated(
             u2[i] = asked(t + STEP, s, i, waves, bias, centring) if continuous else u0[i]
             spool = u0[i] if continuous else y[SPOOL + i]
             if joints[i, PLAY] > 0.0:
-                half = 0.5 * joints[i, PLAY]
-                y[OPENING + i] = min(max(y[OPENING + i], spool - half), spool + half)
+                y[OPENING + i] += follows(spool, y[OPENING + i], before[i], joints[i])
+                before[i] = spool
             if k >= first:
                 spools[k - first, i] = spool
         if k >= first:
