@@ -124,6 +124,8 @@ class EntrainedAir(Effect):
 class DeadVolume(Effect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
 
+    A hose gives like more oil, the less the higher its pressure p: V_dead (1 + k p0) / (1 + k p), k
+    its stiffening, p0 half of the supply's pressure (Merritt 1967, chapter 1: effective modulus).
     Enters as V_dead dp/dt / b (continuity; Merritt 1967, chapter 3), in proportion to the 1/b
     that all chambers share: a shape, so that b stays one. For one chamber the others separate it
     from a smaller b; the same volume in all chambers is separated only by the change of V with the
@@ -164,21 +166,32 @@ class DeadVolume(Effect):
         return ()
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the volume."""
-        return (f"V_dead_{self.joint + 1}_{self.side}",)
+        """Name the volume and its stiffening."""
+        place = f"{self.joint + 1}_{self.side}"
+        return f"V_dead_{place}", f"stiffening_{place}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber."""
+        """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber.
+
+        Its stiffening [1/Pa] is a detail.
+        """
         cap, rod = map(float, rig.chamber_volumes(self.joint, np.zeros(())))
         known = cap if self.side == "cap" else rod
         grid = (0.05 * known, 0.25 * known, 1.0 * known)
-        return (Shape(self.shape_names()[0], "m^3", 0.0, MOST_VOLUME * known, grid, 0.0),)
+        volume, stiffening = self.shape_names()
+        return (
+            Shape(volume, "m^3", 0.0, MOST_VOLUME * known, grid, 0.0),
+            Shape(stiffening, "1/Pa", 0.0, 1e-6, (1e-7,), resolution=True, detail=True),
+        )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Add the volume to the chamber's."""
         field = "V_cap" if self.side == "cap" else "V_rod"
         V = getattr(signals, field).copy()
-        V[:, self.joint] += self.shape_of(rig, shape)[0]
+        more, stiffening = self.whole(rig, shape)
+        p = (signals.p_cap if self.side == "cap" else signals.p_rod)[:, self.joint]
+        level = 1.0 + stiffening * 0.5 * rig.supply.pressure
+        V[:, self.joint] += more * level / (1.0 + stiffening * np.maximum(p, 0.0))
         return replace(signals, **{field: V})
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -186,9 +199,11 @@ class DeadVolume(Effect):
         return {}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, volume of the cap side, of the rod side."""
-        V = self.shape_of(rig, shape)[0]
-        return np.array([self.joint, V * (self.side == "cap"), V * (self.side == "rod")])
+        """Return joint, volume at no pressure of the cap side, of the rod side, stiffening."""
+        V, stiffening = self.whole(rig, shape)
+        V *= 1.0 + stiffening * 0.5 * rig.supply.pressure
+        sides = V * (self.side == "cap"), V * (self.side == "rod")
+        return np.array([self.joint, *sides, stiffening])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a volume at its bounds."""
@@ -215,8 +230,8 @@ def _air(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
 def _dead(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE:
         i = int(par[0])
-        x[V_CAP, i] += par[1]
-        x[V_ROD, i] += par[2]
+        x[V_CAP, i] += par[1] / (1.0 + par[3] * max(x[P_CAP, i], 0.0))
+        x[V_ROD, i] += par[2] / (1.0 + par[3] * max(x[P_ROD, i], 0.0))
 
 
 TERMS = (EntrainedAir, DeadVolume)

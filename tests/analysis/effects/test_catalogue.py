@@ -460,7 +460,7 @@ def test_bounds_grow_with_the_machine_and_not_with_its_pipes(rig: Rig) -> None:
     part = rig.joints[0].cylinder.model_copy(update={"cap_pipe_volume": 1e-6})
     joint = rig.joints[0].model_copy(update={"cylinder": part})
     hosed = rig.model_copy(update={"joints": (joint, *rig.joints[1:])})
-    (volume,) = effect("dead_volume", "joint 1 cap").shapes(hosed)
+    volume = effect("dead_volume", "joint 1 cap").shapes(hosed)[0]
     assert volume.high > 2.0 * part.cap_area * part.stroke
     (offset,) = effect("sensor_offset", "joint 1 piston").shapes(rig)
     low, high = rig.sensors.piston.range
@@ -471,6 +471,20 @@ def test_bounds_grow_with_the_machine_and_not_with_its_pipes(rig: Rig) -> None:
     ):  # fmt: skip
         bounds = [effect(name, where).shapes(r)[0].high for r in (rig, slow)]
         assert bounds == pytest.approx([0.1, 0.5])
+
+
+def test_a_hose_that_stiffens_gives_as_its_volume_grows(rig: Rig, state: Signals) -> None:
+    """Dv/dp of a hose that widens with the logarithm of its pressure, by finite differences."""
+    hose, V, k, step = effect("dead_volume", "joint 1 rod"), 5e-5, 2e-7, 100.0
+    p, level = state.p_rod[:, 0], 0.5 * rig.supply.pressure
+    assert p.min() > 0.0
+    seen = hose.prepare(rig, state, (V, k)).V_rod[:, 0] - state.V_rod[:, 0]
+
+    def widened(at: np.ndarray) -> np.ndarray:
+        return np.asarray(V * (1.0 + k * level) / k * np.log1p(k * at))
+
+    assert seen == pytest.approx((widened(p + step) - widened(p - step)) / (2 * step), rel=1e-6)
+    assert np.interp(level, np.sort(p), np.sort(seen)[::-1]) == pytest.approx(V, rel=0.02)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.2, 1.4])
