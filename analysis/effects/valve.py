@@ -85,7 +85,7 @@ class ValveEffect(Effect):
 MOST_ROUND: Final = 1.7
 # Gain at the null over that far from it, from which edges whose form the records determine do not
 # close there; the most rounded of the dead bands of odd seeds have 0.02.
-OPEN_AT_NULL: Final = 0.25
+OPEN_AT_NULL: Final = 0.1
 
 
 @dataclass(frozen=True)
