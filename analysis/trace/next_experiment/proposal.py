@@ -103,10 +103,14 @@ def rig_with_estimates(train_data: RegressionData) -> Rig:
         name: value
         for name, value in parameters.items()
         # A parameter that the records hardly determine may have any estimate.
-        if name in before
-        and 1 / EXPERIMENT.parameter_ratio < value / before[name] < EXPERIMENT.parameter_ratio
+        if _within(EXPERIMENT.parameter_ratio, value, before.get(name, abs(value)))
     }
     return train_data.rig.model_copy(update={"nominal": {**before, **likely}})
+
+
+def _within(ratio: float, value: float, nominal: float) -> bool:
+    """Return whether a value is at most `ratio` times a nominal one, and at least its inverse."""
+    return nominal != 0.0 and 1 / ratio < value / nominal < ratio
 
 
 def _questions(
@@ -289,7 +293,7 @@ def _protocols(
 def _experiment_in_words(
     effects: Sequence[JudgedEffect], asked: Sequence[PredictedAnswer]
 ) -> Mapping[str, Any] | None:
-    """Describe an experiment in words, for rigs without nominal values and so without a twin."""
+    """Describe an experiment in words, for rigs without a twin."""
     pairs = [(e.name, r.name) for e in effects for r in e.rivals if r.tied]
     texts = [_separated_by(*pair) for pair in pairs]
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -143,6 +144,17 @@ def test_a_rig_without_a_twin_offers_nothing() -> None:
     blind = rig.model_copy(update={"nominal": {}})
     where = joint_settings(rig, train_data.records)[0]
     assert excitation(blind, where, FAST, np.random.default_rng(0)) is None
+
+
+def test_a_rig_without_nominal_values_has_those_of_the_records() -> None:
+    """The twin of an imported machine needs every one; joint 1 never moved."""
+    rig, train_data = sine()
+    blind = replace(train_data, rig=rig.model_copy(update={"nominal": {}}))
+    likely = proposal.rig_with_estimates(blind).nominal
+    assert likely["b"] == pytest.approx(rig.nominal["b"], rel=0.1)
+    assert likely["C_pp_2"] == pytest.approx(rig.nominal["C_pp_2"], rel=0.1)
+    assert "M2" in likely
+    assert "M1" not in likely
 
 
 def test_every_effect_that_can_show_has_a_size_worth_knowing() -> None:
