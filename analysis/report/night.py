@@ -16,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from analysis.identify.settings import IDENTIFY
 from analysis.report import format as fm
 from analysis.report.page import page, write
 from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, style, svg
@@ -28,10 +27,10 @@ _BAR_COLOURS: Final = {"done": BLUE, "tripped": "#d03030"}
 
 @dataclass(frozen=True)
 class NightEstimate:
-    """An identified parameter, SI; `std` is NaN where it is not known."""
+    """An identified parameter, SI, and half of its 95 % interval, NaN where it is not known."""
 
     value: float
-    std: float
+    half: float
     unit: str
 
 
@@ -39,7 +38,8 @@ class NightEstimate:
 class NightItem:
     """One item as the page shows it; times are aware, None where an item did not reach that point.
 
-    Counts are -1 where unknown; `unidentified` states why nothing was identified.
+    Counts and the `seconds` of all samples, by the device's clock, are -1 where unknown: the host's
+    clock may be set during a night. `unidentified` states why nothing was identified.
     """
 
     number: int
@@ -54,6 +54,7 @@ class NightItem:
     records: int = -1
     samples: int = -1
     lost_samples: int = -1
+    seconds: float = -1.0
     parameters: Mapping[str, NightEstimate] = field(default_factory=dict)
     unidentified: str = ""
 
@@ -126,7 +127,7 @@ def _lead(night: Night, counts: Mapping[str, int]) -> str:
 def _tiles(night: Night, counts: Mapping[str, int]) -> list[dict[str, Any]]:
     runs = [item for item in night.items if item.samples >= 0]
     lost = sum(item.lost_samples for item in runs)
-    seconds = sum(_seconds(item) for item in night.items)
+    seconds = sum(max(0.0, item.seconds) for item in night.items)
     bad = sum(n for state, n in counts.items() if state not in ("done", "queued", "cancelled"))
     return [
         {"number": str(counts.get("done", 0)), "label": "items done", "warn": False,
@@ -143,18 +144,11 @@ def _tiles(night: Night, counts: Mapping[str, int]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _seconds(item: NightItem) -> float:
-    if item.started is None or item.ended is None:
-        return 0.0
-    return max(0.0, (item.ended - item.started).total_seconds())
-
-
 def _row(item: NightItem) -> dict[str, Any]:
-    took = _seconds(item)
     return {
         "number": item.number, "name": item.name, "state": item.state, "reason": item.reason,
         "rig": item.rig, "run": item.run, "started": _clock(item.started, date=True),
-        "minutes": f"{took / 60.0:.1f}" if took else fm.DASH,
+        "minutes": f"{item.seconds / 60.0:.1f}" if item.seconds > 0.0 else fm.DASH,
         "records": str(item.records) if item.records >= 0 else fm.DASH,
         "samples": str(item.samples) if item.samples >= 0 else fm.DASH,
         "lost": str(item.lost_samples) if item.lost_samples >= 0 else fm.DASH,
@@ -175,7 +169,7 @@ def _timeline(items: Sequence[NightItem]) -> Markup | None:
         for k, item in enumerate(shown):
             assert item.started is not None
             start_minute = (item.started - begin).total_seconds() / 60.0
-            width = max(_seconds(item) / 60.0, 1e-3)
+            width = max(item.seconds / 60.0, 1e-3)
             colour = _BAR_COLOURS.get(item.state, GREY)
             axes.barh(k, width, left=start_minute, height=0.62, color=colour)
             axes.plot([start_minute + width] * 2, [k - 0.31, k + 0.31], color=INK, lw=0.8)
@@ -210,20 +204,20 @@ def _drift(rig: str, items: Sequence[NightItem]) -> dict[str, Any]:
 
 
 def change(values: Sequence[NightEstimate]) -> tuple[float, float]:
-    """Return the last minus the first estimate, and that over the two errors together (0: unknown).
+    """Return the last minus the first estimate, and that over its 95 % error (0: unknown).
 
     The errors of two runs are independent: their squares add.
     """
     first, last = values[0], values[-1]
     moved = last.value - first.value
-    error = math.hypot(first.std, last.std)
+    error = math.hypot(first.half, last.half)
     return moved, moved / error if error > 0.0 and math.isfinite(error) else 0.0
 
 
 def _drift_row(name: str, items: Sequence[NightItem]) -> dict[str, Any]:
     values = [item.parameters[name] for item in items if name in item.parameters]
     unit = fm.display_unit(values[0].unit)
-    moved, sigmas = change(values)
+    moved, share = change(values)
     percent = 100.0 * moved / abs(values[0].value) if values[0].value else math.nan
     several = len(values) > 1
     return {
@@ -231,10 +225,10 @@ def _drift_row(name: str, items: Sequence[NightItem]) -> dict[str, Any]:
         "unit": unit.text,
         "first": fm.significant(values[0].value, 4, unit.scale),
         "last": fm.significant(values[-1].value, 4, unit.scale),
-        "half": fm.significant(IDENTIFY.normal_quantile * values[-1].std, 2, unit.scale),
+        "half": fm.significant(values[-1].half, 2, unit.scale),
         "change": f"{fm.percent(percent, signed=True)} %" if several else fm.DASH,
-        "sigmas": fm.significant(abs(sigmas), 2) if several and sigmas else fm.DASH,
-        "warn": several and abs(sigmas) > IDENTIFY.normal_quantile,
+        "share": fm.significant(abs(share), 2) if several and share else fm.DASH,
+        "warn": several and abs(share) > 1.0,
         "runs": len(values),
     }
 
@@ -251,9 +245,7 @@ def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> M
             shown = [item for item in items if name in item.parameters]
             hours = np.array([_hours(begin, item) for item in shown])
             values = np.array([item.parameters[name].value for item in shown])
-            half = IDENTIFY.normal_quantile * np.array(
-                [item.parameters[name].std for item in shown]
-            )
+            half = np.array([item.parameters[name].half for item in shown])
             scale = 100.0 / abs(values[0]) if values[0] else 1.0
             percent = scale * (values - values[0])
             axes.axhline(0.0, color=PALE, lw=0.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -59,8 +60,9 @@ def _shown(item: Item) -> NightItem:
         records=-1 if summary is None else summary.records,
         samples=-1 if summary is None else summary.samples,
         lost_samples=-1 if summary is None else summary.lost_samples,
+        seconds=-1.0 if summary is None else summary.seconds,
         parameters={
-            name: NightEstimate(float(p["value"]), _number(p.get("std")), str(p.get("unit", "")))
+            name: NightEstimate(float(p["value"]), _half(p.get("ci95")), str(p.get("unit", "")))
             for name, p in parameters.items()
             if p.get("value") is not None
         },
@@ -68,8 +70,10 @@ def _shown(item: Item) -> NightItem:
     )
 
 
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
+def _half(interval: Sequence[float | None] | None) -> float:
+    """Return half of a 95 % interval (low, high), NaN without one."""
+    low, high = interval or (None, None)
+    return math.nan if low is None or high is None else 0.5 * (high - low)
 
 
 def write_page(path: Path, store: QueueStore, since: datetime | None = None) -> None:
