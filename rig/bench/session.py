@@ -217,9 +217,12 @@ class Bench:
             lost = self._continue(block)
             with self._outputs:
                 self._keep(block, None, lost)
+            # The last picture on a screen has the outputs at zero.
+            self._display.show(block, 0.0, self.lost_samples, self._guard.roles)
 
         seconds = self.recorded_after
         after_zero = record_zero(self.rig, self._driver.read_block, keep, self._clock, seconds)
+        self._display.last()
         return after_zero is not False
 
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:

@@ -19,6 +19,7 @@ from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
 from tests.services.fake_driver import FakeDriver
+from tests.services.test_attach import Wall
 from tests.services.test_bench import pressure_at
 
 RIG = load_rig("shinshu-2dof")
@@ -63,6 +64,20 @@ def test_two_seconds_at_zero_are_recorded_after_the_last_command(
     assert put_out[:160].min() == 1.0
     assert len(put_out) == 160 + 2000
     assert not put_out[160:].any()
+
+
+def test_the_last_picture_of_a_run_that_tripped_has_its_commands_at_zero(tmp_path: Path) -> None:
+    """A person before the bench reads from it whether the valves are closed."""
+    wall = Wall()
+    driver = FakeDriver(RIG, spoil=pressure_at(154))
+    recorder = Recorder(tmp_path / "run", RIG)
+    with pytest.raises(SafetyTrip), Bench(RIG, driver, recorder, wall) as bench:  # noqa: PT012
+        bench.apply(MOVE)
+        bench.run_for(1.0)
+    tripped = [s for s in wall.seen if s.state == "tripped"]
+    assert tripped[0].channels["command_1"].last == 1.0
+    assert tripped[-1].channels["command_1"].last == 0.0
+    assert tripped[-1].tick == 160 + 2000
 
 
 def test_what_a_device_had_queued_is_kept_and_two_seconds_of_zero_follow(tmp_path: Path) -> None:

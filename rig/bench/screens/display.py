@@ -48,6 +48,7 @@ class Display:
         self._tick = 0
         self._first: int | None = None
         self._lost = 0
+        self._end = ""
         self._roles: Sequence[JointRole] = ()
         self._bands: tuple[Sequence[JointRole], Limits, Limits] | None = None
         self._past = PastKeeper(rig.recorded)
@@ -80,7 +81,8 @@ class Display:
         self._lost, self._roles = lost, roles
         if self.trip is not None or self._clock() >= self._next:
             self._next = self._clock() + _INTERVAL
-            self._publish(runstate.RUNNING if self.trip is None else runstate.TRIPPED, age)
+            state = runstate.RUNNING if self.trip is None else runstate.TRIPPED
+            self._publish(self._end or state, age)
 
     def _publish(self, state: str, age: float) -> None:
         if self._publisher is None:
@@ -151,7 +153,13 @@ class Display:
             self.progress = replace(self.progress, device=LOST)
         if message:
             self.progress = replace(self.progress, message=message)
+        self._end = state
         self._publish(state, 0.0)
+
+    def last(self) -> None:
+        """Publish the samples not yet published of a run that has ended."""
+        if self._waiting:
+            self._publish(self._end, 0.0)
 
     def close(self) -> None:
         """Close the sockets; never raises."""
