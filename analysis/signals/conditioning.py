@@ -8,7 +8,7 @@ pressures [Pa gauge], `V_cap V_rod` chamber volumes [m^3], `p_s p_tank` supply a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,6 +112,15 @@ def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
     }
 
 
+def sampled_channels(rig: Rig, rate: float, channels: Mapping[str, Array]) -> dict[str, Array]:
+    """Return channels at the tick's instant, each (n,), as multiplexer and sensors sample them.
+
+    The inverse of `aligned_channels`, at a sample rate [Hz].
+    """
+    shifts = _shifts(rig, rate)
+    return {name: align(x, -shifts[name]) for name, x in channels.items()}
+
+
 def _shifts(rig: Rig, rate: float) -> dict[str, float]:
     """Return by how many samples each channel lags the instant of the tick."""
     return {
@@ -163,6 +172,13 @@ def condition(
     channels = aligned_channels(rig, record)
     n = record.samples
 
+    bands = motion_bands(rig, [record]) if bands is None else bands
+    moving = bands > 0.0
+    for i, band in zip(joints, map(float, bands), strict=True):
+        name = ch.channel(rig.position_kind, i)
+        if name in channels:
+            channels[name] = within_band(channels[name], record.sample_rate, band)
+
     def filtered(kind: str, highest: int) -> Sequence[Array]:
         """Return the joints' channels of one kind and their derivatives, (n, N) each."""
         fill = np.zeros(n)
@@ -171,13 +187,6 @@ def condition(
 
     def bench(name: str, constant: float) -> Array:
         return smoother.apply(channels[name]) if name in channels else np.full(n, constant)
-
-    bands = motion_bands(rig, [record]) if bands is None else bands
-    moving = bands > 0.0
-    for i, band in zip(joints, map(float, bands), strict=True):
-        name = ch.channel(rig.position_kind, i)
-        if name in channels:
-            channels[name] = within_band(channels[name], record.sample_rate, band)
 
     supply, oil = (0.0, 0.0) if rig.electric else (rig.supply.pressure, rig.oil.temperature)
     held = held_positions(rig, [record]) if held is None else held

@@ -70,6 +70,8 @@ def test_a_simulated_run_gives_its_models_parameters_back(folder: Path, rubbed: 
     assert told["Fc2"]["value"] == pytest.approx(FRICTION, rel=0.02)
     for name in ("M2", "W2", "b", "C_pp_2"):
         assert told[name]["value"] == pytest.approx(wanted[name], rel=0.02), name
+    # Its samples have the skew that its rig states: without it Fv2 is 1.5 % off.
+    assert told["Fv2"]["value"] == pytest.approx(wanted["Fv2"], rel=0.004)
 
 
 def test_the_model_taken_over_keeps_its_shapes(folder: Path, rubbed: Path) -> None:

@@ -51,6 +51,7 @@ def channel_simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], M
 
     Raises InputError for a model of another rig, WorkError if a simulation fails.
     """
+    from analysis.signals.conditioning import sampled_channels
     from analysis.simulation.model import load_model, refuse_other_rig
     from analysis.simulation.validate import validate_record
 
@@ -62,6 +63,7 @@ def channel_simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], M
         if result.failure:
             raise WorkError(f"record {record.name!r}: {path} cannot be simulated: {result.failure}")
         every = result.simulation.channels()
-        return {name: every[name] for name in result.measured}
+        simulated = {name: every[name] for name in result.measured}
+        return sampled_channels(rig, record.sample_rate, simulated)
 
     return channels
