@@ -20,6 +20,7 @@ LONGEST_PERIOD = 600.0  # [s] a longer waveform, or common period of two, is a m
 NYQUIST_SHARE = 4.0  # excited lines stay below Nyquist / 4
 FAINT = 1e-3  # of the largest line; a smaller one does not count as excited
 SMOOTH = 8.0  # lines of a shape with edges end at this many times 1 / the edge's time
+LARGEST = 1e100  # [V] of a sample whose spectrum can be computed
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,13 @@ def integral(samples: Array, lines: LineNumbers) -> Array:
 
 
 def start_centred(samples: Array, lines: LineNumbers) -> Array:
-    """Rotate a waveform so that its integral starts at its own mean, rising."""
+    """Rotate a waveform so that its integral starts at its own mean, rising.
+
+    Raises ValueError for a waveform too large to be computed.
+    """
+    largest = float(np.max(np.abs(samples)))
+    if not largest < LARGEST:
+        raise ValueError(f"reaches {largest:g} V; expected an amplitude within limits.command")
     motion = integral(samples, lines)
     rising = np.flatnonzero((motion <= 0.0) & (np.roll(motion, -1) > 0.0))
     return np.asarray(np.roll(samples, -int(rising[0])), dtype=np.float64)

@@ -17,6 +17,7 @@ from protocols.files.library import load, parsed_values, read_protocol, shipped_
 from protocols.files.plan import piston_gain, resolve
 from protocols.files.schema import VERSION, Protocol
 from protocols.language.conditions import parse_condition
+from protocols.language.waveforms import start_centred
 from protocols.signals import SIGNALS
 from protocols.steps import STEPS
 from protocols.steps.prompt import PromptStep
@@ -297,6 +298,12 @@ def test_any_text_is_a_condition_or_refused_in_one_line(text: str) -> None:
         return
     assert found.names
     assert not found.holds({})
+
+
+def test_a_signal_too_large_to_compute_is_refused_with_its_size() -> None:
+    samples = 1e308 * np.sin(2 * np.pi * np.arange(100) / 100)
+    with pytest.raises(ValueError, match=r"reaches 1e\+308 V; expected an amplitude within"):
+        start_centred(samples, np.array([1]))
 
 
 @pytest.mark.parametrize("kind", ["chirp", "step", "ramp", "triangle"])
