@@ -290,6 +290,6 @@ class TcpConnection(ModbusConnection):
 
     def _never_answered(self) -> str:
         return (
-            "something takes connections there, but speaks no Modbus so far: check `port`, which "
-            "another program may have, and the unit's number"
+            "something takes connections there, but has not answered on this one: check whether "
+            "the device hangs, `port`, which another program may have, and the unit's number"
         )

@@ -229,7 +229,9 @@ class Journal:
             # FULL would delay the acquisition by a disk sync per transaction.
             db.execute("PRAGMA synchronous=NORMAL")
         except (sqlite3.Error, OSError) as error:
-            raise RecordingFailed(f"{path}: the journal cannot be written: {error}") from error
+            raise RecordingFailed(
+                f"{path}: the journal cannot be written ({error}; is the disk full?)"
+            ) from error
         return cls(db, path, tail)
 
     @classmethod
@@ -246,7 +248,10 @@ class Journal:
             (last,) = db.execute("SELECT max(id) FROM block").fetchone()
             journal._newest = read_tail(path, after=int(last or 0))
         except (sqlite3.Error, OSError) as error:
-            raise InputError(f"{path}: not a readable journal: {error}") from error
+            raise InputError(
+                f"{path}: not a readable journal ({error}; is the disk full, or the file another "
+                "user's?)"
+            ) from error
         return journal
 
     def _write(self, sql: str, values: tuple[Any, ...]) -> None:

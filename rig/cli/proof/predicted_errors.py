@@ -225,7 +225,7 @@ def design_text(designed: DesignedProtocol, out: Path) -> str:
         was, which = designed.design.shares_before[step]
         lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
     lines.append(
-        f"{designed.design.evaluated} trials, {designed.design.accepted} kept; written to {out}"
+        f"trials: {designed.design.evaluated}, kept: {designed.design.accepted}; written to {out}"
     )
     return "\n".join(lines)
 
