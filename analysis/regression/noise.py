@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows, in_common, record_rows
-from analysis.signals.filters import Smoother, bridged
+from analysis.signals.filters import Smoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.parts import AnySensor
-from rig.model.records import Record
+from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals.filters import Smoother, align, bridged, channel_filter
+from analysis.signals.filters import Smoother, align, channel_filter
 from analysis.signals.locks import held_positions, motion_bands, within_band
 from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.records import Record
+from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

@@ -208,16 +208,3 @@ def _interpolation(shift: float) -> Array:
     distance: Array = np.asarray(np.arange(-reach, reach + 1) - shift, dtype=np.float64)
     taps = _kernel(distance, 0.425, SIGNALS.align_half_width + 0.5, 8.0)
     return np.asarray(taps / taps.sum())
-
-
-def bridged(x: Array) -> Array:
-    """Return x (n,) with every gap of NaN interpolated linearly; zeros if all are NaN."""
-    missing = np.isnan(x)
-    if not missing.any():
-        return x
-    if missing.all():
-        return np.zeros_like(x)
-    index = np.arange(len(x))
-    filled = x.copy()
-    filled[missing] = np.interp(index[missing], index[~missing], x[~missing])
-    return filled

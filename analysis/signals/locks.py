@@ -24,10 +24,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals.filters import FirSmoother, bridged, row_filter
+from analysis.signals.filters import FirSmoother, row_filter
 from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
-from rig.model.records import Record
+from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

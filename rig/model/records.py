@@ -150,3 +150,16 @@ def with_loads_stated(runs: Sequence[Run]) -> tuple[Run, ...]:
         )
         for run in runs
     )  # fmt: skip
+
+
+def bridged(x: Array) -> Array:
+    """Return x (n,) with every gap of NaN interpolated linearly; zeros if all are NaN."""
+    missing = np.isnan(x)
+    if not missing.any():
+        return x
+    if missing.all():
+        return np.zeros_like(x)
+    index = np.arange(len(x))
+    filled = x.copy()
+    filled[missing] = np.interp(index[missing], index[~missing], x[~missing])
+    return filled

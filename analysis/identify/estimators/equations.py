@@ -17,9 +17,8 @@ from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import numbered, sums_of
-from analysis.signals.filters import bridged
 from rig.model import channels as ch
-from rig.model.records import Record
+from rig.model.records import Record, bridged
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

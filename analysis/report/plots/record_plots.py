@@ -29,9 +29,8 @@ from analysis.report.plots.style import (
 )
 from analysis.report.residuals import Residual
 from analysis.report.settings import REPORT
-from analysis.signals.filters import bridged
 from rig.model import channels as ch
-from rig.model.records import Record
+from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

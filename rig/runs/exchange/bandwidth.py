@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.model import channels as ch
+from rig.model.records import bridged
 from rig.model.rig import Rig
 from rig.runs.exchange.settings import EXCHANGE
 
@@ -23,19 +24,11 @@ def motion_bandwidth(
     for a record shorter than `EXCHANGE.bandwidth_seconds`, which needs all its rows.
     """
     free = [i for i in range(1, len(rig.joints) + 1) if i not in locked]
-    positions = [_whole(channels[ch.channel(rig.position_kind, i)]) for i in free]
+    positions = [bridged(channels[ch.channel(rig.position_kind, i)]) for i in free]
     moving = [x for x in positions if np.ptp(x) > 0.0]
     if not moving or len(moving[0]) < EXCHANGE.bandwidth_seconds * rate:
         return None
     return max(_bandwidth(x, rate) for x in moving)
-
-
-def _whole(x: Array) -> Array:
-    """Return samples (n,) with lost ones (NaN) interpolated."""
-    known = np.isfinite(x)
-    if known.all() or not known.any():
-        return np.nan_to_num(x)
-    return np.interp(np.arange(len(x)), np.flatnonzero(known), x[known])
 
 
 def _bandwidth(position: Array, rate: float) -> float:
