@@ -188,11 +188,15 @@ class DeadVolume(Effect):
         """Add the volume to the chamber's."""
         field = "V_cap" if self.side == "cap" else "V_rod"
         V = getattr(signals, field).copy()
-        more, stiffening = self.whole(rig, shape)
         p = (signals.p_cap if self.side == "cap" else signals.p_rod)[:, self.joint]
-        level = 1.0 + stiffening * 0.5 * rig.supply.pressure
-        V[:, self.joint] += more * level / (1.0 + stiffening * np.maximum(p, 0.0))
+        slack, stiffening = self.slack(rig, shape)
+        V[:, self.joint] += slack / (1.0 + stiffening * np.maximum(p, 0.0))
         return replace(signals, **{field: V})
+
+    def slack(self, rig: Rig, shape: Sequence[float]) -> tuple[float, float]:
+        """Return the volume [m^3] at no pressure and its stiffening [1/Pa]."""
+        V, stiffening = self.whole(rig, shape)
+        return V * (1.0 + stiffening * 0.5 * rig.supply.pressure), stiffening
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return nothing: `compressibility` sees the larger volume."""
@@ -200,8 +204,7 @@ class DeadVolume(Effect):
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, volume at no pressure of the cap side, of the rod side, stiffening."""
-        V, stiffening = self.whole(rig, shape)
-        V *= 1.0 + stiffening * 0.5 * rig.supply.pressure
+        V, stiffening = self.slack(rig, shape)
         sides = V * (self.side == "cap"), V * (self.side == "rod")
         return np.array([self.joint, *sides, stiffening])
 
