@@ -65,9 +65,7 @@ def _band(every: Array, rate: float, noise: float) -> float:
     """Return the band [Hz] in which a locked joint moves, of its positions (repeats, n) [m]."""
     count = len(every)
     # Repeats that were not synchronised after all would cancel in the mean.
-    if any(accelerates(x, rate, noise) for x in every) or accelerates(
-        every.mean(axis=0), rate, noise / np.sqrt(count)
-    ):
+    if any(accelerates(x, rate, noise) for x in every):
         return np.inf
     for k, band in enumerate(SIGNALS.moving_bands):
         filtering = row_filter(rate, band)
@@ -75,12 +73,12 @@ def _band(every: Array, rate: float, noise: float) -> float:
             break
         inner = _accelerations(every.T, filtering).T
         mean = inner.mean(axis=0)
-        level = noise * float(np.linalg.norm(filtering.taps[2]))
+        stated = noise * float(np.linalg.norm(filtering.taps[2]))
+        limits = [(SIGNALS.common_ratio if k else SIGNALS.moving_ratio) * stated]
         if count > 1:
-            level = min(
-                level, float(np.sqrt(np.sum((inner - mean) ** 2) / (count - 1) / len(mean)))
-            )
-        if np.std(mean) > SIGNALS.common_ratio * level / np.sqrt(count):
+            measured = float(np.sqrt(np.sum((inner - mean) ** 2) / (count - 1) / len(mean)))
+            limits.append(SIGNALS.common_ratio * measured)
+        if np.std(mean) > min(limits) / np.sqrt(count):
             return band if k else np.inf
     return 0.0
 
