@@ -43,7 +43,6 @@ class SpoolHysteresis(ValveEffect):
     name: ClassVar[str] = "spool_hysteresis"
     least_shape: ClassVar[tuple[float, ...]] = (2e-3,)  # [V]
     mechanism: ClassVar[str] = "spool_dynamics"
-    element: ClassVar[str] = "valve"
     stage: ClassVar[int] = NULL  # before the lag: a pilot has friction, the stage behind it lags
     variable: ClassVar[str] = "the sign of the spool's velocity"
     confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "valve_deadband", "channel_delay")

@@ -59,8 +59,8 @@ class RowFeed:
         self._rig, self._terms, self._head, self._filtering = rig, terms, head, filtering
         self._families = families
         self._chunk = round(IDENTIFY.online_chunk * head.sample_rate)
-        self._spare = overlap(rig, head.sample_rate, filtering, np.full(N, np.inf))
         self._locks = Locks(np.full(N, np.inf), np.zeros(N))
+        self._spare = overlap(rig, head.sample_rate, filtering, self._locks.bands)
         self._waiting: list[Mapping[str, Array]] = []
         self._offset = self._first = self._total = 0
 

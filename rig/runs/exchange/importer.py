@@ -125,8 +125,7 @@ def _without_outliers(rig: Rig, imported: _Imported) -> _Imported:
         x, (low, high) = channels[name], rig.sensors.of(ch.kind_of(name)[0]).range
         margin = EXCHANGE.end * (high - low)
         beyond = (x < low - margin) | (x > high + margin)
-        few = 0 < np.count_nonzero(beyond) <= EXCHANGE.outliers * len(x)
-        if few:
+        if 0 < np.count_nonzero(beyond) <= EXCHANGE.outliers * len(x):
             channels[name] = np.where(beyond, np.nan, x)
     return replace(imported, channels=channels)
 

@@ -188,7 +188,7 @@ def _play(rng: np.random.Generator, i: int) -> Wrong:
     own = {"play": play, "play_form": form, "play_travel": 0.2 * play}
     text = f"{1e3 * play:.2g} mV {('backlash', 'linkage', 'magnet')[form]}"
     return Wrong("spool_hysteresis", f"joint {i + 1}", text, joint=(i, own),
-                 sizes={"w_hysteresis": play} if form == 0 else {})  # fmt: skip
+                 sizes={"w_hysteresis": play} if form == plant.BACKLASH else {})  # fmt: skip
 
 
 def _leak(rng: np.random.Generator) -> tuple[str, int, float]:
