@@ -46,9 +46,8 @@ class CanLine:
         return self._answers.damaged + self._blocks.damaged
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the bus, also if others use it; raises as `CanPort.open`."""
-        del shared
-        self._port.open()
+        """Open the bus; raises as `CanPort.open`."""
+        self._port.open(shared=shared)
         self._answers.reset()
         self._blocks.reset()
         self._damaged = self.damaged

@@ -24,9 +24,13 @@ from can.interfaces.slcan import slcanBus
 from can.interfaces.socketcand import SocketCanDaemonBus
 
 from drivers.base import DeviceError, DeviceLost
+from drivers.serial_transport import PortInUse, port_in_use
 from drivers.settings import DRIVER
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.can_layout import EXTENDED
+
+if os.name == "posix":
+    import fcntl
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +94,7 @@ class CanPort:
         self._deliver = deliver
         self._identifiers = wanted
         self._make = make
+        self._shared = False
         self._reader: _Reader | None = None
 
     @property
@@ -112,9 +117,14 @@ class CanPort:
         """Counts of frames since the bus was last opened."""
         return FrameCounts() if self._reader is None else self._reader.seen
 
-    def open(self) -> None:
-        """Open the bus; raises DeviceLost where there is none, DeviceError where it may not be."""
+    def open(self, *, shared: bool = False) -> None:
+        """Open the bus; raises DeviceLost where there is none, DeviceError where it may not be.
+
+        The port of an slcan adapter belongs to one program, unless `shared`: the adapter then stays
+        as the other program has set it.
+        """
         self.close()
+        self._shared = shared
         # python-can warns of normal conditions, such as half a line; faults are reported here.
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if self._place.interface == SOCKETCAND:
@@ -123,6 +133,8 @@ class CanPort:
         if not reader.opened.wait(DRIVER.can_open):
             reader.end()
             raise DeviceLost(f"{self.where} did not open within {DRIVER.can_open:g} s")
+        if isinstance(reader.fault, PortInUse):
+            raise reader.fault
         if reader.fault is not None:
             raise self._why_not(reader.fault) from reader.fault
         self._reader = reader
@@ -237,7 +249,7 @@ class CanPort:
                     data_sample_point=75.0,
                 )
             if os.name == "posix" and self._make is can.Bus:
-                return _SlcanBus(place.channel, **rates)
+                return _SlcanBus(place.channel, shared=self._shared, **rates)
         elif self._data_bitrate is not None:
             rates |= {"fd": True, "data_bitrate": self._data_bitrate}
         return self._make(interface=place.interface, channel=place.channel, **rates)
@@ -296,7 +308,44 @@ class _SocketcandBus(SocketCanDaemonBus):
 
 
 class _SlcanBus(slcanBus):
-    """python-can's client, corrected: it reads byte by byte and ends at a damaged text."""
+    """python-can's client, corrected: it reads byte by byte and ends at a damaged text.
+
+    It also takes a port that another program has, sets the adapter anew, and takes bytes from that
+    program. Here the port is locked as pyserial does it; if `shared`, it is not, and the adapter is
+    left as it is.
+    """
+
+    def __init__(self, channel: str, *, shared: bool, **options: Any) -> None:
+        self._shared = shared
+        self._lock = -1 if shared else _locked(channel.partition("@")[0])
+        try:
+            super().__init__(channel, **options)
+        except BaseException:
+            self._unlock()
+            raise
+
+    def open(self) -> None:
+        if not self._shared:
+            super().open()
+
+    def close(self) -> None:
+        if not self._shared:
+            super().close()
+
+    def set_bitrate(self, bitrate: int, data_bitrate: int | None = None) -> None:
+        if not self._shared:
+            super().set_bitrate(bitrate, data_bitrate)
+
+    def shutdown(self) -> None:
+        try:
+            super().shutdown()
+        finally:
+            self._unlock()
+
+    def _unlock(self) -> None:
+        lock, self._lock = self._lock, -1
+        if lock >= 0:
+            os.close(lock)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
@@ -316,6 +365,20 @@ class _SlcanBus(slcanBus):
                 self._buffer.extend(port.read(port.in_waiting or 1))
             elif end is not None and left <= 0.0:
                 return None
+
+
+def _locked(device: str) -> int:
+    """Lock a serial port against other programs; returns the file to close at the end.
+
+    Raises PortInUse where another program has locked it, OSError where there is no such port.
+    """
+    file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(file)
+        raise port_in_use(device) from error
+    return file
 
 
 def _first_text(begun: bytearray) -> str | None:

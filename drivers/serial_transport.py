@@ -61,10 +61,7 @@ def why_not_opened(device: str, baud: int, error: Exception) -> DeviceError:
     """Return the error of a serial port that cannot be opened, with a remedy."""
     text = str(error)
     if "exclusively lock" in text:
-        return PortInUse(
-            f"the port {device} is in use by another program, which has control; end it, or wait "
-            "for its end"
-        )
+        return port_in_use(device)
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EPERM, errno.EACCES):
         return DeviceError(
@@ -89,6 +86,14 @@ def _written(file: int, data: bytes) -> int:
 
 class PortInUse(DeviceBusy):
     """Another program has the port."""
+
+
+def port_in_use(device: str) -> PortInUse:
+    """Return the error of a port that another program has."""
+    return PortInUse(
+        f"the port {device} is in use by another program, which has control; end it, or wait "
+        "for its end"
+    )
 
 
 class PySerialTransport:

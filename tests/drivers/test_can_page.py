@@ -84,7 +84,7 @@ class Loop:
         self.lines: list[str] = []
         self._waiting: list[CanFrame] = []
 
-    def open(self) -> None:
+    def open(self, *, shared: bool = False) -> None:
         self.is_open = True
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 import time
+import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -410,3 +411,41 @@ def test_the_file_of_a_rig_is_printed(capsys: pytest.CaptureFixture[str]) -> Non
         command(["dbc", "--rig", "boom-1dof"])
     assert ended.value.code == 0
     assert " SG_ cap_pressure_1 : " in capsys.readouterr().out
+
+
+@pytest.fixture
+def adapter() -> Iterator[tuple[int, str]]:
+    """The adapter's end of a serial line, and the name of the port at the host's end."""
+    end, port = os.openpty()
+    tty.setraw(port)
+    os.set_blocking(end, False)
+    yield end, os.ttyname(port)
+    os.close(port)
+    os.close(end)
+
+
+def written(end: int) -> bytes:
+    try:
+        return os.read(end, 4096)
+    except BlockingIOError:
+        return b""
+
+
+def test_the_port_of_an_slcan_adapter_belongs_to_one_program(adapter: tuple[int, str]) -> None:
+    end, name = adapter
+    run, probe = (CanPort(BusPlace.of(f"slcan{name}"), 500_000, None, frozenset()) for _ in "12")
+    run.open()
+    assert written(end).endswith(b"O\r")  # the adapter's bus is open
+    with pytest.raises(DeviceBusy, match=f"the port {name} is in use by another program"):
+        probe.open()
+    assert written(end) == b""  # nothing that would close the bus of the run
+    probe.open(shared=True)  # for a single frame that zeroes the outputs
+    probe.send(CanFrame(0x80, b"\x01"))
+    probe.close()
+    assert written(end) == b"t080101\r"
+    assert run.is_open
+    assert run.fault is None
+    run.close()
+    assert written(end) == b"C\r"
+    probe.open()
+    probe.close()
