@@ -2,17 +2,19 @@
 
 A bench is identified by its endpoint, not by the rig's name. Each has a folder in `state_folder`:
 `trip.json` while a trip is latched, `resets.jsonl` with every cleared trip, `session.json` while
-a process of this computer uses the bench. A bench with two addresses has two folders; the trip
-latched in the device itself covers that case.
+a process of this computer uses the bench, and `lock`, which that process has locked. A bench with
+two addresses has two folders; the trip latched in the device itself covers that case.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
 import re
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -28,7 +30,7 @@ from rig.runs.files import replace_text, sync_to_disk
 log = logging.getLogger(__name__)
 
 STATE_VARIABLE: Final = "BRAMAH_STATE"
-_TRIP, _RESETS, _SESSION = "trip.json", "resets.jsonl", "session.json"
+_TRIP, _RESETS, _SESSION, _LOCK = "trip.json", "resets.jsonl", "session.json", "lock"
 _THIS_COMPUTER = frozenset({"localhost", "[::1]"})
 _UNREADABLE: Final = "unknown"
 
@@ -95,6 +97,7 @@ class BenchState:
         self.endpoint = wire.endpoint
         self.folder = (state_folder() if root is None else root) / _folder_name(wire)
         self._taken = False
+        self._lock: int | None = None
 
     def prepare(self) -> None:
         """Create the folder; raises InputError if a trip could not be stored there."""
@@ -180,6 +183,45 @@ class BenchState:
 
     # The session
 
+    def occupy(self) -> None:
+        """Keep other processes of this computer off the bench until `release`.
+
+        A device that knows no sessions (valves on CANopen, an I/O module) would serve two programs
+        at once. Raises DeviceBusy where another process has the bench; a folder that cannot be
+        written is logged.
+        """
+        try:
+            handle = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            log.warning("%s: cannot lock the bench: %s", self.folder, error)
+            return
+        try:
+            # A lock of the process: one process may have several sessions with the bench.
+            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            process = os.pread(handle, 32, 0).decode("ascii", "replace").strip()
+            os.close(handle)
+            known = self.holder()
+            run = f", which writes {known.run}" if known and known.run else ""
+            raise DeviceBusy(
+                f"the bench at {self.endpoint} is in use by process {process} of this computer"
+                f"{run}; wait for its end or stop it"
+            ) from error
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+        self._lock = handle
+
+    @contextmanager
+    def occupied(self) -> Iterator[None]:
+        """Return a context in which other processes of this computer are kept off (`occupy`)."""
+        with suppress(InputError):  # without a folder there is nothing to lock, nor to latch
+            self.prepare()
+        self.occupy()
+        try:
+            yield
+        finally:
+            self.release()
+
     def take(self, run: Path | None) -> None:
         """Store this process as the user of the bench; never raises."""
         started = runstate.process_started(os.getpid()) or ""
@@ -191,11 +233,15 @@ class BenchState:
         self._taken = True
 
     def release(self) -> None:
-        """Remove the entry made by `take`; never raises."""
+        """Remove the entry made by `take` and the lock of `occupy`; never raises."""
         if self._taken:
             self._taken = False
             with suppress(OSError):
                 (self.folder / _SESSION).unlink(missing_ok=True)
+        handle, self._lock = self._lock, None
+        if handle is not None:
+            with suppress(OSError):
+                os.close(handle)
 
     def holder(self) -> Holder | None:
         """Return the running process of this computer that uses the bench, None if unknown."""
@@ -240,14 +286,15 @@ def reset_bench(rig: Rig, driver: Driver, reason: str) -> str:
         )
     bench = BenchState(rig.wire)
     bench.prepare()
-    try:
-        driver.connect()
-        cause = driver.trip_cause()
-        driver.reset()
-    except DeviceBusy as error:
-        raise bench.in_use(error) from error
-    finally:
-        driver.close()
+    with bench.occupied():
+        try:
+            driver.connect()
+            cause = driver.trip_cause()
+            driver.reset()
+        except DeviceBusy as error:
+            raise bench.in_use(error) from error
+        finally:
+            driver.close()
     cleared = bench.clear(reason.strip(), cause)
     parts = [] if cleared is None else [cleared.trip]
     parts += [] if cause is None else [f"device: {cause}"]

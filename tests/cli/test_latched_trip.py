@@ -135,10 +135,10 @@ def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path
                 bramah_here("reset", *at, "--reason", "none"),
             ):
                 assert second.returncode == 4, second.stderr
-                assert f"in use: another client has control of the device at {endpoint[13:]}" in (
-                    second.stderr
-                )
-                assert f"process {process.pid}, which writes {run}" in second.stderr
+                assert (
+                    f"device in use: the bench at {endpoint} is in use by process {process.pid} of "
+                    f"this computer, which writes {run}"
+                ) in second.stderr
             assert process.poll() is None
             process.terminate()
             process.communicate(timeout=LONG)

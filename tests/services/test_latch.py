@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,3 +157,44 @@ def test_a_holder_that_died_is_none(state: Path) -> None:
     assert kept.holder() == Holder(**json.loads(note.read_text()))
     note.write_text('{"pid": 4194304, "started": "1", "run": ""}')
     assert kept.holder() is None
+
+
+HOLDS_THE_BENCH = """
+import sys
+from pathlib import Path
+from rig.bench.session import Bench
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
+from tests.services.fake_driver import FakeDriver
+rig = load_rig("shinshu-2dof")
+with Bench(rig, FakeDriver(rig), Recorder(Path(sys.argv[1]), rig)) as bench:
+    print("at work", flush=True)
+    while True:
+        bench.exchange()
+"""
+
+
+def test_a_bench_that_another_process_runs_is_not_even_asked(tmp_path: Path) -> None:
+    """A device that knows no sessions would serve both programs, each with half of the answers."""
+    run, root = tmp_path / "monday", Path(__file__).parents[2]
+    words = [sys.executable, "-c", HOLDS_THE_BENCH, str(run)]
+    with subprocess.Popen(words, cwd=root, stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == "at work\n"
+            driver = FakeDriver(RIG)
+            with pytest.raises(DeviceBusy) as refused, Bench(RIG, driver, signals=False):
+                pytest.fail("two sessions with one bench")
+            assert f"in use by process {other.pid} of this computer, which writes {run};" in str(
+                refused.value
+            )
+            with pytest.raises(DeviceBusy), BenchState(RIG.wire).occupied():
+                pytest.fail("a probe beside a run")
+            with pytest.raises(DeviceBusy, match="in use by process"):
+                reset_bench(RIG, driver, "a reset beside a run")
+            assert {"connect", "zero", "reset"}.isdisjoint(driver.calls)
+        finally:
+            other.kill()
+            other.wait()
+    with Bench(RIG, FakeDriver(RIG), signals=False) as bench:  # the lock died with its process
+        bench.exchange()

@@ -32,10 +32,11 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
 
     described, driver = device_of(rig, endpoint)
     state = BenchState(described.wire)
-    try:
-        readings, timing, cause = bench.probe_timed(driver, described)
-    except DeviceBusy as error:
-        raise state.in_use(error) from error
+    with state.occupied():
+        try:
+            readings, timing, cause = bench.probe_timed(driver, described)
+        except DeviceBusy as error:
+            raise state.in_use(error) from error
     write_json(json, [asdict(reading) for reading in readings])
     if json != Path("-"):
         header = ("channel", "mean", "least", "most", "unit", "codes", "")
