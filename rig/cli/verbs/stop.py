@@ -15,6 +15,7 @@ from rig.cli.options import EndpointOption, RigOption
 from rig.cli.text.output import progress
 
 if TYPE_CHECKING:
+    from drivers.base import Driver
     from rig.bench.latch import Holder
     from rig.model.parts import Wire
 
@@ -36,11 +37,7 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
 
     described, driver = device_of(rig, endpoint)
     try:
-        driver.zero_outputs()  # before anything else
-        elsewhere = _holder(described.wire) is None
-        for _ in range(ZEROS - 1 if elsewhere else 0):
-            time.sleep(BETWEEN_ZEROS)
-            driver.zero_outputs()
+        _zero(driver, described.wire)
     except DeviceError as error:
         watchdog = described.wire.watchdog
         raise type(error)(
@@ -55,6 +52,28 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
         print_pressure(bench.pressurised(bench.probe(device_of(rig, endpoint)[1], described)))
     except DeviceError as error:
         progress(f"pressures not read: {error}")
+
+
+def _zero(driver: Driver, wire: Wire) -> None:
+    """Zero the outputs, several times where a run of another computer may still set them.
+
+    A process of this computer that drives the bench may take the device's answers from the line: if
+    they are missing it is ended, which zeroes the outputs too. Raises DeviceError without an answer
+    after that.
+    """
+    from drivers.base import DeviceError
+
+    try:
+        driver.zero_outputs()  # before anything else
+    except DeviceError:
+        if _holder(wire) is None:
+            raise
+        _end_run(wire)
+        driver.zero_outputs()
+    elsewhere = _holder(wire) is None
+    for _ in range(ZEROS - 1 if elsewhere else 0):
+        time.sleep(BETWEEN_ZEROS)
+        driver.zero_outputs()
 
 
 def _end_run(wire: Wire) -> None:
