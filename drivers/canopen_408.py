@@ -21,7 +21,15 @@ from urllib.parse import SplitResult, parse_qs
 import numpy as np
 from pydantic import Field, field_validator
 
-from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost, OutputLaw, WireSettings
+from drivers.base import (
+    Array,
+    DeviceBusy,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    OutputLaw,
+    WireSettings,
+)
 from drivers.can_port import BusPlace, CanPort
 from drivers.polled import PolledDriver
 from drivers.settings import DRIVER
@@ -38,6 +46,7 @@ logger = logging.getLogger(__name__)
 
 PACKAGE: Final = "canopen"
 _COMMON: Final = frozenset({ch.SUPPLY, ch.TEMPERATURE})
+_PRE_OPERATIONAL: Final = 0x80  # NMT command
 
 
 class ValveBusSettings(WireSettings):
@@ -91,11 +100,13 @@ class CanOpenValves:
         self._nodes: list[Any] = []
         self._places = self._find_sensors()
         wanted = {0x580 + n for n in self._numbers} | self._tpdo_ids
-        wanted |= {cia408.HEARTBEAT_ID + n for n in self._numbers}
+        wanted |= {cia408.HEARTBEAT_ID + n for n in (*self._numbers, at.host)}
         self._port = CanPort(
             BusPlace.of(at.bus), at.bitrate, None, frozenset(wanted), deliver=self._deliver
         )
         self._beat = 0.0
+        self._driven = False  # by this host: it has set the valves' supervision
+        self._other_host = False  # whether another host's heartbeat was heard
         self._states: list[int] = [ValveState.INIT] * len(rig.joints)
 
     @property
@@ -104,10 +115,15 @@ class CanOpenValves:
         return self._wire.watchdog
 
     def open(self) -> str:
-        """Open the bus, configure the nodes, bring them to HOLD; a fault in one stays."""
+        """Open the bus, configure the nodes, bring them to HOLD; a fault in one stays.
+
+        Raises DeviceBusy where another host drives them.
+        """
         self.close()
         self._port.open()
         self._make_network()
+        self._refuse_other_host()
+        self._driven = True
         milliseconds = round(1e3 * self._wire.watchdog)
         for node in self._nodes:
             self._settle(node, milliseconds)
@@ -159,12 +175,32 @@ class CanOpenValves:
             self._canopen.SdoCommunicationError,
             self._canopen.SdoAbortedError,
         )
-        if self._port.is_open and self._nodes:
+        if self._port.is_open and self._driven:
             with suppress(*errors):
                 self._send(np.zeros(len(self._nodes)), Control.DISABLED)
                 for node in self._nodes:
                     node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
+        self._driven = False
         self._port.close()
+
+    def zero_beside_host(self) -> None:
+        """Take the valves from a host that drives them: out of operation, and disabled.
+
+        That host then misses their samples and ends. Raises DeviceLost if a valve does not answer.
+        """
+        self._port.open(shared=True)
+        self._make_network()
+        try:
+            for node in self._nodes:
+                self._network.send_message(0, bytes([_PRE_OPERATIONAL, node.id]))
+            for node in self._nodes:
+                node.sdo[cia408.CONTROL_WORD].raw = int(Control.DISABLED)
+                # Out of operation it obeys nobody; the end of the other host is no fault.
+                node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
+        except (self._canopen.SdoAbortedError, self._canopen.SdoCommunicationError) as error:
+            raise DeviceLost(f"a valve at {self._at.bus} has not confirmed: {error}") from error
+        finally:
+            self._port.close()
 
     def fault(self) -> str | None:
         """Return which valves are in a fault, None if there are none."""
@@ -249,6 +285,27 @@ class CanOpenValves:
             node.sdo.RESPONSE_TIMEOUT = self._wire.timeout
             node.tpdo.subscribe()
 
+    def _refuse_other_host(self) -> None:
+        """Raise DeviceBusy where a host is heard whose heartbeat the valves already watch.
+
+        Two hosts of one number would take turns with the set points, and the end of one would
+        switch the supervision of the other off.
+        """
+        self._other_host = False
+        try:
+            watched = [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in self._nodes]
+        except (self._canopen.SdoAbortedError, self._canopen.SdoCommunicationError):
+            return  # `_settle` says what is wrong
+        end = time.monotonic() + self._wire.watchdog
+        while any(watched) and time.monotonic() < end:
+            if self._other_host:
+                self._port.close()
+                raise DeviceBusy(
+                    f"another host with the number {self._at.host} drives the valves at "
+                    f"{self._at.bus}: its heartbeat is heard; end its run, or stop it"
+                )
+            time.sleep(DRIVER.can_full)
+
     def _settle(self, node: Any, milliseconds: int) -> None:
         """Check a node's identity and configure its reaction to a lost host."""
         try:
@@ -270,6 +327,9 @@ class CanOpenValves:
             ) from error
 
     def _deliver(self, key: int, data: bytes) -> None:
+        if key == cia408.HEARTBEAT_ID + self._at.host:
+            self._other_host = True
+            return
         network = self._network
         if network is None:
             return

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
-from typing import ClassVar, Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from drivers.base import (
     OFF,
     Array,
+    DeviceBusy,
     DeviceError,
     DeviceInfo,
     DeviceLost,
@@ -68,6 +69,17 @@ class InputsOutputs(Protocol):
 
     def close(self) -> None:
         """Close the device; closing twice does nothing."""
+
+
+@runtime_checkable
+class ZeroesBesideHost(Protocol):
+    """A device whose outputs a host can put to zero while another host drives them."""
+
+    def zero_beside_host(self) -> None:
+        """Put every output to zero and end the other host's control; closes the device.
+
+        Raises DeviceLost if the device does not confirm it.
+        """
 
 
 @dataclass(frozen=True)
@@ -208,7 +220,13 @@ class PolledDriver:
                 return
         self._streaming = False
         self._drop()
-        self._safely(self._device.open)
+        try:
+            self._safely(self._device.open)
+        except DeviceBusy:
+            if not isinstance(self._device, ZeroesBesideHost):
+                raise
+            self._safely(self._device.zero_beside_host)
+            return
         self._open, self._loss = True, None
         try:
             self._put(self._volts)

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import DeviceError, DeviceLost, OutputLaw
+from drivers.base import DeviceBusy, DeviceError, DeviceLost, OutputLaw
 from drivers.canopen_408 import CanOpen408Driver
 from drivers.registry import wire_at
 from rig.model.parse import InputError
@@ -65,6 +66,54 @@ def test_valves_follow_their_set_points_and_return_to_zero(at: str) -> None:
     assert np.all(data[:, 10:] == 0.0)
     assert driver._valves._states == [ValveState.HOLD] * 2
     driver.close()
+
+
+def watched(endpoint: str) -> list[int]:
+    """The heartbeats that the valves watch, read as by a tool beside the host."""
+    reader = host(endpoint)._valves
+    reader._port.open()
+    reader._make_network()
+    try:
+        return [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in reader._nodes]
+    finally:
+        reader._port.close()
+
+
+def test_valves_that_another_host_drives_are_refused_but_for_a_stop(at: str) -> None:
+    """A second host would take away the watch on the first, whose valves then stay open."""
+    first, second = host(at), host(at)
+    first.connect()
+    first.start()
+    first.apply(DRIVING)
+    ended: list[DeviceError] = []
+
+    def run() -> None:
+        try:
+            while True:
+                first.read_block()
+        except DeviceError as error:
+            ended.append(error)
+
+    at_work = threading.Thread(target=run)
+    at_work.start()
+    watch = watched(at)
+    assert all(watch)
+    with pytest.raises(DeviceBusy, match="another host with the number 127 drives the valves"):
+        second.connect()
+    second.close()
+    assert watched(at) == watch
+    assert not ended
+    assert first._valves._states == [ValveState.ACTIVE] * 2
+    second.zero_outputs()
+    at_work.join(PATIENCE)
+    assert [type(error) for error in ended] == [DeviceLost]
+    first.close()
+    third = host(at)
+    third.connect()  # nobody is heard any more
+    third.start()
+    assert np.all(third.read_block().data[:, 10:] == 0.0)
+    assert third.trip_cause() is None
+    third.close()
 
 
 def test_a_host_that_says_goodbye_leaves_no_fault(at: str) -> None:
