@@ -300,14 +300,19 @@ class PolledDriver:
                 raise DeviceLost(self._loss)
             raise DeviceError(f"the device of wire {self._wire.kind} is not started; start it")
         patience = self._wire.timeout + self._block_samples / self._rig.sample_rate
-        deadline = self._clock() + self._silence_allowed + patience
+        patience += self._silence_allowed
+        deadline, cause = self._clock() + patience, self._cause
         try:
             while (block := self._block(full=self._clock() <= deadline)) is None:
                 if self._clock() > deadline:
-                    raise DeviceError(
-                        f"no two samples of wire {self._wire.kind} came within {LONGEST:g} periods "
-                        f"of {self._rig.sample_rate:g} Hz; lower the rig's sample_rate"
-                    )
+                    self._trip_on_silence()
+                    if self._cause == cause:
+                        raise DeviceError(
+                            f"no two samples of wire {self._wire.kind} came within {LONGEST:g} "
+                            f"periods of {self._rig.sample_rate:g} Hz; lower the rig's sample_rate"
+                        )
+                    # This host stood still, not the device: a block has to bring the trip.
+                    deadline, cause = self._clock() + patience, self._cause
                 self._serve()
         except BaseException:
             self._make_safe()

@@ -257,11 +257,14 @@ def test_a_host_silent_for_longer_than_the_watchdog_finds_its_outputs_zeroed() -
     assert not driver.read_block().tripped
 
 
-def test_a_reading_that_takes_longer_than_the_watchdog_trips_before_anything_is_put_out() -> None:
+@pytest.mark.parametrize("seconds", [0.7, 5.0037])
+def test_a_reading_that_takes_longer_than_the_watchdog_trips_before_anything_is_put_out(
+    seconds: float,
+) -> None:
     driver, module, clock = started()
     driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
     driver.read_block()
-    slow = iter([0.7])
+    slow = iter([seconds])
     module.before_read = lambda: clock.pass_(next(slow, 0.0))
     before = len(module.written)
     assert driver.read_block().tripped
