@@ -29,6 +29,7 @@ from drivers.register_types import (
     WordOrder,
     decode_registers,
     encode_registers,
+    integers,
     word_count,
 )
 from drivers.settings import DRIVER
@@ -37,6 +38,7 @@ from drivers.wire_entries import (
     offset_of,
     outputs_by_joint,
     read_entry,
+    refuse_short_reach,
     scale_of,
 )
 from rig.model import channels as ch
@@ -166,6 +168,11 @@ def register_map(settings: MapSettings, rig: Rig) -> RegisterMap:
     )
     _refuse_overlap("inputs", inputs)
     _refuse_overlap("outputs", outputs)
+    for point in inputs:
+        if (numbers := integers(point.form)) is not None:
+            least, most = (point.offset + point.scale * number for number in numbers)
+            step = abs(point.scale)
+            refuse_short_reach(rig, point.name, (least, most), rig.range_of(point.name), step)
     for point, joint in zip(outputs, rig.joints, strict=True):
         _refuse_narrow(point, joint.valve.command_range)
     if settings.zero_by == _NO_WATCHDOG:
@@ -214,8 +221,8 @@ def _refuse_narrow(point: Point, reach: float) -> None:
             point.registers(volts)
         except ValueError as error:
             raise InputError(
-                f"wire: outputs.{point.name}.scale: for {volts:g} V of the valve's command_range "
-                f"the register must hold {error}"
+                f"wire: outputs.{point.name}.scale: the register cannot hold {volts:g} V of the "
+                f"valve's command_range: {error}"
             ) from error
 
 

@@ -29,6 +29,7 @@ from drivers.wire_entries import (
     offset_of,
     outputs_by_joint,
     read_entry,
+    refuse_short_reach,
     scale_of,
 )
 from rig.model.parse import InputError, read_quantity
@@ -119,6 +120,11 @@ def wiring(settings: CardSettings, rig: Rig) -> Wiring:
         for k, e, unit in wired
     ]
     scales, offsets = np.array(values).T
+    for name, (scale, offset), volts in zip(rig.channels, values, ranges, strict=True):
+        ends = (offset - scale * volts, offset + scale * volts)
+        (low, high), limits = rig.range_of(name), rig.limits_of(name)
+        needed = max(low, limits[0]), min(high, limits[1])
+        refuse_short_reach(rig, name, ends, needed, step=0.0)
     return Wiring(
         tuple(entry.channel for entry in entries),
         tuple(ranges),

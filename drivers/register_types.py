@@ -42,6 +42,15 @@ _FORMS: Final = {
 }
 
 
+def integers(form: RegisterType) -> tuple[int, int] | None:
+    """Return the least and the largest number of a type of integers, None for other types."""
+    if form in (RegisterType.FLOAT32, RegisterType.FLOAT64):
+        return None
+    bits = 8 * struct.calcsize(_FORMS[form])
+    signed = _FORMS[form][1].islower()
+    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+
+
 def word_count(form: RegisterType) -> int:
     """Return the number of registers of a number."""
     return struct.calcsize(_FORMS[form]) // 2
@@ -62,9 +71,8 @@ def encode_registers(value: float, form: RegisterType, order: WordOrder) -> list
     """
     if not math.isfinite(value):
         raise ValueError(f"{value} is no number for a register")
-    floating = form in (RegisterType.FLOAT32, RegisterType.FLOAT64)
     try:
-        data = struct.pack(_FORMS[form], value if floating else round(value))
+        data = struct.pack(_FORMS[form], value if integers(form) is None else round(value))
     except (struct.error, OverflowError) as error:
         raise ValueError(f"{value:.6g} is outside the range of {form}") from error
     if order is WordOrder.LITTLE:

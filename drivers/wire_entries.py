@@ -77,3 +77,24 @@ def scale_of(text: Any, unit: str, key: str, per: str = "") -> float:
 def offset_of(text: Any, unit: str, key: str) -> float:
     """Read the value [SI] at a reading of zero, 0 where none is given; raises InputError."""
     return 0.0 if text is None else read_quantity(text, unit, f"wire: {key}")
+
+
+def refuse_short_reach(
+    rig: Rig, name: str, ends: tuple[float, float], needed: tuple[float, float], step: float
+) -> None:
+    """Raise InputError where the numbers of an input end before what a channel needs.
+
+    `ends` [SI] are the values at both ends of the register or converter, `needed` [SI] the range of
+    the sensor or its limits, `step` [SI] one code. A limit beyond an end could never trip, and a
+    controller would push on. The lower end of a pressure or temperature may be anywhere: numbers
+    without a sign are common there.
+    """
+    least, most = min(ends), max(ends)
+    unit = rig.unit_of(name)
+    below = unit not in ("Pa", "degC") and least > needed[0] + step
+    if below or most < needed[1] - step:
+        raise InputError(
+            f"wire: inputs.{name}: its numbers end at {least:.6g} and {most:.6g} {unit}, expected "
+            f"them to reach {needed[0]:.6g} and {needed[1]:.6g} {unit}: a limit beyond them could "
+            "never trip; a wider type or input range, a larger scale, or the sensor's true range?"
+        )

@@ -406,8 +406,19 @@ def test_a_module_without_a_watchdog_is_refused_unless_accepted(
         (("address: 4, ", "address: 70000, "), r"inputs.rod_pressure_1.address: .*found 70000"),
         (("2: {address: 101", "3: {address: 101"), r"outputs.3: unknown; the joints are: 1 2"),
         (("address: 101", "address: 100"), r"outputs.2.address: register 100 belongs to"),
-        (("scale: 0.005 V", "scale: 0.1 mV"), r"outputs.1.scale: for -10 V of .* range of int16"),
-        (("type: int16, scale: 5 mV", "type: uint16, scale: 5 mV"), r"outputs.2.scale: for -10 V"),
+        (
+            ("int16, scale: 0.01 mm", "int16, scale: 0.5 um"),
+            r"inputs.piston_1: its numbers end at -0.016384 and 0.0163835 m, expected them to",
+        ),
+        (("uint16, scale: 1 kPa", "uint16, scale: 0.1 kPa"), r"inputs.rod_pressure_2: its numbers"),
+        (
+            ("scale: 0.005 V", "scale: 0.1 mV"),
+            r"outputs.1.scale: .* hold -10 V of .* range of int16",
+        ),
+        (
+            ("type: int16, scale: 5 mV", "type: uint16, scale: 5 mV"),
+            r"outputs.2.scale: the register cannot hold -10 V",
+        ),
         (("register: 200", "register: 101"), r"zero_by.watchdog_register: 101 is a register of o"),
         (("milliseconds: 1500", "milliseconds: 0"), r"zero_by.milliseconds: .*found 0"),
         (("milliseconds: 1500", "milliseconds: 2500"), r"zeroes its outputs after 2.5 s, wire.wat"),

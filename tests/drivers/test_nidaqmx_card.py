@@ -224,6 +224,7 @@ def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatc
             r"inputs.piston_1.channel: Dev1/ai0 is that of inputs.spool_1",
         ),
         (("range: 5 V", "range: 0 V"), r"inputs.spool_1.range: 0 V, expected one above"),
+        (("scale: 8 mm/V}", "scale: 8 mm/V, range: 2 V}"), r"inputs.piston_1: its numbers end at "),
         (("range: 5 V", "range: 5"), r"inputs.spool_1.range: .*has no unit"),
         (("2: {channel: Dev1/ao1}", "2: {channel: Dev1/ao0}"), r"outputs.2.channel: Dev1/ao0 is"),
         (("device: Dev1, ", ""), r"zero_by.device: is missing"),
