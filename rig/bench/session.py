@@ -59,6 +59,7 @@ from rig.runs.recorder import Recorder, RecordMeta
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 _CONTROLS = {TAKE: "taken", RELEASE: "released"}
+_OF_EVENTS = frozenset({"tick", "seconds"})  # of a violation: every event has them itself
 
 
 class Bench:
@@ -117,8 +118,8 @@ class Bench:
         try:
             self.state.refuse_if_tripped(self.rig)
             self.state.prepare()
-            self.info = self._connect()
             self.state.occupy()
+            self.info = self._connect()
             self.state.take(None if self.recorder is None else self.recorder.folder)
             cause = self._outputs.safely(self._driver.trip_cause)
             if cause is not None:
@@ -292,6 +293,7 @@ class Bench:
             violation = self._inspect(block, lost, late)
             if violation is not None:
                 self.zero_outputs()
+                violation = self._timed(violation)
                 trip = self._latch(violation)
             self._keep(block, late, lost)
             self._timing.add(block)
@@ -310,7 +312,8 @@ class Bench:
     def _note_alarms(self, trip: Violation | None) -> None:
         """Write warnings and the trip to the events of the run, and publish them."""
         try:
-            self._alarms.update(self._guard.warnings, self.tick)
+            warnings = {key: self._timed(v) for key, v in self._guard.warnings.items()}
+            self._alarms.update(warnings, self.tick)
             if trip is not None:
                 self._alarms.trip(trip)
         except RecordingFailed:
@@ -342,6 +345,12 @@ class Bench:
             violation = self._guard.device_tripped(block.tick)
         return violation
 
+    def _timed(self, violation: Violation) -> Violation:
+        """Return a violation with its time since the run began, where a run is recorded."""
+        if self.recorder is None:
+            return violation
+        return replace(violation, seconds=self.recorder.time_of(violation.tick))
+
     def _keep(self, block: SampleBlock, late: float | None, lost: int) -> None:
         if self.recorder is None:
             return
@@ -362,7 +371,7 @@ class Bench:
 
     def _report(self, trip: SafetyTrip) -> None:
         log.info("%s", trip)
-        about = {k: v for k, v in asdict(trip.violation).items() if k != "tick"}
+        about = {k: v for k, v in asdict(trip.violation).items() if k not in _OF_EVENTS}
         with suppress(RecordingFailed):  # the trip is the error to report
             self.event("trip", trip.tick, message=str(trip), **about)
 

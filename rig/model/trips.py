@@ -30,7 +30,10 @@ _LARGEST = 1e300  # an end beyond this counts as open
 
 @dataclass(frozen=True)
 class Violation:
-    """A limit and the sample that exceeded it, in SI; `joint` is 1-based, None for the bench."""
+    """A limit and the sample that exceeded it, in SI; `joint` is 1-based, None for the bench.
+
+    `seconds` is the sample's time since the run began, None where nothing is recorded.
+    """
 
     limit: str
     value: float
@@ -39,6 +42,7 @@ class Violation:
     joint: int | None
     channel: str
     tick: int
+    seconds: float | None = None
 
 
 def show(value: float, unit: str) -> str:
@@ -77,10 +81,11 @@ def describe(violation: Violation, rig: Rig) -> str:
     if violation.joint is not None:
         where = f"joint {violation.joint} ({rig.joints[violation.joint - 1].name})"
     subject = f"{violation.channel} of {where}" if violation.channel else where
-    return (
-        f"{subject}: {_value(violation)} at {violation.tick / rig.sample_rate:.4f} s, "
-        f"allowed {_allowed(violation)}"
-    )
+    if violation.seconds is None:
+        time = f"{violation.tick / rig.sample_rate:.4f} s of the device's clock"
+    else:
+        time = f"{violation.seconds:.4f} s"
+    return f"{subject}: {_value(violation)} at {time}, allowed {_allowed(violation)}"
 
 
 class SafetyTrip(Exception):

@@ -181,13 +181,16 @@ class Recorder:
         self.event(STREAM, block.tick, stream=self._stream)
         self._newest = began + length
 
+    def time_of(self, tick: int) -> float | None:
+        """Return the time [s] since the run began of a device tick; None before a first block."""
+        return None if self._clock is None else self._clock.at(tick, self.rig.sample_rate)
+
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
         """Write one event; it is on disk when this returns."""
         if self._events is None:
             raise RecordingFailed(f"{self.folder}: the run is not open for recording")
-        at = self._newest
-        if tick is not None and self._clock is not None:
-            at = self._clock.at(tick, self.rig.sample_rate)
+        timed = None if tick is None else self.time_of(tick)
+        at = self._newest if timed is None else timed
         self._events.append(event, tick, {"t": round(at, 6), **fields})
 
     def begin_record(self, meta: RecordMeta, start: int) -> int:

@@ -93,6 +93,25 @@ def test_a_warning_is_written_down_and_the_run_goes_on(tmp_path: Path) -> None:
     assert read_events(run)[-1]["state"] == "done"
 
 
+def test_an_alarm_and_a_trip_have_the_times_of_the_run_not_of_the_device(tmp_path: Path) -> None:
+    run, up_since = tmp_path / "run", 7_000  # samples that the device took before the run
+    warned = high_between((300, 5000))
+
+    def spoil(block: SampleBlock) -> SampleBlock:
+        late = warned(block)
+        if 900 <= block.tick < 1000:
+            late.data[:, PRESSURE] = 9.5e6
+        return replace(late, tick=late.tick + up_since)
+
+    with pytest.raises(SafetyTrip, match=r"cap_pressure_1 of joint 1 \(boom\): 9.5 MPa at 0\.9"):
+        take(run, spoil, 3.0)
+    told = [e for e in read_events(run) if e["event"] in ("alarm", "trip")]
+    assert min(e["tick"] for e in told) > up_since
+    for event in told:
+        words = event["sentence" if event["event"] == "alarm" else "message"]
+        assert f" at {event['t']:.4f} s, " in words
+
+
 def test_a_value_that_chatters_about_its_limit_is_one_alarm(tmp_path: Path) -> None:
     run = tmp_path / "run"
     spans = [(k, k + 60) for k in range(300, 2300, 100)]

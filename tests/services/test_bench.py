@@ -34,6 +34,9 @@ class Told:
         self.driver = driver
         self.is_open = True
 
+    def time_of(self, tick: int) -> float:
+        return tick / RIG.sample_rate
+
     def __getattr__(self, name: str):
         def told(*_: object, **__: object) -> int:
             self.driver.calls.append(f"recorder.{name}")

@@ -306,16 +306,18 @@ def test_old_data_is_stale_after_the_rigs_watchdog_time() -> None:
 @pytest.mark.parametrize("limit", ["pressure", "lock", "finite samples"])
 def test_the_trips_message_names_limit_value_allowed_joint_channel_and_time(limit: str) -> None:
     violation = {
-        "pressure": Violation(limit, 9.31e6, (-2e5, 9e6), "Pa", 1, "cap_pressure_1", 12345),
+        "pressure": Violation(limit, 9.31e6, (-2e5, 9e6), "Pa", 1, "cap_pressure_1", 12345, 2.5),
         "lock": Violation(limit, 0.0042, (0.0, 0.002), "m", 2, "piston_2", 500),
         "finite samples": Violation(limit, np.nan, (0, 1), "V", 1, "spool_1", 1),
     }[limit]
     said = str(SafetyTrip(violation, RIG))
     wanted = {
-        "pressure": "limit 'pressure', cap_pressure_1 of joint 1 (boom): 9.31 MPa at 12.3450 s, "
+        "pressure": "limit 'pressure', cap_pressure_1 of joint 1 (boom): 9.31 MPa at 2.5000 s, "
         "allowed -0.2 to 9 MPa",
-        "lock": "limit 'lock', piston_2 of joint 2 (arm): 4.2 mm at 0.5000 s, allowed 0 to 2 mm",
-        "finite samples": "spool_1 of joint 1 (boom): nan V at 0.0010 s, allowed finite numbers",
+        "lock": "limit 'lock', piston_2 of joint 2 (arm): 4.2 mm at 0.5000 s of the "
+        "device's clock, allowed 0 to 2 mm",
+        "finite samples": "spool_1 of joint 1 (boom): nan V at 0.0010 s of the device's clock, "
+        "allowed finite numbers",
     }[limit]
     assert wanted in said
     assert "\n" not in said
