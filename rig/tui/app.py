@@ -21,6 +21,7 @@ from textual.message import Message
 from rig.bench.screens.commands import own_command
 from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import AlarmTable
+from rig.model.parts import Wire
 from rig.tui.acting.manual import ByHand
 from rig.tui.browse import BrowserState
 from rig.tui.canvas import Canvas
@@ -447,7 +448,10 @@ def farewell(frame: Frame) -> str:
     )
 
 
-def main(rig: str | None, browsed: BrowserState | None = None) -> int:
-    """Show the screen until the operator leaves it; return the exit code (0, or 130 on Ctrl-C)."""
-    code = Monitor(rig, browsed=browsed).run()
+def main(rig: str | None, browsed: BrowserState | None = None, wire: Wire | None = None) -> int:
+    """Show the screen until the operator leaves it; return the exit code (0, or 130 on Ctrl-C).
+
+    Of several runs of a rig it shows that at `wire`.
+    """
+    code = Monitor(rig, LocalSessions(rig, wire), browsed=browsed).run()
     return 0 if code is None else code

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from rig.model.parts import Wire
 from rig.tui.following.event_lines import EventLine
 from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions
 from rig.tui.units import age_text, clock_text, shown
@@ -50,7 +51,7 @@ def _without(frame: Frame) -> str:
         return f"cannot reach runs: {frame.trouble}"
     if frame.stage is LinkStage.CHOOSING:
         names = ", ".join(f"{e.rig} (process {e.pid})" for e in frame.sessions)
-        return f"several runs, name one with --rig: {names}"
+        return f"several runs, name one with --rig, or its bench with --endpoint: {names}"
     return "waiting for a run" if frame.endpoint is None else "attached, nothing received yet"
 
 
@@ -82,9 +83,12 @@ class Reader:
         self._last = line
 
 
-def print_status(rig: str | None, say: Callable[[str], None]) -> None:
-    """Print a run's status and events until interrupted; the run is not commanded."""
-    link = Link(LocalSessions(rig), time.monotonic)
+def print_status(rig: str | None, say: Callable[[str], None], wire: Wire | None = None) -> None:
+    """Print a run's status and events until interrupted; the run is not commanded.
+
+    Of several runs of a rig it is that at `wire`.
+    """
+    link = Link(LocalSessions(rig, wire), time.monotonic)
     reader = Reader(say)
     link.start()
     try:

@@ -14,7 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from rig.tui.following.link import Link
+from drivers.registry import wire_at
+from rig.bench.latch import BenchState
+from rig.bench.screens.sockets import Publisher
+from rig.runs.rigs import load_rig
+from rig.tui.following.link import Link, LocalSessions
 from rig.tui.plain import Reader
 from tests.tui.glass import Clock, Machine, Recorded, endpoint
 from tests.tui.recorded import Bench, followed, past, run, snapshot, tripped
@@ -97,7 +101,27 @@ def test_without_a_run_it_says_so_once() -> None:
 def test_several_runs_are_named() -> None:
     machine = Machine({HERE: Recorded(), endpoint("press", 9): Recorded()})
     said = " ".join(Listener(machine).listen(1.0))
-    assert "several runs, name one with --rig: shinshu-2dof (process 4711), press" in said
+    assert "name one with --rig, or its bench with --endpoint: shinshu-2dof (process 4711)" in said
+
+
+def test_of_several_benches_of_a_rig_that_at_the_endpoint_is_watched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = load_rig("shinshu-2dof")
+    here, other = (wire_at(f"modbus-tcp://127.0.0.1:{port}", rig.wire) for port in (5001, 5002))
+    with tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as short:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", short)
+        publisher = Publisher(rig.name)
+        state = BenchState(here)
+        state.prepare()
+        state.take(None)
+        try:
+            assert [s.pid for s in LocalSessions(rig.name).find()] == [os.getpid()]
+            assert [s.pid for s in LocalSessions(rig.name, here).find()] == [os.getpid()]
+            assert LocalSessions(rig.name, other).find() == []
+        finally:
+            state.release()
+            publisher.close()
 
 
 @pytest.fixture

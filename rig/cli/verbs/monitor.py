@@ -55,10 +55,15 @@ def monitor(
     # Sessions are listed by the rig's name, not by the name of its file.
     is_file = rig is not None and rig not in shipped_rigs() and Path(rig).is_file()
     name = load_rig(rig).name if rig is not None and is_file else rig
+    wire = None
+    if rig is not None and endpoint is not None:
+        from drivers.registry import wire_at
+
+        wire = wire_at(endpoint, load_rig(rig).wire)
     if plain:
         from rig.tui.plain import print_status
 
-        print_status(name, typer.echo)
+        print_status(name, typer.echo, wire)
         return
     if web:
         raise typer.Exit(_serve(rig, runs, endpoint, port or 0))
@@ -72,7 +77,7 @@ def monitor(
     from rig.tui.app import main
     from rig.tui.browse import BrowserState
 
-    raise typer.Exit(main(name, BrowserState(folder=runs, rig=rig or "", endpoint=endpoint)))
+    raise typer.Exit(main(name, BrowserState(folder=runs, rig=rig or "", endpoint=endpoint), wire))
 
 
 def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:

@@ -15,9 +15,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Final, Protocol
 
+from rig.bench.latch import BenchState
 from rig.bench.screens.commands import Command, own_command
 from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
+from rig.model.parts import Wire
 from rig.runs.runstate import read_events
 from rig.tui.following.event_lines import EventLine, from_events, new_lines, with_earlier
 from rig.tui.following.history import EMPTY, History, HistoryWindow
@@ -70,14 +72,21 @@ class Sessions(Protocol):
 
 
 class LocalSessions:
-    """The sessions of this machine's user, over the local sockets."""
+    """The sessions of this machine's user, over the local sockets.
 
-    def __init__(self, rig: str | None) -> None:
-        self._rig = rig
+    `wire` is the bench whose session is wanted, None for every bench of the rig.
+    """
+
+    def __init__(self, rig: str | None, wire: Wire | None = None) -> None:
+        self._rig, self._wire = rig, wire
 
     def find(self) -> Sequence[Endpoint]:
-        """Return the live sessions of the rig (of every rig when it is None)."""
-        return Attachment.find(self._rig)
+        """Return the live sessions of the rig (of every rig when it is None) and the bench."""
+        sessions = Attachment.find(self._rig)
+        if self._wire is None:
+            return sessions
+        holder = BenchState(self._wire).holder()
+        return [s for s in sessions if holder is not None and s.pid == holder.pid]
 
     def open(self, endpoint: Endpoint) -> SnapshotSource:
         """Connect to one of them."""
