@@ -440,10 +440,12 @@ def farewell(frame: Frame) -> str:
     """Return the line left in the terminal when the screen closes."""
     if frame.endpoint is None or frame.snapshot is None:
         return "bramah: screen closed; no run was attached"
+    snapshot = frame.snapshot
+    what = f"run {snapshot.run}" if snapshot.run else f"the {snapshot.kind} session"
     if frame.over:
-        return f"bramah: screen closed; run {frame.snapshot.run} had ended ({frame.snapshot.state})"
+        return f"bramah: screen closed; {what} had ended ({snapshot.state})"
     return (
-        f"bramah: screen closed; run {frame.snapshot.run} GOES ON "
+        f"bramah: screen closed; {what} GOES ON "
         f"(watch it again: bramah monitor --rig {frame.endpoint.rig})"
     )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from rig.model.units import READINGS, display_unit
+from rig.model.units import AXES, display_unit
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ _LEAST: Final = {"Pa": 0.2e6, "m": 2e-3, "V": 0.02, "degC": 2.0}
 
 def shown(unit: str) -> Format:
     """Return the display of an SI unit; an unlisted one keeps its own name."""
-    known = display_unit(unit, READINGS)
+    known = display_unit(unit, AXES)
     return Format(known.text, known.scale, known.decimals, _LEAST.get(unit, 0.0))
 
 

@@ -256,6 +256,15 @@ async def test_a_joint_is_jogged_while_a_key_is_held_and_locked() -> None:
         assert record.commands == ["stop"]
 
 
+async def test_the_state_of_a_manual_session_is_readable_on_a_small_terminal() -> None:
+    record = by_hand(message="every valve is closed, and joint 1 is held where it stands")
+    async with glass(Machine({HERE: record}), size=(60, 16)) as shown:
+        await shown.press("9")
+        assert "every valve is closed" in shown.text
+        assert "held where it stands" in " ".join(shown.text.split())
+        assert "let go" in shown.text
+
+
 async def test_by_hand_is_refused_while_a_protocol_runs() -> None:
     record = running()
     async with glass(Machine({HERE: record})) as shown:

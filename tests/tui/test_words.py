@@ -200,6 +200,8 @@ def test_the_last_words_on_the_terminal() -> None:
     assert "no run was attached" in farewell(Frame())
     assert "GOES ON" in farewell(LIVE)
     assert "had ended (aborted)" in farewell(replace(LIVE, snapshot=stopped(VIEW)))
+    by_hand = replace(LIVE, snapshot=replace(VIEW, run="", kind="manual"))
+    assert "closed; the manual session GOES ON" in farewell(by_hand)
 
 
 def test_numbers_wear_the_operators_units() -> None:

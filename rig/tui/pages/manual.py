@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rig.tui.drawing.rows import Row, block, fit, hstack, row, wrapped
+from rig.tui.drawing.rows import Row, block, hstack, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import bench_bars, joint_box, joints_in
@@ -27,15 +27,15 @@ def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
         return block(wrapped(text, width, WARN_TEXT), width, height)
     joints = list(joints_in(snapshot.channels))
     joint = joints[min(max(view.look.joint, 1), len(joints)) - 1] if joints else 1
-    held = "" if view.in_command else "   t takes the controls first"
+    keys = f"hold ↑ to extend joint {joint}, ↓ to retract: it stops when you let go"
     head = [
-        fit(row((f" joint {joint} ", ASK), ("  hold ↑ to extend, ↓ to retract: it stops when you "
-                "let go", STRONG), (held, WARN_TEXT)), width),
-        fit(row((" ← → joint   l lock   u unlock   x end the session   ", ""),
-                (snapshot.message, DIM)), width),
-    ]  # fmt: skip
+        *wrapped(snapshot.message, width, STRONG),
+        *([] if view.in_command else wrapped("t takes the controls first", width, WARN_TEXT)),
+        *wrapped(keys, width, ASK),
+        *wrapped("← → joint   l lock   u unlock   x end the session", width, DIM),
+    ]
     bars = bench_bars(view, width)
-    room = height - len(head) - len(bars)
+    room = max(height - len(head) - len(bars), 0)
     others = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
     each = (width - len(others) + 1) // len(others)
     boxes = [(joint_box(view, number, each, room), each) for number in sorted(others)]
