@@ -22,7 +22,7 @@ from pydantic import Field
 from drivers.base import Array, DeviceError, DeviceLost, WireSettings
 from drivers.bench_protocol import DeviceRefused
 from drivers.modbus_frames import READ_HOLDING
-from drivers.modbus_transport import TcpConnection
+from drivers.modbus_transport import TcpConnection, registers_in_words
 from drivers.polled import PolledDriver
 from drivers.register_types import (
     RegisterType,
@@ -141,8 +141,11 @@ class Span:
     points: tuple[tuple[int, Point], ...]
 
     def __str__(self) -> str:
-        names = " ".join(point.name for _, point in self.points)
-        return f"registers {self.address} to {self.address + self.words - 1} ({names})"
+        names = " ".join(
+            f"output {point.name}" if point.name.isdigit() else point.name
+            for _, point in self.points
+        )
+        return f"{registers_in_words(self.address, self.words)} ({names})"
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ class ModbusConnection(ABC):
         if self._ask(request) != request[:5]:
             raise self._mismatch(
                 f"the device at {self.where} confirmed another write than that of "
-                f"{len(words)} registers from {address}"
+                f"{registers_in_words(address, len(words))}"
             )
 
     def write_and_read(self, write_at: int, words: list[int], read_at: int, count: int) -> bytes:
@@ -293,3 +293,8 @@ class TcpConnection(ModbusConnection):
             "something takes connections there, but has not answered on this one: check whether "
             "the device hangs, `port`, which another program may have, and the unit's number"
         )
+
+
+def registers_in_words(address: int, count: int) -> str:
+    """Return the numbers of `count` registers from `address` on in words."""
+    return f"register {address}" if count == 1 else f"registers {address} to {address + count - 1}"

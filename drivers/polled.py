@@ -41,6 +41,7 @@ from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.units import plain
 from rig.model.wire.resample import LONGEST, Resampler, Row
 
 logger = logging.getLogger(__name__)
@@ -436,7 +437,7 @@ class PolledDriver:
             raise DeviceError(
                 f"one reading and writing takes {fastest * 1e3:.3g} ms, but the rig's sample_rate "
                 f"of {self._rig.sample_rate:g} Hz leaves {period * 1e3:.3g} ms; lower it to "
-                f"{0.5 / fastest:.3g} Hz or less"
+                f"{plain(0.5 / fastest, 3)} Hz or less"
             )
 
     def _zero_laws(self) -> None:

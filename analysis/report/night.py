@@ -132,7 +132,7 @@ def _tiles(night: Night, counts: Mapping[str, int]) -> list[dict[str, Any]]:
     return [
         {"number": str(counts.get("done", 0)), "label": "items done", "warn": False,
          "detail": f"of {len(night.items)}"},
-        {"number": str(bad), "label": "items ended otherwise", "warn": bad > 0,
+        {"number": str(bad), "label": "ended otherwise", "warn": bad > 0,
          "detail": "the table says why"},
         {"number": str(counts.get("queued", 0)), "label": "items still queued", "warn": False,
          "detail": ""},

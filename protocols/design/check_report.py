@@ -37,8 +37,16 @@ class MotionPrediction:
 
     @property
     def margin(self) -> float:
-        """Distance of the prediction from the nearest limit, in `unit`; negative if exceeded."""
-        return min(self.low - self.allowed_low, self.allowed_high - self.high)
+        """Distance of the prediction from the nearest limit, in `unit`; negative if exceeded.
+
+        A flow that begins at zero has an upper limit only.
+        """
+        above = self.allowed_high - self.high
+        return (
+            above
+            if self.low == self.allowed_low == 0.0
+            else min(self.low - self.allowed_low, above)
+        )
 
     @property
     def ok(self) -> bool:

@@ -15,12 +15,14 @@ from pydantic import Field, ValidationError
 from rig.model.parts import Joint, Part
 from rig.model.quantity import Length, Ratio
 
+MOST: Final = 0.2  # of an area or a volume: more is a percentage without its sign
+
 
 class Tolerances(Part):
     """Standard uncertainties: areas and volumes relative to the number, lengths in metres."""
 
-    area: Ratio = Field(default=0.0, ge=0, lt=1, description="of cap_area and rod_area")
-    volume: Ratio = Field(default=0.0, ge=0, lt=1, description="of the pipe volumes")
+    area: Ratio = Field(default=0.0, ge=0, lt=MOST, description="of cap_area and rod_area")
+    volume: Ratio = Field(default=0.0, ge=0, lt=MOST, description="of the pipe volumes")
     pin: Length = Field(default=0.0, ge=0, description="of base_pin and arm_pin [m]")
     mid_length: Length = Field(default=0.0, ge=0, description="of mid_length [m]")
 

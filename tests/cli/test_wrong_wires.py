@@ -156,7 +156,7 @@ def test_a_wrong_word_order_is_suspected_by_probe(tmp_path: Path) -> None:
     ("change", "says"),
     [
         pytest.param(("unit: 7", "unit: 8"), ("unit 8", "check `unit`"), marks=pytest.mark.slow),
-        (("address: 18", "address: 19"), ("registers 19 to 19 (oil_temperature)", "manual")),
+        (("address: 18", "address: 19"), ("register 19 (oil_temperature)", "manual")),
         (("function: 4, address: 18", "function: 3, address: 18"), ("oil_temperature",)),
     ],
 )

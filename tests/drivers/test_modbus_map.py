@@ -120,7 +120,7 @@ def test_the_map_is_read_in_as_few_requests_as_possible() -> None:
     ]
     assert [(s.function, s.address, s.words) for s in spans(found.outputs)] == [(3, 100, 2)]
     assert [s.words for s in spans(found.inputs, 4)] == [4, 2, 3, 3, 3]
-    assert str(spans(found.outputs)[0]) == "registers 100 to 101 (1 2)"
+    assert str(spans(found.outputs)[0]) == "registers 100 to 101 (output 1 output 2)"
 
 
 def test_a_waveform_is_played_and_moves_the_piston(driver: ModbusMapDriver, port: int) -> None:
@@ -336,7 +336,7 @@ def test_a_write_that_was_not_confirmed_as_asked_is_an_error() -> None:
     server = Answers(lambda request: request[:-1] + b"\x09")
     link = UnitConnection("127.0.0.1", server.port, 0.5, unit=7)
     link.open()
-    with pytest.raises(DeviceError, match="another write than that of 1 registers from 100"):
+    with pytest.raises(DeviceError, match="another write than that of register 100"):
         link.write(100, [3])
     assert not link.is_open
     server.join()
@@ -345,9 +345,9 @@ def test_a_write_that_was_not_confirmed_as_asked_is_an_error() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("address: 18", "address: 19"), r"exception 2: registers 19 to 19 \(oil_temperature\)"),
+        (("address: 18", "address: 19"), r"exception 2: register 19 \(oil_temperature\)"),
         (("watchdog_register: 200", "watchdog_register: 250"), r"register 250 \(zero_by.watchd"),
-        (("1: {address: 100", "1: {address: 400"), r"registers 400 to 400 \(1\)"),
+        (("1: {address: 100", "1: {address: 400"), r"register 400 \(output 1\)"),
         (
             ("watchdog_register: 200", "watchdog_register: 210"),
             r"register 210 .* holds 0 after 1500 was wr",

@@ -228,7 +228,7 @@ def test_a_bench_without_tolerances_is_stored_as_ever() -> None:
         ("{pins: 0.2 mm}", "tolerances.pins: unknown key"),
         ("{pin: -0.2 mm}", "tolerances.pin: expected greater than or equal to 0, found -0.0002"),
         ("{area: -1 %}", "tolerances.area: expected greater than or equal to 0, found -0.01"),
-        ("{area: 120 %}", "tolerances.area: expected less than 1, found 1.2"),
+        ("{area: 120 %}", "tolerances.area: expected less than 0.2, found 1.2"),
         ("{pin: 0.2}", "tolerances.pin: 0.2 has no unit; write one beside the number"),
         ("{area: 3 mm^2}", "tolerances.area: unit 'mm^2' is of another dimension"),
         ("{mid_length: 5 cm}", "mid_length 50 mm: with mid_length of joint 2 larger by it"),

@@ -29,6 +29,8 @@ from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 
+_ROUNDING = 1e-12  # below it a relative figure is a rounding error
+
 CHECKED = 0.4  # share of the total time that the check of the limits takes
 
 
@@ -128,8 +130,9 @@ def as_dict(forecast: CheckedForecast) -> dict[str, Any]:
 
 
 def percent(value: float) -> str:
-    """Return a relative figure as a percentage with three digits, or a dash."""
-    return f"{100.0 * value:.3g}" if math.isfinite(value) else "—"
+    """Return a relative figure as a percentage with three digits, or a dash; rounding is zero."""
+    shown = 100.0 * value if abs(value) > _ROUNDING else 0.0
+    return f"{shown:.3g}" if math.isfinite(value) else "—"
 
 
 def prediction_text(forecast: CheckedForecast) -> str:
