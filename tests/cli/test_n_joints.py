@@ -21,13 +21,14 @@ from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from protocols.steps.plans import StepPlan
-from rig.cli.proof.step_planning import predictor
+from rig.cli.proof.step_planning import PlanRequest, plan_steps, predictor
 from rig.model.channels import kind_of
 from rig.model.parameters import parameter_names
+from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from rig.model.wire.codes import decode_input
-from rig.runs.rigs import load_rig
+from rig.runs.rigs import load_rig, rig_text
 from rig.runs.store import load_run
 from tests.cli.bench import bramah, simulated
 
@@ -196,3 +197,11 @@ def test_a_protocol_that_leaves_a_parameter_open_is_not_proved(tmp_path: Path) -
     assert found.returncode == 1
     assert "does not determine" in found.stderr.splitlines()[-1]
     assert "R12" in found.stderr.splitlines()[-1]
+
+
+def test_a_plan_names_the_nominal_value_that_a_rig_lacks(tmp_path: Path) -> None:
+    text, _ = rig_text("boom-1dof")
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("\n".join(line for line in text.splitlines() if "Fv1:" not in line))
+    with pytest.raises(InputError, match=r"has no nominal 'Fv1' \[N\*m\*s/rad\]"):
+        plan_steps(PlanRequest(str(mine)), lambda _: None)

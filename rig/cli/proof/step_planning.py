@@ -38,8 +38,17 @@ def predictor() -> Predictor:
 
 
 def plan_steps(request: PlanRequest, say: Say) -> Proof:
-    """Generate or prove a protocol; return the proof. Raises InputError for conflicting options."""
+    """Generate or prove a protocol; return the proof.
+
+    Raises InputError for conflicting options, and for a rig that lacks a nominal value, without
+    which the twin cannot move.
+    """
+    from analysis.simulation.model import nominal_model
+    from analysis.terms import baseline_of
+    from analysis.terms.base import Used
+
     rig, tools = load_bench(request.rig), predictor()
+    nominal_model(rig, tuple(map(Used, baseline_of(rig))))
     if request.prove is not None:
         if request.out is not None:
             raise InputError("--prove generates no protocol: expected either --prove or --out")
