@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 FORMAT: Final = "bramah-model"
 VERSION: Final = 1
+_DIFFERENCES_LISTED: Final = 3  # of two rigs, in a message
 _MOST_BYTES: Final = 1 << 26  # nine joints with curves have far fewer
 
 
@@ -229,19 +230,35 @@ def rig_difference(rig: Rig, other: Rig) -> str:
     """
     if rig.name != other.name:
         return f"name {rig.name!r} and {other.name!r}"
+    if len(rig.joints) != len(other.joints):
+        return f"{len(rig.joints)} and {len(other.joints)} joints"
+    first, second = _physical_values(rig), _physical_values(other)
+    differing = [key for key in {**first, **second} if first.get(key) != second.get(key)]
+    if not differing:
+        return ""
+    listed = ", ".join(
+        f"{key} {first.get(key, 'absent')} and {second.get(key, 'absent')}"
+        for key in differing[:_DIFFERENCES_LISTED]
+    )
+    more = len(differing) - _DIFFERENCES_LISTED
+    return f"{listed} (SI){f' and {more} more values' if more > 0 else ''}"
+
+
+def _physical_values(rig: Rig) -> dict[str, Any]:
+    """Return the values of a rig that describe the machine, by their keys: joints.1.link_length."""
     ignored = {"description", "nominal", "wire", "sample_rate", "tolerances"}
-    first, second = (r.model_dump(exclude=ignored) for r in (rig, other))
-    for key, value in first.items():
-        if value != second.get(key):
-            if key == "joints":
-                differing = [
-                    f"joints.{i}.{part}"
-                    for i, (a, b) in enumerate(zip(value, second[key], strict=False), start=1)
-                    for part in a
-                    if a[part] != b[part] and part not in ("limits", "name")
-                ]
-                if len(value) == len(second[key]) and not differing:
-                    continue
-                return ", ".join(differing) or f"{len(value)} and {len(second[key])} joints"
-            return f"{key} {value!r} and {second.get(key)!r}"
-    return ""
+    data = rig.model_dump(exclude=ignored)
+    joints = {
+        str(i): {k: v for k, v in joint.items() if k not in ("limits", "name")}
+        for i, joint in enumerate(data["joints"], start=1)
+    }
+    return dict(_leaves("", {**data, "joints": joints}))
+
+
+def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings with their keys, joined by dots."""
+    if not isinstance(value, dict):
+        yield key, value
+        return
+    for name, inner in value.items():
+        yield from _leaves(f"{key}.{name}" if key else name, inner)
