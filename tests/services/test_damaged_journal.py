@@ -15,6 +15,7 @@ from drivers.base import OutputLaw
 from rig.bench.session import Bench
 from rig.cli.main import app
 from rig.model.trips import RecordingFailed
+from rig.runs.listing.summary import summarise
 from rig.runs.recorder import Recorder
 from rig.runs.recover import FINALISED, recover
 from rig.runs.rigs import load_rig
@@ -193,6 +194,9 @@ def test_a_run_copied_without_its_samples_is_no_run_of_0_samples(run: Path) -> N
     with pytest.raises(RecordingFailed, match=r"neither journal\.sqlite nor records\.h5 is here"):
         recover(run)
     assert sorted(path.name for path in run.iterdir()) == before
+    listed = summarise(run)
+    assert listed.samples == -1
+    assert "neither journal.sqlite nor records.h5 is here" in listed.message
 
 
 def test_blocks_longer_than_a_page_are_read_by_number(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from rig.model.parse import InputError
 from rig.runs.journal import read_tail
-from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, read_events, read_state
+from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, STREAM, read_events, read_state
 from rig.runs.sections import Written
 from rig.runs.store import ARCHIVE, is_crate, is_run, read_header
 
@@ -50,10 +50,11 @@ def summarise(folder: Path) -> RunSummary:
     except InputError as error:
         return RunSummary(folder, UNREADABLE, "", "", "", -1, str(error))
     state = read_state(folder)
-    recovered, message = _end_of_run(read_events(folder), state, folder)
+    events = read_events(folder)
+    recovered, message = _end_of_run(events, state, folder)
     counted = _UNKNOWN
     try:
-        counted = _count(folder)
+        counted = _count(folder, events)
     except (InputError, OSError, sqlite3.Error) as error:
         message = f"{message}; {error}".removeprefix("; ")
     total = counted.samples + counted.lost_samples + counted.outside
@@ -89,11 +90,17 @@ def _end_of_run(events: list[dict[str, Any]], state: str, folder: Path) -> tuple
     return recovered, f"recovered: {last}" if ends and ends[-1]["event"] == "recovered" else last
 
 
-def _count(folder: Path) -> Written:
+def _count(folder: Path, events: list[dict[str, Any]]) -> Written:
+    """Count the contents of a run; raises InputError where the file of its samples is missing."""
     archive, journal = folder / ARCHIVE, folder / JOURNAL
     if journal.exists():
         return _count_journal(journal)
     if not archive.exists():
+        if any(event.get("event") == STREAM for event in events):
+            raise InputError(
+                f"samples were recorded, and neither {JOURNAL} nor {ARCHIVE} is here; copy the "
+                "missing file from where the run was taken"
+            )
         return Written(0, 0, 0, 0, 0)
     from rig.runs.archive_reader import count  # noqa: PLC0415 - h5py loads slowly
 
