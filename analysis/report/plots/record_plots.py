@@ -72,8 +72,8 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
     shown = slice(0, int(min(record.samples, REPORT.record_seconds * record.sample_rate)))
     with style():
         canvas = figure(3.7)
-        top = canvas.add_axes((0.13, 0.60, 0.84, 0.33))
-        low = canvas.add_axes((0.13, 0.115, 0.84, 0.33))
+        top = canvas.add_axes((0.15, 0.60, 0.82, 0.33))
+        low = canvas.add_axes((0.15, 0.115, 0.82, 0.33))
         if command is not None:
             top.plot(
                 *thin(record.time[shown], np.asarray(command)[shown]), color=SKY, linewidth=2.2
