@@ -12,6 +12,7 @@ from analysis.report import format as fm
 from analysis.report.identification.report import Provenance
 from analysis.report.page import page, write
 from analysis.report.plots import place_plot, trace_plots
+from analysis.simulation.model import Estimate
 from analysis.trace.clues.frequency import FREQUENCY
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
@@ -169,16 +170,31 @@ def _effect(effect: JudgedEffect, key: str) -> dict[str, Any]:
 
 
 def _parameters(result: Trace) -> list[tuple[str, ...]]:
+    """Return rows of name, value before and after, their change, and unit."""
     if result.verdict == CLEAN or not result.changed:
         return []
     after = result.model_after.parameters
     out: list[tuple[str, ...]] = []
     for name, estimate in result.model_before.parameters.items():
         if name in after and estimate.identified and after[name].identified:
-            change = (
-                f"{100 * (after[name].value / estimate.value - 1):+.1f} %"
-                if estimate.value
-                else fm.DASH
-            )
-            out.append((name, quantity(estimate), quantity(after[name]), change))
+            unit = fm.display_unit(estimate.unit)
+            values = (quantity(_scaled(e, unit.scale)) for e in (estimate, after[name]))
+            out.append((name, *values, _change(estimate.value, after[name].value), unit.text))
     return out
+
+
+def _scaled(estimate: Estimate, scale: float) -> Estimate:
+    """Return an estimate times `scale`, without its unit."""
+    low, high = estimate.ci95
+    return Estimate(
+        scale * estimate.value, "", scale * estimate.std, (scale * low, scale * high), estimate.note
+    )
+
+
+def _change(before: float, after: float) -> str:
+    """Return the relative change of a value in percent, a dash for one that was 0."""
+    if not before:
+        return fm.DASH
+    change = 100.0 * (after / before - 1.0)
+    text = fm.fixed(change, 1)
+    return f"+{text} %" if change > 0.0 and text != "0.0" else f"{text} %"

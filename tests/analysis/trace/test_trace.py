@@ -12,7 +12,7 @@ import pytest
 
 from analysis.effects.base import Effect
 from analysis.identify.identify import identify
-from analysis.report.trace import render
+from analysis.report.trace import body, render
 from analysis.simulation.model import load_model, save_model
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
@@ -94,6 +94,18 @@ def test_parameters_that_the_leak_had_biased_come_back(leaking: Trace) -> None:
     before, after = (m.values for m in (leaking.model_before, leaking.model_after))
     off = {n: abs(m["b"] / TRUTH["b"] - 1) for n, m in (("before", before), ("after", after))}
     assert off["after"] < 0.02 < off["before"]
+
+
+def test_the_page_shows_parameters_in_display_units(quiet: tuple[Run, Run], leaking: Trace) -> None:
+    rows = {row[0]: row[1:] for row in body([quiet[1]], leaking)["parameters"]}
+    before, after, change, unit = rows["b"]
+    assert unit == "MPa"
+    shown = float(after.split(" ± ")[0])
+    assert shown == pytest.approx(1e-6 * leaking.model_after.values["b"], rel=1e-3)
+    ratio = leaking.model_after.values["b"] / leaking.model_before.values["b"]
+    assert change == f"{100 * (ratio - 1):+.1f} %".replace("-", "−")
+    assert "±" in before
+    assert all("-0.0" not in row[2] for row in rows.values())
 
 
 def test_the_extended_model_is_a_model_file_like_any_other(leaking: Trace, tmp_path: Path) -> None:
