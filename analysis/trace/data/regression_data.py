@@ -64,6 +64,8 @@ class RegressionData:
     `base` (M, k) holds the columns of the coefficients `names`; `residual` (R, M) the residual of
     each repeat over its noise, NaN on segments with fewer repeats. `records` are the averaged
     records, `rows` their rows before whitening [SI], `floors` the split of the residuals.
+    `relative`: rows of a model with effects that rescale signals have the size that they have
+    without these effects; otherwise gains that make rows small would seem to leave little.
     """
 
     rig: Rig
@@ -77,6 +79,7 @@ class RegressionData:
     records: tuple[ConditionedRecord, ...]
     rows: tuple[Mapping[str, Rows], ...]
     cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
+    relative: bool = False
 
     @functools.cached_property
     def mean_residual(self) -> Array:

@@ -2,8 +2,9 @@
 
 The rows of the averaged records are computed again at every shape, the linear coefficients are
 solved for, and only the shapes are searched (Golub and Pereyra, 1973). An effect that rescales the
-right side and its noise (a sensor's gain) must not reduce the residual by that: rows are scaled
-back to the right side's size before the change.
+right side (a sensor's gain) must not seem to explain it by that: while its shapes are searched,
+rows are scaled back to the size of the right side before the change. What a fit leaves is compared
+with noise in the rows as they are.
 """
 
 from __future__ import annotations
@@ -112,9 +113,7 @@ def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> 
         for record, rows in zip(data.records, data.rows, strict=True)
     }
     own_rows = data.family_rows[family]
-    rescaled = any(
-        isinstance(u.term, Effect) and u.term.rescales and u not in data.terms for u in terms
-    )
+    rescaled = data.relative and _rescale(data, terms)
     X, y = np.zeros((len(own_rows), len(names))), data.mean_residual[own_rows]
     kept: dict[str, list[Indices]] = {}
     every: dict[str, list[Indices]] = {}
@@ -182,7 +181,7 @@ def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     for family, rows in data.family_rows.items():
         acting = acting_on(data.rig, terms, family, data.cache)
         own: _FamilyFit = data.cache.fits.get(
-            (family, data.terms, acting), partial(_family_fit, data, family, acting)
+            (family, data.terms, acting, data.relative), partial(_family_fit, data, family, acting)
         )
         at = [names.index(n) for n in own.names]
         values[at], residual[rows] = own.values, own.residual
@@ -206,7 +205,27 @@ def refine(
     A set that may only replace the fit `instead_of` is not searched further where it leaves over
     `SEARCH.unpromising_ratio` times as much and little less than `SEARCH.first_steps` before. Where
     it leaves more than that fit, its terms that are in it keep the forms that they have.
+
+    Shapes of effects that rescale signals are searched in rows of unchanged size
+    (`RegressionData.relative`). The fit returned is of rows over their noise.
     """
+    if not _rescale(data, terms):
+        return _refined(data, terms, instead_of, steps)
+    found = _refined(replace(data, relative=True), terms, instead_of, steps)
+    return fit_coefficients(data, found.terms)
+
+
+def _rescale(data: RegressionData, terms: Sequence[Used]) -> bool:
+    """Return whether a term that is not the data's own multiplies signals."""
+    return any(
+        isinstance(u.term, Effect) and u.term.rescales and u not in data.terms for u in terms
+    )
+
+
+def _refined(
+    data: RegressionData, terms: Sequence[Used], instead_of: ExactFit | None, steps: int
+) -> ExactFit:
+    """Return the fit of `refine`, its rows of the size that `data` asks for."""
     shared: Sequence[int] = ()
     enough = math.inf
     if instead_of is not None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,15 @@ from tests.analysis.trace.hidden import pair_of_runs
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class FewRows:
+    """What a search asks of its data where the fit is given."""
+
+    rig: Rig
+    terms: tuple[Used, ...] = ()
+    relative: bool = False
+
+
 @pytest.mark.parametrize("start", [0.9, 0.98, 1.02, 1.1])
 def test_a_gain_is_found_from_the_wrong_side_of_one_too(
     rig: Rig, start: float, monkeypatch: pytest.MonkeyPatch
@@ -39,10 +47,25 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
         return refinement.ExactFit(tuple(terms), {}, left, np.zeros((0, 0)))
 
     monkeypatch.setattr(refinement, "fit_coefficients", fit)
-    train_data: Any = SimpleNamespace(rig=rig, terms=())
-    used = Used(make("sensor_gain", "joint 2 cap"), (start,))
+    train_data: Any = FewRows(rig)
+    used = Used(make("sensor_gain", "joint 2 piston"), (start,))
     found = refinement.refine(train_data, (used,))
     assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)
+
+
+def test_what_a_gain_leaves_is_noise_although_the_corrected_forces_are_smaller(rig: Rig) -> None:
+    """The force of a piston is a difference: a few per cent of one side may double it."""
+    run, _ = pair_of_runs(rig, gain_cap_pressure=1.3)
+    terms = tuple(map(Used, baseline()))
+    train_data = regression_data(rig, terms, conditioned_records(rig, [run]))
+    used = Used(make("sensor_gain", "joint 2 cap"), (1.2,))
+    found = refinement.refine(train_data, (*terms, used))
+    assert found.terms[-1].shape[0] == pytest.approx(1.3, abs=1e-3)
+    left = energy_above_noise(train_data, found.residual)["torque_2"]
+    scaled = refinement.fit_coefficients(replace(train_data, relative=True), found.terms)
+    rows = train_data.row_counts["torque_2"]
+    assert left < 0.0  # the noise of the reading was magnified too
+    assert energy_above_noise(train_data, scaled.residual)["torque_2"] - left > 0.3 * rows
 
 
 @pytest.mark.parametrize("edges", [(0.0018, 0.014), (0.02, 0.001)])
