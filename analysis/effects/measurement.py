@@ -361,7 +361,11 @@ class SensorCrosstalk(Sensor):
 
 @dataclass(frozen=True)
 class SensorGain(Sensor):
-    """reading = gain x."""
+    """reading = gain x; of a pressure p reading = gain p (1 + bend (2 p/p_S - 1)).
+
+    The bend is a detail of the form: a sensor whose characteristic is not straight. It is the
+    relative error at the supply's pressure p_S, and there is none at half of it.
+    """
 
     rescales: ClassVar[bool] = True
     name: ClassVar[str] = "sensor_gain"
@@ -382,17 +386,46 @@ class SensorGain(Sensor):
         """Return that the flow gains absorb a spool's gain."""
         return "the flow gains absorb a spool's gain completely" if self.side == "spool" else ""
 
+    @property
+    def _bends(self) -> bool:
+        return ch.unit_of(self.channel) == "Pa"
+
     def shape_names(self) -> tuple[str, ...]:
-        """Name the gain."""
-        return (f"gain_{self.channel}",)
+        """Name the gain, and the bend of a pressure."""
+        bend = (f"bend_{self.channel}",) if self._bends else ()
+        return (f"gain_{self.channel}", *bend)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return reading over truth [-], between two thirds and one and a half."""
-        return (Shape(self.shape_names()[0], "", 0.67, 1.5, (0.9, 0.98, 1.02, 1.1), 1.0),)
+        """Return reading over truth [-], 2/3 to 3/2, and the bend [-] of a pressure."""
+        gain = Shape(self.shape_names()[0], "", 0.67, 1.5, (0.9, 0.98, 1.02, 1.1), 1.0)
+        bends = self.shape_names()[1:]
+        return (gain, *(Shape(n, "", -0.3, 0.3, (-0.03, 0.03), 0.0, detail=True) for n in bends))
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x / gain."""
         return x / value
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Undo gain and bend in the channel's signal and in its rate."""
+        new, bend, supply = super().prepare(rig, signals, shape), _bend(shape), rig.supply.pressure
+        if bend == 0.0:
+            return new
+        if self.where == "bench":
+            return replace(new, p_s=_straight(new.p_s, bend, supply))
+        p, pd = getattr(new, f"p_{self.side}").copy(), getattr(new, f"pd_{self.side}").copy()
+        i = self.joint
+        p[:, i] = _straight(p[:, i], bend, supply)
+        pd[:, i] /= 1.0 - bend + 4.0 * bend * p[:, i] / supply
+        return replace(new, **{f"p_{self.side}": p, f"pd_{self.side}": pd})
+
+    def correct(
+        self, rig: Rig, channels: Mapping[str, Array], rate: float, shape: Sequence[float]
+    ) -> dict[str, Array]:
+        """Return the channels as a correct sensor would have sampled them, each (n,)."""
+        out = super().correct(rig, channels, rate, shape)
+        if _bend(shape) and self.channel in out:
+            out[self.channel] = _straight(out[self.channel], _bend(shape), rig.supply.pressure)
+        return out
 
 
 @dataclass(frozen=True)
@@ -466,6 +499,20 @@ class SensorOffset(Sensor):
     def _is_stated(self, rig: Rig) -> bool:
         """Return whether it is that of the supply's pressure, which the rig file states."""
         return self.where == "bench" and rig.sensors.supply_pressure is None
+
+
+def _bend(shape: Sequence[float]) -> float:
+    """Return the bend of a gain's shape, 0 where it has none."""
+    return shape[1] if len(shape) > 1 else 0.0
+
+
+def _straight(y: Array, bend: float, supply: float) -> Array:
+    """Return the pressure p (n,) [Pa] for which y (n,) [Pa] is p (1 + bend (2 p/p_S - 1)).
+
+    `supply` is p_S [Pa]. A value beyond the curve's turn, which is noise, is taken as its turn.
+    """
+    root = np.sqrt(np.maximum((1.0 - bend) ** 2 + 8.0 * bend * y / supply, 0.0))
+    return np.asarray(2.0 * y / (1.0 - bend + root))
 
 
 def corrected_channels(

@@ -5,7 +5,7 @@ And the model with the effect, run by the analysis's own integrator, follows tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,8 +16,12 @@ from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter
 from analysis.simulation.simulate import State, drive_of, simulate
 from analysis.simulation.validate import fit_percent
-from analysis.terms import make
-from analysis.terms.base import Used
+from analysis.terms import baseline, make
+from analysis.terms.base import Array, Used
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
+from analysis.trace.search.hypothesis import energy_above_noise
+from analysis.trace.search.refinement import refine
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 from tests.analysis.effects.fitting import Data, fitted, model_of, residual
@@ -169,3 +173,44 @@ def test_sensor_effects_make_the_simulation_comparable(rig: Rig) -> None:
     after = np.abs(corrected["piston_2"] - truth["piston_2"])[inner].max()
     assert after < 1e-2 * before
     assert corrected["cap_pressure_2"] is clean["cap_pressure_2"]
+
+
+def test_a_pressure_sensor_that_is_not_straight_is_found_with_its_bend(rig: Rig) -> None:
+    gain, bend, supply = 1.04, -0.05, rig.supply.pressure
+
+    def reading(p: Array) -> Array:
+        return gain * p * (1.0 + bend * (2.0 * p / supply - 1.0))
+
+    run = bench.run(rig, bench.RIGHT, *TRAIN)
+    bent = [
+        replace(r, channels={**r.channels, "cap_pressure_2": reading(r.channels["cap_pressure_2"])})
+        for r in run.records
+    ]
+    records = conditioned_records(rig, [replace(run, records=tuple(bent))])
+    data = regression_data(rig, tuple(map(Used, baseline())), records)
+    effect = make("sensor_gain", "joint 2 cap")
+    assert isinstance(effect, Sensor)
+    found = refine(data, (*data.terms, Used(effect, (1.02,))))
+    assert found.terms[-1].shape == pytest.approx((gain, bend), abs=2e-3)
+    assert all(
+        v < 0.1 * len(found.residual) for v in energy_above_noise(data, found.residual).values()
+    )
+
+    # The rate follows the straightened pressure, which a finite difference of it shows.
+    p = 0.5 * supply * (1.0 + 0.9 * np.sin(0.02 * np.arange(2000)))
+    signals = records[0].signals
+    count = len(signals.p_cap)
+    wave = np.resize(p, count)
+    rate = np.gradient(reading(wave)) * signals.rate
+    told = replace(
+        signals,
+        p_cap=np.column_stack([signals.p_cap[:, 0], reading(wave)]),
+        pd_cap=np.column_stack([signals.pd_cap[:, 0], rate]),
+    )
+    straight = effect.prepare(rig, told, (gain, bend))
+    assert straight.p_cap[:, 1] == pytest.approx(wave, rel=1e-9)
+    inner = slice(5, min(count, 1990))
+    difference = np.gradient(straight.p_cap[:, 1])[inner] * signals.rate
+    assert straight.pd_cap[inner, 1] == pytest.approx(difference, rel=1e-3, abs=1e-3 * np.ptp(rate))
+    channels = effect.correct(rig, {"cap_pressure_2": reading(wave)}, signals.rate, (gain, bend))
+    assert channels["cap_pressure_2"] == pytest.approx(wave, rel=1e-9)
