@@ -30,6 +30,8 @@ from rig.model import channels as ch
 from rig.model.rig import Rig
 
 SHEAR: Final = 0.02  # of the bore: a third of a seal's section, which is a fifteenth of the bore
+GRID_RATIO: Final = 4.0  # between presliding distances where a search begins
+YIELD: Final = 5e-3  # of the stroke: the largest presliding distance; a longer one is a spring
 STIFFENING: Final = 30.0  # [s/m] where a search begins
 STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] a smaller one is below a tenth at 0.1 m/s: negligible
 FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
@@ -63,7 +65,8 @@ ROTARY: Final = ContactRange("rad", (5e-5, 5e-4, 3e-3), (2e-6, 2e-2), 1e-2, (TRA
 def contact_range(rig: Rig, joint: int) -> ContactRange:
     """Return the range of a joint's contact (0-based): that of an angle on a revolute drive.
 
-    A seal's section grows with the cylinder's bore, and with it its shear travel.
+    A seal's section grows with the cylinder's bore, and with it its shear travel; what the
+    cylinder's mounting yields under friction grows with the stroke.
     """
     at = rig.joints[joint]
     if path_unit(rig, joint) == ROTARY.unit:
@@ -72,7 +75,11 @@ def contact_range(rig: Rig, joint: int) -> ContactRange:
         return LINEAR
     low, high = LINEAR.distance_bounds
     bore = 2.0 * math.sqrt(at.cylinder.cap_area / math.pi)
-    return replace(LINEAR, distance_bounds=(low, max(high, SHEAR * bore)))
+    high = max(high, SHEAR * bore, YIELD * at.cylinder.stroke)
+    distances = list(LINEAR.distances)
+    while distances[-1] * GRID_RATIO < high:  # a search from far below ends elsewhere
+        distances.append(distances[-1] * GRID_RATIO)
+    return replace(LINEAR, distances=tuple(distances), distance_bounds=(low, high))
 
 
 def path_unit(rig: Rig, joint: int) -> str:

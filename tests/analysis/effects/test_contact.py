@@ -7,7 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import erf
 
-from analysis.effects.contact import contact_state, contact_under_load, worked
+from analysis.effects.contact import (
+    GRID_RATIO,
+    contact_range,
+    contact_state,
+    contact_under_load,
+    worked,
+)
 from analysis.effects.friction import CoulombFriction, StribeckFriction
 from analysis.effects.friction_levels import PressureDependentFriction
 from analysis.signals.conditioning import condition
@@ -122,3 +128,15 @@ def test_a_fall_over_most_of_the_speeds_is_no_breakaway(rig: Rig, multisine_run:
         curve = np.exp(-((v / shape[0]) ** 2))
         left = curve - lines @ np.linalg.lstsq(lines, curve)[0]
         assert (np.std(left) > 0.07) == shown
+
+
+def test_a_presliding_distance_grows_with_bore_and_stroke(rig: Rig) -> None:
+    """The mounting of a long cylinder yields too; a search from far below ends elsewhere."""
+    joint = rig.joints[0]
+    long = joint.cylinder.model_copy(update={"stroke": 1.5, "cap_area": 0.02, "rod_area": 0.012})
+    big = rig.model_copy(update={"joints": (joint.model_copy(update={"cylinder": long}),)})
+    among = contact_range(big, 0)
+    assert among.distance_bounds[1] == pytest.approx(7.5e-3)
+    assert max(among.distances) > among.distance_bounds[1] / GRID_RATIO
+    small = contact_range(rig, 0)
+    assert small.distance_bounds[1] < 1e-3
