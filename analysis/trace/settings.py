@@ -305,6 +305,8 @@ class SearchSettings:
     most_names: int = 3
     """Largest number of effects in a set; one that acts at several joints counts once."""
     pair_starts: int = 10
+    shapes_fitted: int = 4
+    """Number of shapes of one effect among them."""
     """Number of single candidates from which pairs are tried."""
     full_fits: int = 40
     """Number of best candidates that are fitted together with the set."""

@@ -10,6 +10,7 @@ numbers comes first.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -170,7 +171,7 @@ def sets_with_one_more(
     g = gains(K, c, candidates.groups, candidates.least)
     taken = {candidates.entries[m].variant.key for m in members}
     trials: list[LinearFit] = []
-    for i in map(int, np.argsort(-g)[: SEARCH.full_fits]):
+    for i in _best_of_each(candidates, g):
         if g[i] <= 0 or candidates.entries[i].variant.key in taken:
             continue
         if g[i] < SEARCH.add_share * energy_touched(candidates, i, now):
@@ -186,6 +187,23 @@ def sets_with_one_more(
         (t for t in trials if t.total <= limit), key=lambda t: (_size(candidates, t), t.total)
     )
     return near + sorted((t for t in trials if t.total > limit), key=lambda t: t.total)
+
+
+def _best_of_each(candidates: CandidateColumns, g: Array) -> list[int]:
+    """Return the entries with the largest gains g (V,), a few shapes of each effect.
+
+    All shapes of an effect that fits with an impossible number would leave no room for others.
+    """
+    fitted: Counter[Key] = Counter()
+    best: list[int] = []
+    for i in map(int, np.argsort(-g)):
+        key = candidates.entries[i].variant.key
+        fitted[key] += 1
+        if fitted[key] <= SEARCH.shapes_fitted:
+            best.append(i)
+        if len(best) == SEARCH.full_fits:
+            break
+    return best
 
 
 def _size(candidates: CandidateColumns, choice: LinearFit) -> int:

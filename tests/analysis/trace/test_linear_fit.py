@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from analysis.effects.base import Effect
+from analysis.effects.friction import CoulombFriction
 from analysis.effects.mechanics import TorqueOffset
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import VariantColumns, regression_data
-from analysis.trace.search.linear_fit import gains, project
+from analysis.trace.search.linear_fit import gains, project, sets_with_one_more
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment
 
@@ -38,3 +40,29 @@ def test_how_much_of_a_column_must_be_its_own(
     candidates = project(data, [entry], lambda _: 1, lambda *_: True)
     gained = gains(candidates.K, candidates.columns.T @ own, candidates.groups, candidates.least)
     assert gained[0] == pytest.approx(float(own @ own) if shows else 0.0)
+
+
+def test_an_effect_that_fits_with_an_impossible_number_leaves_room_for_others(rig: Rig) -> None:
+    """Fifty shapes of it would be the only ones that are fitted together with the set."""
+    run = experiment(rig, Hidden(), repeats=1, seed=1, rms=RMS)
+    data = regression_data(
+        rig, [Used(term) for term in baseline_of(rig)], conditioned_records(rig, [run])
+    )
+    rng, torque = np.random.default_rng(0), np.zeros(len(data.base))
+    for s in data.segments:
+        if s.equation == "torque_2":
+            torque[s.where] = 5.0 * rng.normal(size=s.where.stop - s.where.start)
+    r = torque - data.base @ np.linalg.lstsq(data.base, torque, rcond=None)[0]
+
+    def entry(effect: Effect, shape: tuple[float, ...], share: float) -> VariantColumns:
+        other = rng.normal(size=len(r)) * (torque != 0.0)
+        column = share * r + (1.0 - share) * other
+        where = frozenset({"torque_2"})
+        return VariantColumns(Variant(effect, shape), ("size",), column[:, None], where)
+
+    friction, offset = CoulombFriction("joint 2"), TorqueOffset("joint 2")
+    entries = [entry(friction, (1e-5 * k,), 0.99) for k in range(1, 51)]
+    entries.append(entry(offset, (), 0.7))
+    candidates = project(data, entries, lambda _: 1, lambda e, _: e.variant.effect is offset)
+    found = sets_with_one_more(candidates, (), r)
+    assert [candidates.entries[m].variant.effect for m in found[0].members] == [offset]
