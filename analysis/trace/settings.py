@@ -263,9 +263,6 @@ class SearchSettings:
     form_share: float = 0.02
     """Share of an equation's energy above noise under the baseline, by which the catalogue's form
     of an effect may differ from the real one (tuned)."""
-    exact_from: float = 10.0
-    """Energy that an equation keeps over the noise's band, from which a set within the tolerance
-    for its forms is compared with all others by exact columns (tuned)."""
     exact_trials: int = 3
     """Number of candidates that are refined of those tried by exact columns (tuned)."""
     negative_share: float = 0.1
@@ -305,11 +302,11 @@ class SearchSettings:
     most_names: int = 3
     """Largest number of effects in a set; one that acts at several joints counts once."""
     pair_starts: int = 10
-    shapes_fitted: int = 4
-    """Number of shapes of one effect among them."""
     """Number of single candidates from which pairs are tried."""
     full_fits: int = 40
     """Number of best candidates that are fitted together with the set."""
+    shapes_fitted: int = 4
+    """Number of shapes of one effect among them."""
     refined_singles: int = 14
     """Number of single candidates that are refined exactly, best first."""
     refined_pairs: int = 6

@@ -6,10 +6,11 @@ far from the sizes for which first-order columns hold.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 
 from analysis.terms.base import Used
-from analysis.trace.search.hypothesis import Hypothesis, Key, may_grow
+from analysis.trace.search.hypothesis import Hypothesis, Key, may_grow, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.settings import SEARCH
@@ -20,8 +21,8 @@ _Trial = tuple[float, tuple[Used, ...]]  # the energy that a set leaves at a poi
 def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypothesis:
     """Return the set, or a better one with an effect added or exchanged, of all candidates.
 
-    It is asked while the set leaves more than the tolerance for its forms, or far more than noise.
-    A set within that tolerance is left only for one that leaves a tenth.
+    It is asked while the set leaves more than noise. A set within the tolerance for its forms is
+    left only for one that leaves a tenth, or only noise.
     """
     while above := _equations_above(hypotheses, now):
         tried = [
@@ -29,7 +30,8 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
             for energy, effects in _best_trials(hypotheses, now, above)
         ]
         better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([now, *tried])))
-        tolerated = hypotheses.within_form_tolerance(now)
+        to_noise = within_band(better.excess_energy, hypotheses.noise_band)
+        tolerated = hypotheses.within_form_tolerance(now) and not to_noise
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
         if hypotheses.log_energy_ratio(now, better) < least:
             break
@@ -38,13 +40,9 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
 
 
 def _equations_above(hypotheses: HypothesisSet, now: Hypothesis) -> set[str]:
-    """Return the equations above the tolerance, or `SEARCH.exact_from` times the noise's band."""
+    """Return the equations that keep more than noise."""
     band = hypotheses.noise_band.by_equation
-    return {
-        e
-        for e, v in now.excess_energy.items()
-        if not hypotheses.negligible(e, v) or v > SEARCH.exact_from * band[e]
-    }
+    return {e for e, v in now.excess_energy.items() if v > band[e]}
 
 
 def _best_trials(
@@ -66,7 +64,10 @@ def _best_trials(
 def _best_additions(
     hypotheses: HypothesisSet, now: Hypothesis, start: Sequence[Used], equations: Collection[str]
 ) -> list[_Trial]:
-    """Return the sets with one more effect that leave least at a point of its shape grid."""
+    """Return the sets with one more effect that leave least at a point of its shape grid.
+
+    Sets that are physically impossible there would take the places of others.
+    """
     data = hypotheses.train_data
     least: dict[Key, _Trial] = {}
     for variant in hypotheses.variants_of(data, now.fit.residual):
@@ -76,4 +77,9 @@ def _best_additions(
             energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
             if energy < least.get(variant.key, (float("inf"), ()))[0]:
                 least[variant.key] = energy, effects
-    return sorted(least.values(), key=lambda trial: trial[0])[: SEARCH.exact_trials]
+    ordered = sorted(least.values(), key=lambda trial: trial[0])
+    possible = (
+        trial for trial in ordered
+        if not hypotheses.physical_problem(hypotheses.at_given_shapes(trial[1]))
+    )  # fmt: skip
+    return list(itertools.islice(possible, SEARCH.exact_trials))

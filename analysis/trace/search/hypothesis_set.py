@@ -77,6 +77,11 @@ class HypothesisSet:
             complexity(rig, effects),
         )
 
+    def at_given_shapes(self, effects: Sequence[Used]) -> Hypothesis:
+        """Return the fit of a set of effects with the shapes that they have."""
+        fit = fit_coefficients(self.train_data, (*self.base, *effects))
+        return self._hypothesis(fit.terms[len(self.base) :], fit)
+
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
         """Return a copy with further candidates; sets that were fitted already are shared."""
         wide = copy.copy(self)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from analysis.trace.search.exact_trials import improved_by_exact_trials
+from analysis.trace.search.hypothesis import within_band
 from rig.model.rig import Rig
 from tests.analysis.trace.gate_cases import LEAK, searched
 from tests.analysis.trace.hidden import pair_of_runs
@@ -43,3 +45,18 @@ def test_a_spring_is_found_beside_a_gain_that_took_part_of_it(rig: Rig) -> None:
     assert gain == pytest.approx(1.05, abs=1e-3)
     assert s.winner.fit.beta["k_spring_2"] == pytest.approx(20.0, rel=0.03)
     assert s.vetoes(s.winner) == ""
+
+
+def test_what_a_dead_band_leaves_above_the_noise_is_an_offset_and_not_an_error_of_its_form(
+    rig: Rig,
+) -> None:
+    """The remainder is within the tolerance for forms; friction and a spring would fit it too."""
+    runs = pair_of_runs(rig, w_ahead=8e-3, w_astern=8e-3, offset_cap_pressure=2.1e3)
+    others = "joint_spring", "asymmetric_friction", "coulomb_friction", "stribeck_friction"
+    sets = (s := searched(rig, *runs, "valve_deadband", "sensor_offset", *others)).hypotheses
+    alone = s.set_of("valve_deadband")
+    assert sets.within_form_tolerance(alone)
+    assert not within_band(alone.excess_energy, sets.noise_band)
+    improved = improved_by_exact_trials(sets, alone)
+    assert {name for name, _ in improved.keys} == {"valve_deadband", "sensor_offset"}
+    assert within_band(improved.excess_energy, sets.noise_band)
