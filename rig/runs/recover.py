@@ -174,11 +174,8 @@ def _without_journal(folder: Path) -> RecoverReport:
     state = runstate.read_state(folder)
     archive = folder / store.ARCHIVE
     if not archive.exists():
-        if any(event.get("event") == runstate.STREAM for event in runstate.read_events(folder)):
-            raise RecordingFailed(
-                f"{folder}: samples were recorded, and neither {runstate.JOURNAL} nor "
-                f"{store.ARCHIVE} is here; copy the missing file from where the run was taken"
-            )
+        if missing := store.missing_samples(runstate.read_events(folder)):
+            raise RecordingFailed(f"{folder}: {missing}")
         message = "nothing had been recorded"
         _end(folder, state)
         _note(folder, state, message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +25,7 @@ from rig.runs.runstate import (
     INTERRUPTED,
     JOURNAL,
     RUNNING,
+    STREAM,
     read_owner,
     read_state,
     release_ownership,
@@ -175,6 +176,16 @@ def parse_header(text: str, source: str) -> Header:
         return Header.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{source}: {first_problem(error)}") from error
+
+
+def missing_samples(events: Iterable[Mapping[str, Any]]) -> str:
+    """Return that a folder without samples once had some, by its events ('' if it had none)."""
+    if not any(event.get("event") == STREAM for event in events):
+        return ""
+    return (
+        f"samples were recorded, and neither {JOURNAL} nor {ARCHIVE} is here; copy the missing "
+        "file from where the run was taken"
+    )
 
 
 def finished(folder: Path) -> tuple[Header, str]:

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 from rig.model.parse import InputError
 from rig.runs.journal import read_tail
-from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, STREAM, read_events, read_state
+from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, read_events, read_state
 from rig.runs.sections import Written
-from rig.runs.store import ARCHIVE, is_crate, is_run, read_header
+from rig.runs.store import ARCHIVE, is_crate, is_run, missing_samples, read_header
 
 UNREADABLE: Final = "unreadable"
 _UNKNOWN = Written(-1, 0, -1, 0, 0, -1)
@@ -96,11 +96,8 @@ def _count(folder: Path, events: list[dict[str, Any]]) -> Written:
     if journal.exists():
         return _count_journal(journal)
     if not archive.exists():
-        if any(event.get("event") == STREAM for event in events):
-            raise InputError(
-                f"samples were recorded, and neither {JOURNAL} nor {ARCHIVE} is here; copy the "
-                "missing file from where the run was taken"
-            )
+        if missing := missing_samples(events):
+            raise InputError(missing)
         return Written(0, 0, 0, 0, 0)
     from rig.runs.archive_reader import count  # noqa: PLC0415 - h5py loads slowly
 
