@@ -93,6 +93,7 @@ class CanOpenValves:
                 f"wire: kind: {wire.kind} needs the package {PACKAGE}: "
                 "pip install 'bramah[canopen]'"
             ) from error
+        self._sdo_errors = self._canopen.SdoAbortedError, self._canopen.SdoCommunicationError
         self._eds, self._source = _eds(at)
         self._received = threading.Condition()
         self._awaited_ids: set[int] = set()
@@ -170,13 +171,8 @@ class CanOpenValves:
 
     def close(self) -> None:
         """Disable the valves if the bus works, and stop their supervision of the heartbeat."""
-        errors = (
-            DeviceError,
-            self._canopen.SdoCommunicationError,
-            self._canopen.SdoAbortedError,
-        )
         if self._port.is_open and self._driven:
-            with suppress(*errors):
+            with suppress(DeviceError, *self._sdo_errors):
                 self._send(np.zeros(len(self._nodes)), Control.DISABLED)
                 for node in self._nodes:
                     node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
@@ -197,7 +193,7 @@ class CanOpenValves:
                 node.sdo[cia408.CONTROL_WORD].raw = int(Control.DISABLED)
                 # Out of operation it obeys nobody; the end of the other host is no fault.
                 node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
-        except (self._canopen.SdoAbortedError, self._canopen.SdoCommunicationError) as error:
+        except self._sdo_errors as error:
             raise DeviceLost(f"a valve at {self._at.bus} has not confirmed: {error}") from error
         finally:
             self._port.close()
@@ -294,7 +290,7 @@ class CanOpenValves:
         self._other_host = False
         try:
             watched = [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in self._nodes]
-        except (self._canopen.SdoAbortedError, self._canopen.SdoCommunicationError):
+        except self._sdo_errors:
             return  # `_settle` says what is wrong
         end = time.monotonic() + self._wire.watchdog
         while any(watched) and time.monotonic() < end:
