@@ -66,7 +66,7 @@ class HypothesisSet:
         self.effects = tuple(effects)
         self.noise_band = noise_band(train_data)
         self.fitted: dict[frozenset[Key], Hypothesis] = {}
-        self.empty = self._hypothesis((), fit_coefficients(train_data, self.base))
+        self.empty = self.at_given_shapes(())
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.train_data.rig
