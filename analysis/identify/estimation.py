@@ -17,14 +17,22 @@ from analysis.identify.estimators.equations import (
     FamilyBlocks,
     RepeatBlock,
     blocks_of,
+    common,
     least_squares,
     levelled,
     pieces,
 )
 from analysis.identify.estimators.instruments import (
+    Hausman,
     hausman,
     instrumental_variables,
     steps_without_instruments,
+)
+from analysis.identify.estimators.prior_rows import (
+    PriorRow,
+    prior_rows,
+    spread_with_priors,
+    with_prior_rows,
 )
 from analysis.identify.estimators.robust import robust
 from analysis.identify.estimators.shifts import (
@@ -117,7 +125,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
             f"row: {' '.join(single)}. Record more repeats (bramah run --repeats 4), or use "
             "--estimator output-error"
         )
-    tests = {} if single else {p.family: hausman(p.blocks) for p in prepared}
+    tests = {} if single else {p.family: _hausman(p) for p in prepared}
     estimator = job.estimator
     fits = {p.family: _solve(p, "ls" if estimator == "auto" else estimator) for p in prepared
              if estimator != OUTPUT_ERROR}  # fmt: skip
@@ -170,8 +178,8 @@ def _bootstrap_ends(
     No resampling shows this shift, because it is the same in every repeat.
     """
     rng = job.rng or np.random.default_rng(0)
-    error = spread([pieces(fit)], fit.inverse)
-    drawn = bootstrap(p.blocks, _redo(p, _FITS[estimator], error), job.bootstrap, rng)
+    kind, rows = _FITS[estimator], _prior_rows(p, fit, estimator)
+    drawn = bootstrap(p.blocks, _redo(kind, rows, p.parameters), job.bootstrap, rng)
     # Towards the estimate by instruments.
     low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
     high = drawn.high[: p.parameters] - np.minimum(shift, 0.0)
@@ -252,26 +260,28 @@ def _family(
 
 def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:
     fit = _FITS[estimator](p.blocks)
-    error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
-    beta, inverse = fit.beta, fit.inverse
-    for prior in nu.priors(p.names, beta):
-        beta, error, inverse = nu.joined(beta, error, prior, inverse)
-    return beta[: p.parameters], _first(error, p.parameters), fit
+    rows = _prior_rows(p, fit, estimator)
+    fit = with_prior_rows(fit, rows)
+    error = spread_with_priors(fit, rows)
+    return fit.beta[: p.parameters], _first(error, p.parameters), fit
+
+
+def _prior_rows(p: FamilyBlocks, fit: EquationFit, estimator: str) -> tuple[PriorRow, ...]:
+    """Return the rows of a family's prior knowledge beside those of its fit by an estimator."""
+    plain = least_squares(fit.blocks) if estimator == "iv" else fit
+    return prior_rows(plain, nu.priors(p.names, plain.beta))
 
 
 def _redo(
-    p: FamilyBlocks, kind: Callable[[Sequence[RepeatBlock]], EquationFit], error: CovarianceParts
+    kind: Callable[[Sequence[RepeatBlock]], EquationFit], rows: Sequence[PriorRow], count: int
 ) -> Callable[[Sequence[RepeatBlock]], Array]:
-    """Return the function that estimates from resampled blocks, with the same prior knowledge."""
+    """Return the function that estimates (count,) from resampled blocks, with the same priors."""
+    return lambda blocks: with_prior_rows(kind(blocks), rows).beta[:count]
 
-    def estimate(blocks: Sequence[RepeatBlock]) -> Array:
-        fit = kind(blocks)
-        beta, inverse, after = fit.beta, fit.inverse, error
-        for prior in nu.priors(p.names, beta):
-            beta, after, inverse = nu.joined(beta, after, prior, inverse)
-        return beta[: p.parameters]
 
-    return estimate
+def _hausman(p: FamilyBlocks) -> Hausman:
+    plain = least_squares(common(p.blocks))
+    return hausman(plain, prior_rows(plain, nu.priors(p.names, plain.beta)))
 
 
 def _first(s: CovarianceParts, k: int) -> CovarianceParts:

@@ -22,12 +22,12 @@ from analysis.identify.estimators.equations import (
     EquationFit,
     RepeatBlock,
     common,
-    least_squares,
     over_repeats,
     pieces,
     shared_ticks,
     solve,
 )
+from analysis.identify.estimators.prior_rows import PriorRow, with_prior_rows
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import stratified
 
@@ -67,18 +67,18 @@ def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
     return solve(blocks, Z, [np.ones(len(b.y)) for b in blocks])
 
 
-def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
-    """Compare least squares with instrumental variables on the same rows.
+def hausman(plain: EquationFit, rows: Sequence[PriorRow] = ()) -> Hausman:
+    """Compare least squares, `plain` on rows that all repeats have, with instrumental variables.
 
-    The difference scatters by noise: its covariance is that between repeats within each part of the
-    period, of which there are many more than repeats.
+    Both have the same prior rows. The difference scatters by noise: its covariance is that between
+    repeats within each part of the period, of which there are many more than repeats.
     """
-    iv = instrumental_variables(blocks)
-    ls = least_squares(iv.blocks)
+    iv = with_prior_rows(instrumental_variables(plain.blocks), rows)
+    ls = with_prior_rows(plain, rows)
     difference = ls.beta - iv.beta
-    plain, instrumented = pieces(ls), pieces(iv)
-    influence = plain.score @ ls.inverse.T - instrumented.score @ iv.inverse.T
-    scatter = stratified(influence, plain.stratum, plain.part)
+    of_ls, of_iv = pieces(ls), pieces(iv)
+    influence = of_ls.score @ ls.inverse.T - of_iv.score @ iv.inverse.T
+    scatter = stratified(influence, of_ls.stratum, of_ls.part)
     assert scatter is not None, "instruments exist only where steps have repeats"
     covariance, dof = scatter
     error = np.sqrt(np.diag(covariance))

@@ -34,7 +34,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.settings import IDENTIFY
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Coefficient, Columns, Term, Used, equation
@@ -225,31 +224,3 @@ def implausible(prior: Prior, beta: Array, covariance: Array) -> bool:
     """Return whether the data contradict prior knowledge: another effect is in that column."""
     variance = prior.std**2 + float(prior.h @ covariance @ prior.h)
     return bool(abs(prior.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
-
-
-def joined(
-    beta: Array, spread: CovarianceParts, prior: Prior, inverse: Array
-) -> tuple[Array, CovarianceParts, Array]:
-    """Join a prior observation into beta (k,), its spread and `inverse`, A^-1 (k, k).
-
-    The gain g of Kalman's update is taken from A^-1 scaled to the spread V: g = P h / (h'P h +
-    s^2), P = A^-1 (h'V h) / (h'A^-1 h). V itself is based on few repeats: a gain from it would
-    follow their noise and promise too small a variance. An estimate with any gain has the
-    covariance (I - g h') V (I - g h')' + g s^2 g' (Joseph's form).
-    """
-    V, h = spread.covariance, prior.h
-    if h @ inverse @ h <= 0.0:  # a column of zeros: the records hold nothing to join
-        return beta, spread, inverse
-    shape = 0.5 * (inverse + inverse.T)
-    P = shape * (h @ V @ h) / (h @ shape @ h)
-    gain = P @ h / (h @ P @ h + prior.std**2)
-    move = np.eye(len(h)) - np.outer(gain, h)
-    scatter = move @ V @ move.T
-    after = scatter + prior.std**2 * np.outer(gain, gain)
-    remaining = np.diag(scatter)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Prior knowledge needs no repeats: its part of the variance counts as known.
-        grown = np.where(remaining > 0, np.minimum(np.diag(after) / remaining, 1e3), 1.0)
-        systematic = np.minimum(spread.systematic, 1.0) / grown
-    new = CovarianceParts(after, spread.dof * grown**2, systematic)
-    return beta - gain * (h @ beta), new, move @ inverse
