@@ -397,8 +397,9 @@ def test_a_fill_value_of_a_logger_is_a_lost_sample(tmp_path: Path, fill: float) 
     assert not np.isnan(record.channels["piston_1"]).any()
 
 
-def test_a_channel_in_another_unit_is_kept_and_spoken_of(tmp_path: Path) -> None:
-    report = bring(tmp_path, ONE, a__csv=csv(data=moving(cap_pressure_2=1e5 * PRESSURE)))
+@pytest.mark.parametrize("factor", [1e5, 1e-5])
+def test_a_channel_in_another_unit_is_kept_and_spoken_of(tmp_path: Path, factor: float) -> None:
+    report = bring(tmp_path, ONE, a__csv=csv(data=moving(cap_pressure_2=factor * PRESSURE)))
     assert any("is the unit another" in warning for warning in report.warnings)
     (record,) = load_run(tmp_path / "run").records
     assert not np.isnan(record.channels["cap_pressure_2"]).any()

@@ -18,11 +18,12 @@ from rig.runs.exchange.settings import EXCHANGE
 
 Array = NDArray[np.float64]
 
+_PRESSURES = (ch.CAP, ch.ROD, ch.SUPPLY)
 _DRIVEN = (ch.SPOOL, ch.DRIVE)  # channels that a waveform or its limit may keep constant
 
 
 def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
-    """Return a sentence for each constant, stuck, clipped or hardly moving channel (n,); else [].
+    """Return a sentence for each constant, stuck, clipped or far too small channel (n,); else [].
 
     Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
     """
@@ -36,8 +37,8 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
         if low == high:
             said.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
             continue
-        if still := _hardly_moves(rig, kind, name, high - low):
-            said += still
+        if small := _too_small(rig, kind, name, low, high):
+            said += small
             continue
         beyond = _beyond(rig, kind, name, low, high)
         flat = [] if beyond or kind in _DRIVEN else _flat(name, values, unit)
@@ -61,13 +62,19 @@ def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
     ]
 
 
-def _hardly_moves(rig: Rig, kind: str, name: str, travel: float) -> list[str]:
-    ends = rig.sensors.of(kind).range
-    share = travel / (ends[1] - ends[0])
-    if kind not in (ch.PISTON, ch.POSITION) or share >= EXCHANGE.least_travel:
+def _too_small(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
+    ends, unit = rig.sensors.of(kind).range, rig.unit_of(name)
+    if kind in _PRESSURES:  # one may hardly change, but is no such small part of its range
+        seen, words = max(abs(low), abs(high)), "stays below"
+    elif kind in (ch.PISTON, ch.POSITION):
+        seen, words = high - low, "moves by"
+    else:
+        return []
+    share = seen / (ends[1] - ends[0])
+    if share >= EXCHANGE.least_part:
         return []
     return [
-        f"{name}: moves by {travel:.3g} {rig.unit_of(name)}, {100 * share:.2f} % of the range of "
+        f"{name}: {words} {seen:.3g} {unit}, {100 * share:.2g} % of the range of "
         "the rig's sensor; is the unit another?"
     ]
 

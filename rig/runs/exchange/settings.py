@@ -36,7 +36,7 @@ class ExchangeSettings:
     end: float = 1e-3  # of a sensor's range, from its end
     outliers: float = 0.01  # of a channel's samples: so few beyond the range are taken as lost
     stuck_travel: float = 0.2  # of the piston's travel, while a pressure keeps one exact value
-    least_travel: float = 2e-3  # of a position sensor's range: a joint that is free moves more
+    least_part: float = 2e-3  # of a sensor's range: free joints move, pressures are higher
 
 
 EXCHANGE: Final = ExchangeSettings()
