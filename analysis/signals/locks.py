@@ -55,8 +55,11 @@ def motion_bands(rig: Rig, repeats: Sequence[Record]) -> Array:
         if len(locked) < len(repeats):
             bands.append(np.inf)
             continue
-        length = min(SIGNALS.deciding_samples, *(r.samples for r in locked))
-        every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in locked])
+        # A repeat that was cut short decides nothing: what it cannot show is not absent.
+        longest = max(r.samples for r in locked)
+        long = [r for r in locked if r.samples >= SIGNALS.deciding_share * longest]
+        length = min(SIGNALS.deciding_samples, *(r.samples for r in long))
+        every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in long])
         bands.append(_band(every, rate, noise))
     return np.array(bands)
 

@@ -20,11 +20,13 @@ class SignalSettings:
     # A locked joint moves where the rms of its acceleration within the widest of `moving_bands`
     # [Hz] exceeds `moving_ratio` times that of the stated sensor noise, or within any of them
     # `common_ratio` times that of the noise as measured by the repeats, if smaller: a narrow band
-    # has few independent samples. The first `deciding_samples` decide.
+    # has few independent samples. The first `deciding_samples` decide, of the repeats that have at
+    # least `deciding_share` of the longest one's samples.
     moving_bands: tuple[float, ...] = (15.0, 5.0, 2.0)
     moving_ratio: float = 1.2
     common_ratio: float = 2.0
     deciding_samples: int = 120_000
+    deciding_share: float = 0.5
 
 
 SIGNALS: Final = SignalSettings()

@@ -219,6 +219,19 @@ def test_a_lock_that_gives_slowly_is_seen_in_a_narrow_band_and_filtered_to_it(
     assert error(np.array([np.inf, np.inf])) > 3.0
 
 
+def test_a_repeat_that_was_cut_short_does_not_hide_that_a_lock_yields(
+    multisine_run: Run, rig: Rig
+) -> None:
+    """A run that tripped after a second, and three whole ones: joint 1 yields in all of them."""
+    record = next(r for r in multisine_run.records if r.step == "step1")
+    moved = record.channels["piston_1"] + 2e-3 * np.sin(2.6 * np.pi * record.time)
+    whole = changed(record, piston_1=moved)
+    begun = {name: x[:1000] for name, x in whole.channels.items()}
+    short = replace(whole, repeat=4, channels=begun)
+    assert motion_bands(rig, [whole, short]).tolist() == motion_bands(rig, [whole]).tolist()
+    assert motion_bands(rig, [whole])[0] > 0.0
+
+
 def test_a_parameter_that_rests_on_sensor_noise_is_no_parameter(
     multisine_run: Run, rig: Rig
 ) -> None:
