@@ -16,6 +16,8 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import clipped_samples
 from analysis.simulation.model import Estimate, rig_difference
+from analysis.simulation.model_draws import far_from_nominal
+from analysis.simulation.settings import SIMULATION
 from analysis.terms.inertia import chain_matrix, mass_matrix
 from rig.model import channels as ch
 from rig.model.parameters import gain_names, inertia_names
@@ -284,8 +286,17 @@ def masked(rows: int, dropped: int) -> Check:
 
 
 def consistency(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
-    """State signs, positive inertia over the workspace, R12/W2 against l1, and b."""
-    return [_signs(rig, estimates), *_inertia(rig, estimates), *_bulk(estimates)]
+    """State signs, positive inertia over the workspace, R12/W2 against l1, b, nominal values."""
+    parts = [_signs(rig, estimates), *_inertia(rig, estimates), *_bulk(estimates)]
+    return parts + _nominal(rig, estimates)
+
+
+def _nominal(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
+    if not rig.nominal:
+        return []
+    far = far_from_nominal(rig, {name: e.value for name, e in estimates.items()})
+    within = f"within a factor of {SIMULATION.far_from_nominal:g} of the rig file's"
+    return [Check("nominal values", not far, far or within)]
 
 
 def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:

@@ -10,7 +10,7 @@ unbiased in the rest, whose signs are random.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -21,6 +21,7 @@ from scipy.linalg import hadamard
 from analysis.simulation.model import Model, rig_difference
 from analysis.simulation.settings import SIMULATION
 from analysis.terms import BASELINE
+from rig.model.parameters import is_positive
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -84,25 +85,49 @@ def unusable(model: Model, rig: Rig) -> str:
     ]
     if unknown:
         return f"it has no intervals for {' '.join(unknown)}"
-    for name in _flow_parameters(model):
+    return _implausible(model, rig)
+
+
+def _implausible(model: Model, rig: Rig) -> str:
+    """Return which parameter the machine cannot have or the data hardly determine ('' if none)."""
+    for name in filter(is_positive, _baseline_parameters(model)):
         p = model.parameters[name]
-        half = max(p.ci95[1] - p.value, p.value - p.ci95[0])
         if p.value <= 0.0:
             return f"its {name} is {p.value:.3g} {p.unit}, expected more than 0"
+    for name in _baseline_parameters(model, "fluid"):
+        p = model.parameters[name]
+        half = max(p.ci95[1] - p.value, p.value - p.ci95[0])
         if half > SIMULATION.widest_interval * p.value:
             return (
                 f"its {name} is known to +- {100 * half / p.value:.0f} % only, expected "
                 f"{100 * SIMULATION.widest_interval:.0f} % or less"
             )
-    return ""
+    far = far_from_nominal(rig, model.values)
+    return f"it has {far}" if far else ""
 
 
-def _flow_parameters(model: Model) -> list[str]:
-    """Name b and the flow gains, to which stroke and speed are proportional."""
+def far_from_nominal(rig: Rig, values: Mapping[str, float]) -> str:
+    """Name the positive parameters a factor away from the rig's nominal values ('' if none).
+
+    The factor, `SIMULATION.far_from_nominal`, is one of a wrong unit or of a wrong gain.
+    """
+    most = SIMULATION.far_from_nominal
+    ratio = {n: values[n] / rig.nominal[n] for n in rig.nominal if n in values and is_positive(n)}
+    far = [f"{n} {r:.2g}" for n, r in ratio.items() if r > most or 0.0 < r < 1.0 / most]
+    if not far:
+        return ""
+    return (
+        f"{', '.join(far)} times the nominal value of the rig file, expected within a factor of "
+        f"{most:g}: is a channel in another unit, or is the nominal value wrong?"
+    )
+
+
+def _baseline_parameters(model: Model, family: str | None = None) -> list[str]:
+    """Name the parameters of the baseline's terms, or of those in one family of rows."""
     return [
         c.parameter
         for used in model.terms
         if used.term.name in BASELINE
         for c in used.term.parameters(model.rig)
-        if c.family == "fluid"
+        if family in (None, c.family)
     ]

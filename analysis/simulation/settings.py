@@ -38,6 +38,9 @@ class SimulationSettings:
     # -- the twin ------------------------------------------------------------------------------
     # A rig file's guess of a valve's gain is seldom worse than half of it.
     widest_interval: float = 0.5  # half width of b and flow gains, relative, that a twin may have
+    # A factor between an identified and a nominal value that only a wrong unit or gain explains:
+    # decimal units differ by ten or more, a poor guess or a payload by less than four.
+    far_from_nominal: float = 4.0
     # Models within the intervals, a power of two. Eight widen a range by an amount that differs by
     # less than half from that of thirty-two (seed bench identified from four repeats: within 40 %).
     twin_draws: int = 8

@@ -232,6 +232,22 @@ def test_a_repeat_that_was_cut_short_does_not_hide_that_a_lock_yields(
     assert motion_bands(rig, [whole])[0] > 0.0
 
 
+def test_a_spool_recorded_ten_times_too_large_is_seen_by_the_nominal_gains(
+    multisine_run: Run, found: Identification
+) -> None:
+    records = [
+        changed(r, **{n: 10.0 * r.channels[n] for n in ("spool_1", "spool_2")})
+        for r in multisine_run.records
+    ]
+    result = identify([replace(multisine_run, records=tuple(records))])
+    before, after = (
+        next(c for c in each.checks if c.name == "nominal values") for each in (found, result)
+    )
+    assert before.ok
+    assert not after.ok
+    assert after.detail.startswith("C_pp_1 0.11, C_pm_1 0.11, ")
+
+
 def test_a_parameter_that_rests_on_sensor_noise_is_no_parameter(
     multisine_run: Run, rig: Rig
 ) -> None:

@@ -197,6 +197,12 @@ def test_the_effects_of_the_model_are_in_the_twin(rig: Rig, tmp_path: Path) -> N
         (lambda m: known(m, {}, 0.4), "is known to +- 80 % only, expected 50 % or less"),
         (lambda m: known(m, {"b": float("nan")}, 1e-3), "it does not determine b"),
         (lambda m: known(m, {"C_pp_2": -1e-7}, 1e-3), "its C_pp_2 is -1e-07"),
+        (lambda m: known(m, {"M2": -1.3}, 1e-3), "its M2 is -1.3 kg"),
+        (
+            lambda m: known(m, {"C_mm_1": 6e-8}, 1e-3),
+            "it has C_mm_1 0.1 times the nominal value of the rig file, expected within a factor "
+            "of 4: is a channel in another unit",
+        ),
         (lambda m: known(m, {}, float("nan")), "it has no intervals for M1"),
         (
             lambda m: replace(
