@@ -20,7 +20,7 @@ from analysis.regression.rows import Filtering, default_filtering
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.records import Record, Run, with_loads_stated
+from rig.model.records import Record, Run, refuse_malformed, with_loads_stated
 from rig.model.rig import Rig
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
@@ -50,6 +50,7 @@ def identify(
     Raises InputError for another method or estimator, for runs of different rigs and for records
     that cannot be used, naming record and channel.
     """
+    refuse_malformed(runs)
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)
     rig, runs = ck.common_rig(runs), with_loads_stated(runs)

@@ -33,7 +33,7 @@ from analysis.simulation.simulate import (
 )
 from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Record, Run, refuse_malformed
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -74,6 +74,7 @@ def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
     Raises InputError for a run of another rig, a record too short, or a model with parameters
     that were not identified.
     """
+    refuse_malformed(runs)
     out = []
     for run in runs:
         refuse_other_rig(model, run.rig, run.source or "the run")

@@ -83,7 +83,13 @@ from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError
-from rig.model.records import Record, Run, with_common_bandwidth, with_loads_stated
+from rig.model.records import (
+    Record,
+    Run,
+    refuse_malformed,
+    with_common_bandwidth,
+    with_loads_stated,
+)
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -127,6 +133,8 @@ def trace(
     judging records that are equal to others, and for records that are too short.
     """
     started = time.perf_counter()
+    for given in (runs, holdout, judge):
+        refuse_malformed(given)
     rig = ck.common_rig([*runs, *holdout, *judge])
     _refuse_same(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)

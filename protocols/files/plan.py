@@ -274,7 +274,7 @@ def _located(problem: str, step: StepKind) -> str:
 
 
 def _whole(step: str, duration: float, period: int, rate: float) -> int:
-    if duration > LONGEST_RECORD:
+    if not duration <= LONGEST_RECORD:  # NaN as well
         raise InputError(
             f"step {step!r}: duration {duration:g} s; expected at most {LONGEST_RECORD:g} s"
         )

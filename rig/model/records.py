@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -105,6 +106,44 @@ class Run:
     records: tuple[Record, ...]
     source: str = ""
     state: str = "done"
+
+
+def refuse_malformed(runs: Sequence[Run]) -> None:
+    """Raise InputError for runs made in Python whose records no analysis can work on.
+
+    Records of run folders and of imports are checked where they are read.
+    """
+    if isinstance(runs, Run) or not all(isinstance(run, Run) for run in runs):
+        raise InputError("expected a list of runs, such as [load_run('runs/monday')]")
+    for run in runs:
+        for record in run.records:
+            if problem := _malformed(record):
+                raise InputError(f"record {record.name!r} of {run.source or 'a run'}: {problem}")
+
+
+def _malformed(record: Record) -> str:
+    """Return what is wrong with a record ('' if nothing)."""
+    if not (np.isfinite(record.sample_rate) and record.sample_rate > 0):
+        return f"its sample rate is {record.sample_rate} Hz, expected a positive number"
+    if record.period < 0:
+        return f"its period is {record.period} samples, expected 0 (not periodic) or more"
+    if not record.channels:
+        return "it has no channels"
+    for name, samples in record.channels.items():
+        if problem := _malformed_samples(samples):
+            return f"{name}: {problem}"
+    lengths = {len(x) for x in record.channels.values()}
+    if len(lengths) > 1:
+        return f"its channels have {min(lengths)} to {max(lengths)} samples, expected equally many"
+    return "" if lengths != {0} else "it has no samples"
+
+
+def _malformed_samples(samples: Array) -> str:
+    x = np.asarray(samples)
+    if x.ndim != 1 or x.dtype.kind != "f" or x is not samples:
+        found = f"{type(samples).__name__} of {x.dtype}, shape {x.shape}"
+        return f"expected an array (n,) of floats, found {found}"
+    return ""
 
 
 def common_bandwidth(widths: Sequence[float | None]) -> float | None:

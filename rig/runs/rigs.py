@@ -28,6 +28,8 @@ def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple
     `relative_to` is the folder that a relative path starts from (default: the current one).
     Raises InputError.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise InputError(f"expected the name or the file of a rig, found {name_or_path!r:.60}")
     wanted = os.fspath(name_or_path)
     names = shipped_rigs()
     if wanted in names:

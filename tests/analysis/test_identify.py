@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter, row_filter, row_step
 from analysis.signals.locks import accelerates, motion_bands
 from analysis.simulation.synthetic import multisine, synthetic_run
+from analysis.simulation.validate import validate
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -246,6 +249,52 @@ def test_a_spool_recorded_ten_times_too_large_is_seen_by_the_nominal_gains(
     assert before.ok
     assert not after.ok
     assert after.detail.startswith("C_pp_1 0.11, C_pm_1 0.11, ")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (
+            {"piston_2": np.zeros(9_995)},
+            "its channels have 9995 to 10000 samples, expected",
+        ),
+        ({"piston_2": np.zeros((10_000, 1))}, "piston_2: expected an array (n,) of floats, found"),
+        ({"piston_2": [0.0] * 10_000}, "found list of float64, shape (10000,)"),
+        ({"piston_2": np.zeros(10_000, dtype=int)}, "found ndarray of int64"),
+    ],
+)
+def test_a_record_made_in_python_is_checked_before_it_is_used(
+    multisine_run: Run, found: Identification, spoil, words: str
+) -> None:  # type: ignore[no-untyped-def]
+    first, *others = multisine_run.records
+    run = replace(multisine_run, records=(changed(first, **spoil), *others))
+    for work in (lambda: identify([run]), lambda: validate(found.model, [run])):
+        with pytest.raises(InputError, match=re.escape(words)) as caught:
+            work()
+        assert first.name in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"sample_rate": 0.0}, "its sample rate is 0.0 Hz, expected a positive number"),
+        ({"sample_rate": float("nan")}, "its sample rate is nan Hz"),
+        ({"period": -5}, "its period is -5 samples, expected 0 (not periodic) or more"),
+        ({"channels": {}}, "it has no channels"),
+        ({"channels": {"spool_1": np.zeros(0)}}, "it has no samples"),
+    ],
+)
+def test_so_are_the_numbers_that_describe_it(
+    multisine_run: Run, change: dict[str, Any], words: str
+) -> None:
+    record = replace(multisine_run.records[0], **change)
+    with pytest.raises(InputError, match=re.escape(words)):
+        identify([replace(multisine_run, records=(record,))])
+
+
+def test_one_run_in_place_of_a_list_of_runs_is_refused(multisine_run: Run) -> None:
+    with pytest.raises(InputError, match="expected a list of runs"):
+        identify(multisine_run)  # type: ignore[arg-type]
 
 
 def test_a_parameter_that_rests_on_sensor_noise_is_no_parameter(
