@@ -107,7 +107,7 @@ def _who(view: PlotView, width: int) -> Row:
     speed = f" ({view.newest.speed:.0f}×)" if view.newest.speed > 1.5 else ""
     clock = f"  t {clock_text(run_time(view.newest))}{speed} "
     command = "in command" if view.in_command else "held by another" if snapshot.holder else ""
-    command = f"{command}  " if command else "read-only  "
+    command = f" {command or 'read-only'}  "
     right = row((command, DIM), (word, style if not view.newest.over else DIM), (clock, STRONG))
     name = snapshot.run.rstrip("/").rpartition("/")[2]
     return ends(row(badge, (f" {snapshot.rig}", STRONG), (f"  {name}", DIM)), right, width)
