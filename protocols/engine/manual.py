@@ -22,7 +22,7 @@ from protocols.engine.locking import position_law
 from protocols.engine.session import BenchSession
 from protocols.engine.settings import ENGINE
 from protocols.steps.parts import Place
-from rig.bench.guard import FREE, JointRole
+from rig.bench.guard import FREE, JOGGED, JointRole
 from rig.bench.screens.commands import Command
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -147,7 +147,7 @@ class Manual:
             moving = self._jog is not None and self._jog[0] == joint
             law = position_law(self._jogging, self._jog[1], 0.0) if moving and self._jog else OFF
             laws.append(law)
-            roles.append(FREE)
+            roles.append(JOGGED if moving else FREE)
         if tuple(laws) == self._laws:
             return
         self._laws = tuple(laws)

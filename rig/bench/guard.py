@@ -23,7 +23,7 @@ from rig.bench.checks.frozen import Frozen
 from rig.bench.checks.plausibility import Plausibility
 from rig.bench.checks.rates import rate_window, rates
 from rig.bench.checks.recent import Recent
-from rig.bench.checks.roles import EXCITED, FREE, JointRole, piston_bounds
+from rig.bench.checks.roles import EXCITED, FREE, JOGGED, JointRole, piston_bounds
 from rig.bench.checks.saturation import Saturation
 from rig.bench.checks.settings import GuardSettings
 from rig.model import channels as ch
@@ -47,7 +47,8 @@ from rig.model.trips import (
 )
 
 __all__ = [
-    "EXCITED", "FREE", "Guard", "GuardSettings", "JointRole", "piston_bounds", "rate_window",
+    "EXCITED", "FREE", "JOGGED", "Guard", "GuardSettings", "JointRole", "piston_bounds",
+    "rate_window",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -124,7 +125,9 @@ class Guard:
         self._inner = bands.inner_bounds(self.rig, self._warn, self.settings)
         self._tightest = self._trip.within(self._warn)
         excited = [
-            frozen.judged for r, frozen in zip(roles, self._frozen, strict=True) if r.excited
+            frozen.judged
+            for r, frozen in zip(roles, self._frozen, strict=True)
+            if r.excited or r.jogged
         ]
         self._may_freeze = np.any(excited, axis=0) if excited else None
         self._plausibility.restart()
@@ -256,14 +259,15 @@ class Guard:
         return Violation(limit, value, bounds.of(column), ch.unit_of(name), joint, name, tick)
 
     def _frozen_sensors(self, last: int) -> list[Violation]:
-        """Return the trip of an excited joint's channel that kept one value in the window."""
+        """Return the trip of a moved joint's channel that kept one value in the window."""
         window = self._recent.last(self._window)
         if len(window) < self._window:
             return []
         if not np.count_nonzero((window[0] == window[-1]) & self._may_freeze):
             return []  # mostly the first and last value differ, and no further check is needed
         for joint, (role, frozen) in enumerate(zip(self.roles, self._frozen, strict=True), 1):
-            column = frozen.find(window) if role.excited else None
+            judged = role.excited or role.jogged
+            column = frozen.find(window, role.jogged) if judged else None
             if column is None:
                 continue
             name = self.rig.recorded[column]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
-from rig.bench.guard import EXCITED, FREE, Guard, GuardSettings, JointRole, rate_window
+from rig.bench.guard import EXCITED, FREE, JOGGED, Guard, GuardSettings, JointRole, rate_window
 from rig.model.channels import kind_of
 from rig.model.parts import BenchLimits
 from rig.model.trips import SafetyTrip, Violation
@@ -203,6 +203,28 @@ def test_a_sensor_that_freezes_while_its_joint_moves_trips(channel: str, cuts: l
     said = str(SafetyTrip(found, RIG))
     assert f"limit 'frozen sensor', {channel} of joint 2 (arm)" in said
     assert "0.25 s" in said
+
+
+@pytest.mark.parametrize("volts", [0.15, -0.15])
+def test_a_position_that_freezes_during_a_jog_trips(volts: float) -> None:
+    """The command of a jog is constant, and spool and pressures with it."""
+    data, every_ten = quiet_stream(n=600), list(range(10, 600, 10))
+    data[:, NAMES.index("command_2")] = volts
+    sensor, rng = RIG.sensors.piston, np.random.default_rng(6)
+    code = np.ptp(sensor.range) / ((1 << sensor.bits) - 1)
+    piston = 1e-5 * volts * np.arange(600) + rng.normal(0.0, sensor.noise, 600)
+    data[:, NAMES.index("piston_2")] = code * np.round(piston / code)
+    guard = Guard(RIG)
+    guard.set_roles([FREE, JOGGED])
+    assert first_violation(guard, blocks(data, every_ten)) is None
+    guard.forget()
+    data[200:, NAMES.index("piston_2")] = data[200, NAMES.index("piston_2")]
+    found = first_violation(guard, blocks(data, every_ten))
+    assert found is not None
+    assert (found.limit, found.channel, found.joint) == ("frozen sensor", "piston_2", 2)
+    guard.forget()
+    data[:, NAMES.index("command_2")] = 0.0
+    assert first_violation(guard, blocks(data, every_ten)) is None  # a closed valve may hold it
 
 
 def test_what_may_stand_still_is_not_called_frozen() -> None:

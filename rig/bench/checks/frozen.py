@@ -5,7 +5,8 @@ joint's command and another of its channels move. This cannot be a slow signal o
 converter: only sensors whose stated noise is a code or more are judged. Even at rest, two samples
 in a row of such a sensor read the same code with a probability of at most q / (2 sigma sqrt(pi)) <
 0.29 (q: one code), 250 of them with 0.29^249. Noise four times smaller than stated would still need
-a pressure or position constant to a code while the joint moves. A sensor at an end of its range is
+a pressure or position constant to a code while the joint moves. In a jog the command is constant
+and nothing else need change: there the position alone is judged. A sensor at an end of its range is
 left to the check for saturation.
 """
 
@@ -22,6 +23,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 SWING: Final = 0.05  # share of the command's limit, peak to peak, that moves a joint
+HELD: Final = 0.01  # share of the command's limit that, kept up in a jog, moves a joint
 _MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
 
 
@@ -42,14 +44,19 @@ class Frozen:
         self._high = np.array([s.range[1] for _, s in parts]) - codes
         self._command = rig.recorded.index(ch.channel(ch.COMMAND, joint + 1))
         self._swing = SWING * rig.joints[joint].limits.command
+        self._held = HELD * rig.joints[joint].limits.command
+        self._position = np.array(
+            [kind == rig.position_kind for _, kind, i in own if i == joint + 1]
+        )
 
-    def find(self, window: Array) -> int | None:
+    def find(self, window: Array, jogged: bool = False) -> int | None:
         """Return the column that kept one value over a window of samples, None if none did."""
         values = window[:, self._columns]
         still = (values == values[0]).all(axis=0) & self._judged
         still &= (values[0] > self._low) & (values[0] < self._high)
-        if not still.any() or np.ptp(window[:, self._command]) < self._swing:
+        command = window[:, self._command]
+        if jogged:
+            still &= self._position & (max(command.min(), -command.max()) >= self._held)
+        elif np.ptp(command) < self._swing or not (np.ptp(values, axis=0) > self._moved).any():
             return None
-        if not (np.ptp(values, axis=0) > self._moved).any():
-            return None
-        return int(self._columns[np.argmax(still)])
+        return int(self._columns[np.argmax(still)]) if still.any() else None

@@ -15,10 +15,12 @@ class JointRole:
     """The present role of a joint.
 
     The piston of an `excited` joint must stay within `limits.piston`; any other may reach the ends
-    of its stroke. A locked piston must stay within `tolerance` [m] of `locked_at` [m].
+    of its stroke, also that of a `jogged` one, which a person moves. A locked piston must stay
+    within `tolerance` [m] of `locked_at` [m].
     """
 
     excited: bool = False
+    jogged: bool = False
     locked_at: float | None = None
     tolerance: float = math.inf
 
@@ -30,6 +32,7 @@ class JointRole:
 
 FREE = JointRole()
 EXCITED = JointRole(excited=True)
+JOGGED = JointRole(jogged=True)
 
 
 def piston_bounds(role: JointRole, rig: Rig, joint: int) -> tuple[str, float, float]:
