@@ -129,9 +129,13 @@ class WireSettings(Part):
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
         """Return the settings of an endpoint such as ``modbus-tcp://127.0.0.1:5020``.
 
-        Raises ValueError where it does not have the form of `example`.
+        By default KIND://VALUE of the one setting that a rig file must state. Raises ValueError
+        where it does not have the form of `example`, or where no single setting must be stated.
         """
-        raise NotImplementedError
+        needed = [name for name, field in cls.model_fields.items() if field.is_required()]
+        if len(needed) != 1:
+            raise ValueError("no single setting names the device")
+        return {needed[0]: url.netloc + url.path}
 
     example: ClassVar[str] = ""
 

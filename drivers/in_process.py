@@ -201,7 +201,7 @@ class InProcessDriver:
         try:
             measured, outputs = device.advance(BLOCK_SAMPLES, laws)
             block = self._block(np.asarray(measured), np.asarray(outputs))
-        except Exception as error:  # any exception of the user's object
+        except (Exception, SystemExit) as error:  # any exception of the user's object
             self.close()
             raise DeviceLost(f"the object of the wire in-process failed: {error!r}") from error
         self._tick += BLOCK_SAMPLES

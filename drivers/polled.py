@@ -477,7 +477,7 @@ class PolledDriver:
         except OSError as error:
             self._loss = f"the device of wire {self._wire.kind} is gone: {error}"
             raise DeviceLost(self._loss) from error
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a library's sys.exit() would end a run as done
             raise DeviceError(
                 f"the device of wire {self._wire.kind} failed: {type(error).__name__}: {error}"
             ) from error

@@ -51,5 +51,10 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
     try:
         values = settings.of_endpoint(url)
     except ValueError as error:
-        raise InputError(f"--endpoint {endpoint}: expected one like {settings.example}") from error
+        wanted = (
+            f"one like {settings.example}"
+            if settings.example
+            else (f"the settings of {url.scheme} in the rig file's section `wire`")
+        )
+        raise InputError(f"--endpoint {endpoint}: expected {wanted}") from error
     return wire.reached_by(url.scheme, values)

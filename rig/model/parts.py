@@ -352,13 +352,32 @@ class Wire(Part):
 
     @property
     def endpoint(self) -> str:
-        """The bench's address in the form of `--endpoint`: device file, bus, or host and port."""
+        """The bench's address in the form of `--endpoint`: device file, bus, or host and port.
+
+        Two benches of one computer must differ in it: trips are stored and benches locked by it.
+        That of a kind with none of these keys is what names its device: texts, as `address: COM3`,
+        or the card of its outputs' channels, as `Dev1/ao0`.
+        """
         at = self.settings
         if "bus" in at:
             rest = urlencode({key: value for key, value in at.items() if key != "bus"}, safe="/")
             return f"{self.kind}://{at['bus']}{'?' if rest else ''}{rest}"
         if "device" in at:
             return f"{self.kind}://{at['device']}"
+        if "host" not in at and "port" not in at and (named := _cards(at) or _texts(at)):
+            return f"{self.kind}://{','.join(named)}"
         host = str(at.get("host", LOCALHOST))
         host = f"[{host}]" if ":" in host else host
         return f"{self.kind}://{host}:{at.get('port', PORT)}"
+
+
+def _cards(settings: Mapping[str, Any]) -> list[str]:
+    """Return the first part of the channels of outputs, such as Dev1 of Dev1/ao0."""
+    outputs = settings.get("outputs")
+    places = outputs.values() if isinstance(outputs, dict) else ()
+    channels = [str(p["channel"]) for p in places if isinstance(p, dict) and "channel" in p]
+    return sorted({channel.partition("/")[0] for channel in channels})
+
+
+def _texts(settings: Mapping[str, Any]) -> list[str]:
+    return [value for value in settings.values() if isinstance(value, str)]

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
-from drivers.base import DeviceLost, OutputLaw
+from drivers.base import DeviceError, DeviceLost, OutputLaw
 from drivers.modbus_map import InputEntry, MapSettings, OutputEntry, register_map
 from drivers.nidaqmx_card import CardInput, CardOutput, CardSettings, wiring
 from drivers.polled import InputsOutputs, PolledDriver
 from drivers.register_types import RegisterType
+from rig.bench.latch import BenchState
 from rig.model.parse import parse_model
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -68,18 +71,34 @@ class Line:
         self.sent.append(text)
 
     def ask(self, text: str) -> str:
+        if self.channels == "off":
+            sys.exit(0)
         return "seven" if text == "name" else self.channels
 
     def close(self) -> None:
         pass
 
 
-def test_the_pages_small_class_is_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("channels", "kind", "words"),
+    [
+        ("", DeviceLost, "switched on"),
+        ("off", DeviceError, "failed: SystemExit: 0"),  # the library ends the program
+    ],
+)
+def test_the_pages_small_class_is_a_driver(
+    channels: str, kind: type[Exception], words: str
+) -> None:
     line = Line()
     names: dict[str, Any] = {"open_line": lambda _: line, "__name__": "my_bench.gauge"}
     exec(compile(listing(OWN_PAGE, "python"), "own-device.md", "exec"), names)
     rig = seed_rig().model_copy(update={"sample_rate": 100.0})
     wire = Wire(kind="gauge-box", timeout=0.2, watchdog=0.5, address="COM3")  # type: ignore[call-arg]
+    assert wire.endpoint == "gauge-box://COM3"
+    other = {"address": "COM4"}
+    assert names["GaugeSettings"].of_endpoint(urlsplit("gauge-box://COM4")) == other
+    # A trip at one box is not reset at the other.
+    assert BenchState(wire).folder != BenchState(wire.reached_by("gauge-box", other)).folder
     driver = names["GaugeDriver"](wire, rig)
     assert isinstance(driver, PolledDriver)
     box: InputsOutputs = names["GaugeBox"](line)
@@ -89,8 +108,8 @@ def test_the_pages_small_class_is_a_driver(monkeypatch: pytest.MonkeyPatch) -> N
     driver.apply([OutputLaw(bias=1.0, limit=2.0), OutputLaw()])
     assert driver.read_block().data.shape[1] == 12
     assert line.sent[-1] == "put 1.0000 0.0000"
-    line.channels = ""
-    with pytest.raises(DeviceLost, match="switched on"):
+    line.channels = channels
+    with pytest.raises(kind, match=words):
         driver.read_block()
     assert line.sent[-1] == "put 0.0000 0.0000"
     driver.close()
