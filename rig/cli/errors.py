@@ -97,7 +97,8 @@ def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., 
     )
 
 
-def _code_and_message(error: BaseException) -> tuple[int, str]:
+def code_and_message(error: BaseException) -> tuple[int, str]:
+    """Return the exit code of an exception, and what a person is told about it."""
     for kinds, code, text in _codes():
         if isinstance(error, kinds):
             return code, _with_notes(error, text(error))
@@ -144,7 +145,7 @@ def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
 def _failed(error: BaseException, debug: bool) -> int:
     if debug:
         traceback.print_exception(error)
-    code, message = _code_and_message(error)
+    code, message = code_and_message(error)
     _say(message)
     return code
 

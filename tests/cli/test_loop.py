@@ -165,7 +165,7 @@ def test_a_trip_ends_the_loop_with_its_code_and_what_was_known(tmp_path: Path) -
     assert "cap_pressure_2" in done.stderr.strip().splitlines()[-1]
     told = json.loads((out / "loop.json").read_text())
     assert told["rounds"] == []
-    assert "SafetyTrip" in told["stopped"]
+    assert told["stopped"].startswith("safety trip: limit ")
     assert (out / "run-1" / "state").read_text().strip() == "tripped"
 
 

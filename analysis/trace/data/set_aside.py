@@ -106,5 +106,5 @@ def _division_note(divided: Collection[Group], short: Sequence[str]) -> str:
     rest = f"; too short for that, {' '.join(short)} does both" if short else ""
     return (
         f"a third of the held-out rows (every third block of {DATA.judging_block:g} s) judges and "
-        f"the rest chooses; `--judge RUN` gives both in full{rest}"
+        f"the rest chooses; `bramah trace --judge RUN` gives both in full{rest}"
     )

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rig.cli.errors import code_and_message
 from rig.cli.options import (
     EndpointOption,
     JsonOption,
@@ -97,7 +98,7 @@ def loop(
         try:
             experiments.close()
         except BaseException as error:
-            experiments.stopped = f"{type(error).__name__}: {error}"
+            experiments.stopped = code_and_message(error)[1]
             raise
         finally:
             _show_result(experiments, json, report or out / "loop.html")
