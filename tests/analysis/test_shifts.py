@@ -90,7 +90,7 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
     X = np.column_stack((x, 0.5 * x + 0.5 * x * np.abs(x) + 0.15 * np.cos(6 * np.pi * t)))
     parts = np.arange(200) // 25
     hits, narrower = [], []
-    for _ in range(400):
+    for _ in range(200):
         truth = np.array([1.0, known * rng.standard_normal()])
         blocks = [
             RepeatBlock(0, step, r, f"{step}_r{r}", "flow_cap_1", X,

@@ -200,6 +200,7 @@ def test_a_leak_that_began_between_the_runs_gets_no_clue_from_the_noise_before_i
     assert any("the machine has changed between the runs" in note for note in result.notes)
 
 
+@pytest.mark.slow  # with few candidates: test_clue_formula
 def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     quiet: tuple[Run, Run],
 ) -> None:
