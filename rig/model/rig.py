@@ -105,6 +105,17 @@ class Rig(Part):
         return values
 
     @model_validator(mode="after")
+    def _calibrations_of_channels(self) -> Self:
+        stated = () if self.electric else self.sensors.calibrations
+        unknown = [name for name in stated if name not in self.channels]
+        if unknown:
+            raise ValueError(
+                f"sensors calibrations {unknown[0]}: this rig has no such channel; it has "
+                f"{' '.join(self.channels)}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _limits_can_be_seen(self) -> Self:
         """Reject a limit beyond the sensor's range, which no sample could pass."""
         if self.electric:

@@ -233,7 +233,8 @@ def test_a_sensor_s_calibration_has_a_date_and_a_serial_number() -> None:
     rig = Rig.model_validate(data)
     assert rig.sensors.calibrations["cap_pressure_1"].date.isoformat() == "2026-02-01"
     assert Rig.model_validate(rig.model_dump(mode="json")) == rig
-    for wrong in ({"piston": given}, {"piston_1": {**given, "date": "soon"}}, {"piston_1": {}}):
+    soon = {**given, "date": "soon"}
+    for wrong in ({"piston": given}, {"piston_3": given}, {"piston_1": soon}, {"piston_1": {}}):
         data["sensors"]["calibrations"] = wrong
         with pytest.raises(ValueError, match="calibrations"):
             Rig.model_validate(data)
