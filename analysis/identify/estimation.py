@@ -166,19 +166,20 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         if estimator == "robust":
             checks.append(outlier_statement(p.family, fit))
         if job.bootstrap:
-            ends |= _bootstrap_ends(job, p, estimator, fit, shift)
+            ends |= _bootstrap_ends(job, p, estimator, shift)
     return Refinement(new, tuple(checks), estimator, ends)
 
 
 def _bootstrap_ends(
-    job: EstimationJob, p: FamilyBlocks, estimator: str, fit: EquationFit, shift: Array
+    job: EstimationJob, p: FamilyBlocks, estimator: str, shift: Array
 ) -> dict[str, tuple[float, float]]:
     """Return the bootstrap's intervals by name, extended by a shift (k,) of the value.
 
     No resampling shows this shift, because it is the same in every repeat.
     """
     rng = job.rng or np.random.default_rng(0)
-    kind, rows = _FITS[estimator], _prior_rows(p, fit, estimator)
+    kind = _FITS[estimator]
+    rows = _prior_rows(p, kind(p.blocks), estimator)
     drawn = bootstrap(p.blocks, _redo(kind, rows, p.parameters), job.bootstrap, rng)
     # Towards the estimate by instruments.
     low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
@@ -267,7 +268,7 @@ def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, Equ
 
 
 def _prior_rows(p: FamilyBlocks, fit: EquationFit, estimator: str) -> tuple[PriorRow, ...]:
-    """Return the rows of a family's prior knowledge beside those of its fit by an estimator."""
+    """Return the rows of prior knowledge beside those of a fit that is not joined with them."""
     plain = least_squares(fit.blocks) if estimator == "iv" else fit
     return prior_rows(plain, nu.priors(p.names, plain.beta))
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from analysis.identify.estimation import EstimationJob, _bootstrap_ends
 from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman, instrumental_variables
-from analysis.identify.estimators.nuisance import TAU, Prior, implausible
+from analysis.identify.estimators.nuisance import BETWEEN, TAU, Prior, implausible, priors
 from analysis.identify.estimators.prior_rows import (
     prior_rows,
     spread_with_priors,
@@ -25,6 +26,7 @@ from analysis.identify.estimators.shifts import (
     significant_shift,
 )
 from analysis.identify.estimators.statements import noise_statement, nuisance_statement
+from rig.model.rig import Rig
 from tests.analysis.straight_line import line
 
 CASES = {
@@ -108,6 +110,27 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
         narrower.append(both.covariance[0, 0] / alone.covariance[0, 0])
     assert 0.92 < np.mean(hits) < 0.98
     assert np.median(narrower) < 0.3
+
+
+def test_draws_of_repeats_keep_the_weight_of_what_is_known_beforehand(rig: Rig) -> None:
+    """A path between samples whose column is much like the gain's, known to +- 0.05."""
+    rng = np.random.default_rng(7)
+    t, parts = np.arange(200) / 100.0, np.arange(200) // 25
+    x = np.sin(np.pi * t)
+    X = np.column_stack((x, 0.98 * x + 0.02 * np.cos(6 * np.pi * t)))
+    blocks = tuple(
+        RepeatBlock(0, step, r, f"{step}_r{r}", "flow_cap_1", X,
+                    x + 0.1 * rng.standard_normal(200), t, parts, parts)
+        for step in "abc" for r in range(6)
+    )  # fmt: skip
+    p = FamilyBlocks("fluid", ("C_pp_1", f"{BETWEEN}1"), 1, blocks)
+    fit = least_squares(blocks)
+    rows = prior_rows(fit, priors(p.names, fit.beta))
+    joined = with_prior_rows(fit, rows)
+    between_repeats = spread([pieces(joined)], joined.inverse).covariance[0, 0]
+    job = EstimationJob(rig, (), (), (), "ls", 200, rng)
+    low, high = _bootstrap_ends(job, p, "ls", np.zeros(1))["C_pp_1"]
+    assert (high - low) / 3.92 == pytest.approx(np.sqrt(between_repeats), rel=0.3)
 
 
 @pytest.mark.parametrize(("alike", "ok"), [(0.0, True), (0.9, False)])
