@@ -51,10 +51,8 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
     try:
         values = settings.of_endpoint(url)
     except ValueError as error:
-        wanted = (
-            f"one like {settings.example}"
-            if settings.example
-            else (f"the settings of {url.scheme} in the rig file's section `wire`")
-        )
+        wanted = f"the settings of {url.scheme} in the rig file's section `wire`"
+        if settings.example:
+            wanted = f"one like {settings.example}"
         raise InputError(f"--endpoint {endpoint}: expected {wanted}") from error
     return wire.reached_by(url.scheme, values)

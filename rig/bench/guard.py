@@ -124,12 +124,8 @@ class Guard:
         self._warn = bands.warning_bounds(self.rig, self.roles, self.settings)
         self._inner = bands.inner_bounds(self.rig, self._warn, self.settings)
         self._tightest = self._trip.within(self._warn)
-        excited = [
-            frozen.judged
-            for r, frozen in zip(roles, self._frozen, strict=True)
-            if r.excited or r.jogged
-        ]
-        self._may_freeze = np.any(excited, axis=0) if excited else None
+        driven = [frozen.judged for r, frozen in zip(roles, self._frozen, strict=True) if r.driven]
+        self._may_freeze = np.any(driven, axis=0) if driven else None
         self._plausibility.restart()
 
     def gap(self, lost: int, tick: int) -> Violation | None:
@@ -266,8 +262,7 @@ class Guard:
         if not np.count_nonzero((window[0] == window[-1]) & self._may_freeze):
             return []  # mostly the first and last value differ, and no further check is needed
         for joint, (role, frozen) in enumerate(zip(self.roles, self._frozen, strict=True), 1):
-            judged = role.excited or role.jogged
-            column = frozen.find(window, role.jogged) if judged else None
+            column = frozen.find(window, role.jogged) if role.driven else None
             if column is None:
                 continue
             name = self.rig.recorded[column]

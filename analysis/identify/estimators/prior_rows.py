@@ -37,7 +37,7 @@ class PriorRow:
 def prior_rows(fit: EquationFit, priors: Sequence[Prior]) -> tuple[PriorRow, ...]:
     """Return the rows of prior observations beside those of a fit of least squares.
 
-    Without the row of one that the fit's rows hold nothing of (a column of zeros).
+    A prior has no row where the columns that it concerns are zero in all rows of the fit.
     """
     rows: list[PriorRow] = []
     for prior in priors:

@@ -54,6 +54,8 @@ class Frozen:
         values = window[:, self._columns]
         still = (values == values[0]).all(axis=0) & self._judged
         still &= (values[0] > self._low) & (values[0] < self._high)
+        if not still.any():
+            return None
         command = window[:, self._command]
         if jogged:
             still &= self._position & (max(command.min(), -command.max()) >= self._held)

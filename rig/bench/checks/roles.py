@@ -25,6 +25,11 @@ class JointRole:
     tolerance: float = math.inf
 
     @property
+    def driven(self) -> bool:
+        """Whether a command moves the joint, of a protocol or of a person."""
+        return self.excited or self.jogged
+
+    @property
     def locked(self) -> bool:
         """Whether the joint is locked."""
         return self.locked_at is not None and math.isfinite(self.tolerance)

@@ -64,7 +64,7 @@ def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
 
 def _too_small(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
     ends, unit = rig.sensors.of(kind).range, rig.unit_of(name)
-    if kind in _PRESSURES:  # one may hardly change, but is no such small part of its range
+    if kind in _PRESSURES:  # a pressure may be constant, but is not near zero throughout
         seen, words = max(abs(low), abs(high)), "stays below"
     elif kind in (ch.PISTON, ch.POSITION):
         seen, words = high - low, "moves by"
