@@ -98,9 +98,12 @@ def live_subject(rig: Rig) -> Subject:
     def make() -> Iterator[DeviceUnderTest]:
         yield DeviceUnderTest(rig, lambda wanted: make_driver(wanted.wire, wanted))
 
+    host_timed = driver_class(rig.wire.kind).host_timed
     claims = Capabilities(
-        host_timed=driver_class(rig.wire.kind).host_timed,
+        host_timed=host_timed,
         virtual_time=info.virtual_time,
+        # Inputs and outputs that the host clocks hold neither a rate nor a rig to compare.
+        refuses_other_rigs=not host_timed,
     )
     volts = _PART * min(joint.limits.command for joint in rig.joints)
     return Subject(rig.wire.kind, make, claims, volts)

@@ -6,12 +6,14 @@ import re
 import sys
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 
 from drivers.base import DeviceError, DeviceLost, OutputLaw
+from drivers.conformance import CheckVerdict, live_subject, run
 from drivers.modbus_map import InputEntry, MapSettings, OutputEntry, register_map
 from drivers.nidaqmx_card import CardInput, CardOutput, CardSettings, wiring
 from drivers.polled import InputsOutputs, PolledDriver
@@ -113,6 +115,23 @@ def test_the_pages_small_class_is_a_driver(
         driver.read_block()
     assert line.sent[-1] == "put 0.0000 0.0000"
     driver.close()
+
+
+def test_the_pages_driver_passes_the_checks_that_move_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names: dict[str, Any] = {"open_line": lambda _: Line(), "__name__": "my_bench.gauge"}
+    exec(compile(listing(OWN_PAGE, "python"), "own-device.md", "exec"), names)
+    installed = SimpleNamespace(load=lambda: names["GaugeDriver"])
+    monkeypatch.setattr("drivers.registry.entry_points", lambda **_: [installed])
+    wire = Wire(kind="gauge-box", timeout=0.2, watchdog=0.5, address="COM3")  # type: ignore[call-arg]
+    rig = seed_rig().model_copy(update={"sample_rate": 100.0, "wire": wire})
+    report = run(live_subject(rig), outputs=False)
+    assert not report.of(CheckVerdict.FAILED)
+    assert len(report.of(CheckVerdict.PASSED)) >= 8
+    # The box holds neither a rate nor a rig that `connect` could compare.
+    skipped = {result.check: result.reason for result in report.of(CheckVerdict.SKIPPED)}
+    assert skipped["other_rig_refused"] == "not claimed: refusal of other rigs"
 
 
 def test_the_page_names_every_call_of_a_whole_driver() -> None:
