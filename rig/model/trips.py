@@ -45,10 +45,10 @@ class Violation:
     seconds: float | None = None
 
 
-def show(value: float, unit: str) -> str:
+def show(value: float, unit: str, digits: int = 4) -> str:
     """Return a value with its display unit: '9.31 MPa'."""
     shown = display_unit(unit, LIMITS)
-    return f"{value * shown.scale:.4g} {shown.text}"
+    return f"{value * shown.scale:.{digits}g} {shown.text}"
 
 
 def _open(end: float) -> bool:
@@ -56,7 +56,14 @@ def _open(end: float) -> bool:
 
 
 def _value(violation: Violation) -> str:
-    return show(violation.value, violation.unit) if violation.unit else "reported by the device"
+    """Return the value, with enough digits to differ from the limits."""
+    if not violation.unit:
+        return "reported by the device"
+    limits = {show(end, violation.unit) for end in violation.allowed}
+    shown = (show(violation.value, violation.unit, digits) for digits in range(4, 16))
+    return next(
+        (text for text in shown if text not in limits), show(violation.value, violation.unit)
+    )
 
 
 def _allowed(violation: Violation) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +15,7 @@ from drivers.base import SampleBlock
 from rig.bench.guard import EXCITED, FREE, JOGGED, Guard, GuardSettings, JointRole, rate_window
 from rig.model.channels import kind_of
 from rig.model.parts import BenchLimits
-from rig.model.trips import SafetyTrip, Violation
+from rig.model.trips import SafetyTrip, Violation, describe
 from rig.runs.rigs import load_rig
 
 RIG = load_rig("shinshu-2dof")
@@ -343,3 +343,11 @@ def test_the_trips_message_names_limit_value_allowed_joint_channel_and_time(limi
     }[limit]
     assert wanted in said
     assert "\n" not in said
+
+
+def test_a_trip_just_beyond_its_limit_shows_a_value_that_differs_from_it() -> None:
+    rig = load_rig("shinshu-2dof")
+    allowed = (9.99e6, 11e6)
+    trip = Violation("supply pressure", 9.98996e6, allowed, "Pa", None, "supply_pressure", 20)
+    assert "9.98996 MPa at 0.0200 s" in describe(trip, rig)
+    assert "9.31 MPa" in describe(replace(trip, value=9.31e6), rig)
