@@ -83,6 +83,8 @@ def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> True
                 f"expected one of: {' '.join(names)}"
             )
     merged = {**machine.parameters, **(overrides or {})}
+    if rig.gravity == 0.0:  # in a horizontal plane weights have no effect, and no file needs them
+        merged = {name: 0.0 for name in names if name.startswith("W")} | merged
     missing = [name for name in names if name not in merged]
     if missing:
         raise InputError(

@@ -237,8 +237,12 @@ def test_a_bench_without_a_machine_file_needs_every_nominal_value() -> None:
     nominal = {k: v for k, v in rig.nominal.items() if k not in ("b", "W2")}
     other = rig.model_copy(update={"name": "home-made"})
     assert Plant(other, Scenario(), 1).truth() == rig.nominal
+    bare = other.model_copy(update={"nominal": nominal})
     with pytest.raises(InputError, match=r"home-made.*missing: W2 b$"):
-        Plant(other.model_copy(update={"nominal": nominal}), Scenario(), 1)
+        Plant(bare, Scenario(), 1)
+    level = bare.model_copy(update={"gravity": 0.0})  # a weight has no effect
+    with pytest.raises(InputError, match=r"home-made.*missing: b$"):
+        Plant(level, Scenario(), 1)
 
 
 def test_the_shipped_machine_is_table_iii() -> None:
