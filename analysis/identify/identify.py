@@ -24,6 +24,7 @@ from rig.model.records import Record, Run, refuse_malformed, with_loads_stated
 from rig.model.rig import Rig
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
+HYDRAULIC = ("sequential", "pso", "ga")
 
 
 def identify(
@@ -55,6 +56,11 @@ def identify(
     _refuse_estimator(estimator, bootstrap)
     rig, runs = ck.common_rig(runs), with_loads_stated(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    if method in HYDRAULIC and rig.electric:
+        raise InputError(
+            f"the method {method} needs pressures and flows, and rig {rig.name!r} is electric; "
+            "expected coupled or simultaneous"
+        )
     if method != "coupled":
         result = identify_by(method, runs, used, filtering, reject_noise, rng, search)
         return result if result.geometry is not None else _with_exact_geometry(rig, result)

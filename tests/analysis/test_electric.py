@@ -120,6 +120,12 @@ def test_mechanics_and_slope_are_identified_together(
     assert judged.units == {"position_1": "rad", "position_2": "rad"}
 
 
+@pytest.mark.parametrize("method", ["sequential", "pso", "ga"])
+def test_methods_for_pressures_and_flows_are_refused(run: Run, method: str) -> None:
+    with pytest.raises(InputError, match=rf"method {method} needs pressures and flows.*electric"):
+        identify([run], method=method)
+
+
 def test_noise_that_the_rig_file_does_not_state_biases_least_squares_and_is_seen(
     robot: ElectricRig, arm: plant.Arm
 ) -> None:

@@ -36,7 +36,7 @@ def simultaneous(
         steps = " ".join(sorted({r.step for run in runs for r in run.records}))
         raise InputError(
             f"the simultaneous method needs records that excite all {len(rig.joints)} joints at "
-            f"once; in the steps {steps} a joint is locked (`bramah run validate` records some)"
+            f"once; in the steps {steps} a joint is locked; record a step that locks none"
         )
     chosen = [run for run in kept if run.records]
     # Least squares as in the paper, despite its bias by noise: that is what is compared.
