@@ -89,11 +89,22 @@ def test_the_process_beside_the_run_finds_what_is_found_here(
         for tick, data in blocks(rig, record, 100):
             tracking.block(block_of(rig, tick, data))
         tracking.record_ends(meta, 100, record.samples, "complete")
+        short = RecordMeta("more", 1, record.locked, record.period, record.lines)
+        after = 100 + record.samples
+        tracking.record_begins(short, after, 200)
+        for tick, data in blocks(rig, record, after):
+            if tick < after + 200:
+                tracking.block(block_of(rig, tick, data))
+        tracking.record_ends(short, after, 200, "complete")
     here = Tracker(rig)
     track(here, record)
     kept = json.loads((tmp_path / "tracked.json").read_text())
     assert kept["memory_s"] is None
-    assert [entry["record"] for entry in kept["records"]] == ["step1_r1"]
+    one, other = kept["records"]
+    assert (one["record"], other["record"]) == ("step1_r1", "more_r1")
+    assert one["rows"] > 0 == other["rows"]
+    assert other["parameters"] == one["parameters"]
+    assert any("'more_r1' changes no estimate: it is too short" in line for line in said)
     for name, estimate in here.estimates().items():
         found = kept["parameters"][name]
         if estimate.identified:

@@ -252,6 +252,7 @@ class Tracker:
         self._feed: RowFeed | None = None
         self._start = 0.0
         self._clock = -np.inf
+        self.record_rows = 0  # of the present record, or of the last one
 
     def _concerns(self, used: Used) -> bool:
         """Return whether a term acts in the families followed."""
@@ -264,7 +265,7 @@ class Tracker:
         """Begin a record, of which `samples` may be unknown; `start` [s] is the device's time."""
         # Imported records all start at 0: they are then placed one after the other.
         self._start = max(head.start, self._clock)
-        self._head = head
+        self._head, self.record_rows = head, 0
         filters = default_filtering(head.record({}))
         self._feed = RowFeed(self._rig, self._terms, head, filters, self._families)
         self._running = copy.deepcopy(self._kept)
@@ -292,6 +293,7 @@ class Tracker:
             rows = [r for name, r in by_equation.items() if family_of(name) == family]
             if rows:
                 running.fold(self._head, rows, self._start)
+                self.record_rows += sum(len(r.rhs) for r in rows)
                 self._clock = max([self._clock, *(self._start + r.time[-1:].sum() for r in rows)])
         return True
 

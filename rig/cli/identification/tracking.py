@@ -216,8 +216,13 @@ class Tracking:
             if reply["kind"] == "last":
                 return True
             if reply["kind"] == "record":
-                entry = {"record": reply["record"], "parameters": reply["parameters"]}
+                entry = {key: reply[key] for key in ("record", "rows", "parameters")}
                 self._history.append(entry)
+                if not entry["rows"]:
+                    self._say(
+                        f"record {entry['record']!r} changes no estimate: it is too short for the "
+                        "filters, or its samples are not usable"
+                    )
                 for note in self._notes:
                     note(entry)
             elif time.monotonic() >= self._next_say:
@@ -270,7 +275,7 @@ def _serve(settings: TrackingSettings, socket: zmq.Socket[bytes]) -> None:
             start, ticks, state, name = (word.decode() for word in words)
             follower.ends(int(start), int(ticks), state == "complete")
             if state == "complete":
-                _reply(socket, "record", tracker, record=name)
+                _reply(socket, "record", tracker, record=name, rows=tracker.record_rows)
         else:
             _reply(socket, "last", tracker)
             return
@@ -282,7 +287,7 @@ def _head(data: dict[str, Any]) -> RecordHead:
     return RecordHead(**fields)
 
 
-def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) -> None:
+def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str | int) -> None:
     estimates: dict[str, Estimate] = tracker.estimates()
     known = {name: estimate_json(e) for name, e in estimates.items()}
     if all(e["value"] is None for e in known.values()):
