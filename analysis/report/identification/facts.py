@@ -150,7 +150,7 @@ def sentences(
     first = (
         f"On {bench} {rig.name} ({fm.count(joints, kind)}), "
         f"{fm.count(len(records), 'record')} of {fm.count(steps, 'step')} were taken, "
-        f"{minutes(duration(records))} of data; one {identification.method} least-squares solve "
+        f"{minutes(duration(records))} of data; one {identification.method} solution "
         f"gives {len(identified)} of the {len(expected)} parameters of the model."
     )
     if not validation:

@@ -56,7 +56,7 @@ def parameters(
         )  # fmt: skip
     figures.append(
         ReportFigure(interval_plots.interval_widths(estimates), "Width of the intervals",
-              "Scatter is not accuracy: the interval does not include model error.")
+              "They do not include effects that the model lacks: `bramah trace` looks for them.")
     )  # fmt: skip
     return Gallery(tuple(figures))
 
