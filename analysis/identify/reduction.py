@@ -309,6 +309,7 @@ def record_checks(
     return [
         ck.repeats(repeats_in_motion(rig, ((part.run, part.head) for part in reductions))),
         ck.joints_excited(rig, heads),
+        *ck.supply_measured(rig),
         *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
         *ck.leak_down(rig, heads),
         ck.lost_samples([(reduction.head, reduction.lost) for reduction in reductions]),

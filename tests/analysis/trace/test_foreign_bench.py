@@ -430,6 +430,9 @@ def test_a_supply_that_no_sensor_measures_is_found_to_have_another_pressure(rig:
         return Run(stated, tuple(records), run.source)
 
     train, held_out = map(unmeasured, pair_of_runs(rig, Hidden()))
+    said = next(c for c in identify([train]).checks if c.name == "supply pressure")
+    assert not said.ok
+    assert said.detail.startswith("not measured: taken as 6.65 MPa")
     names = (*FLOWS, "sensor_offset")
     result = trace([train], [held_out], catalogue(stated, names), look_ahead=False)
     assert result.verdict == "explained"
