@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -37,8 +38,9 @@ from analysis.identify.estimators.prior_rows import (
 from analysis.identify.estimators.robust import robust
 from analysis.identify.estimators.shifts import (
     including,
-    largest_move,
+    largest_shift,
     predicted_shift,
+    shift_without,
     shifts_of,
     significant_shift,
 )
@@ -156,17 +158,17 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
         beta, total, fit = fits[p.family]
-        shift = np.zeros(p.parameters)
+        shifts = list(p.omitted)
         if estimator == "ls" and tests:
-            shift = significant_shift(tests[p.family], p)
+            shifts.append(significant_shift(tests[p.family], p))
         elif estimator == "ls":
-            shift = predicted_shift(solutions[p.family], p)
-        total = including(total, shift)
+            shifts.append(predicted_shift(solutions[p.family], p))
+        total = functools.reduce(including, shifts, total)
         new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
             checks.append(outlier_statement(p.family, fit))
         if job.bootstrap:
-            ends |= _bootstrap_ends(job, p, estimator, shift)
+            ends |= _bootstrap_ends(job, p, estimator, sum(shifts, np.zeros(p.parameters)))
     return Refinement(new, tuple(checks), estimator, ends)
 
 
@@ -181,7 +183,7 @@ def _bootstrap_ends(
     kind = _FITS[estimator]
     rows = _prior_rows(p, kind(p.blocks), estimator)
     drawn = bootstrap(p.blocks, _redo(kind, rows, p.parameters), job.bootstrap, rng)
-    # Towards the estimate by instruments.
+    # Towards the estimate by instruments, or with the nuisances that are left out.
     low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
     high = drawn.high[: p.parameters] - np.minimum(shift, 0.0)
     ends = zip(p.names, low, high, strict=False)
@@ -232,9 +234,11 @@ def _plausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:
             continue
         less = _without(p, name)
         left = least_squares(less.blocks)
-        moved = largest_move(p.names[: p.parameters], fit.beta, left.beta, error)
+        shift = shift_without(fit.beta, left.beta, error, p.parameters)
+        moved = largest_shift(p.names[: p.parameters], fit.beta[: p.parameters], shift)
         checks.append(nuisance_statement(prior, p.names, fit.beta, error, moved))
-        p, fit, error = less, left, spread([pieces(left)], left.inverse)
+        p = replace(less, omitted=(*p.omitted, shift))
+        fit, error = left, spread([pieces(left)], left.inverse)
     return p, checks
 
 

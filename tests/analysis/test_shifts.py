@@ -21,13 +21,17 @@ from analysis.identify.estimators.prior_rows import (
 from analysis.identify.estimators.shifts import (
     Shift,
     including,
-    largest_move,
+    largest_shift,
+    shift_without,
     shifts_of,
     significant_shift,
 )
 from analysis.identify.estimators.statements import noise_statement, nuisance_statement
+from analysis.identify.identify import identify
+from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 from tests.analysis.straight_line import line
+from tests.analysis.trace.hidden import pair_of_runs
 
 CASES = {
     # noise of the regressor, of the equation; is the shift certain, is it large
@@ -154,12 +158,27 @@ def test_an_impossible_law_of_flow_speaks_against_a_gain_that_it_moves_only(
     assert implausible(prior, fit.beta, error.covariance)
     without = least_squares([replace(b, X=b.X[:, :1]) for b in blocks])
     names = ("C_pp_1", TAU)
-    moved = largest_move(names[:1], fit.beta, without.beta, error)
+    shift = shift_without(fit.beta, without.beta, error, 1)
+    moved = largest_shift(names[:1], fit.beta[:1], shift)
     said = nuisance_statement(prior, names, fit.beta, error, moved)
     assert said.ok is ok
     assert ("no parameter moves by more than" in said.detail) is ok
     # The gain takes up the share of the left-out column that is like its own.
     assert moved == ("C_pp_1", pytest.approx(0.02 * alike, abs=1e-3))
+
+
+def test_intervals_include_what_a_law_of_flow_that_no_orifice_has_shifts(rig: Rig) -> None:
+    """The supply's sensor reads 20 kPa too much: too little to speak against the gains."""
+    found = identify([pair_of_runs(rig, offset_supply_pressure=2e4)[0]])
+    said = next(c for c in found.checks if c.name == "laminar transition")
+    assert said.ok
+    assert "which the intervals include" in said.detail
+    without = identify([pair_of_runs(rig)[0]])
+    for name in gain_names(2):
+        gain, exact = found.model.parameters[name], without.model.parameters[name]
+        assert abs(gain.value - exact.value) < 2.5 * gain.half
+        assert gain.half > 3.0 * exact.half
+        assert gain.half < 0.01 * gain.value
 
 
 def test_what_records_hold_nothing_of_leaves_every_estimate_as_it_is() -> None:

@@ -51,12 +51,17 @@ class RepeatBlock:
 
 @dataclass(frozen=True)
 class FamilyBlocks:
-    """A family's blocks, nuisance columns last, with the names of all columns."""
+    """A family's blocks, nuisance columns last, with the names of all columns.
+
+    `omitted` holds, for each nuisance that was left out since the data contradict it, how much its
+    absence shifts the `parameters` first columns' coefficients (k,).
+    """
 
     family: str
     names: tuple[str, ...]
     parameters: int
     blocks: tuple[RepeatBlock, ...]
+    omitted: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)

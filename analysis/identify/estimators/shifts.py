@@ -57,22 +57,24 @@ class Shift:
         )
 
 
-def largest_move(
-    names: Sequence[str], value: Array, without: Array, error: CovarianceParts
-) -> tuple[str, float]:
-    """Return the parameter that moves most when a nuisance is left out, and how much (relative).
+def shift_without(value: Array, without: Array, error: CovarianceParts, count: int) -> Array:
+    """Return how much the first `count` coefficients shift when a nuisance is left out.
 
-    `value` (k,) are the parameters `names` and perhaps nuisances beside it, `without` the same
-    parameters without it, `error` the spread of `value`. Moves are compared by the limits beyond
-    which they matter; one within `IDENTIFY.shift_of_interval` of the 95 % half width counts as 0.
+    `value` (m,) are the coefficients with it and `error` their spread, `without` those without it.
+    A shift within `IDENTIFY.shift_of_interval` of the 95 % half width counts as 0.
     """
-    count = len(names)
-    move = np.abs(without[:count] - value[:count])
+    shift = without[:count] - value[:count]
     half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)[:count]
+    return np.where(np.abs(shift) > IDENTIFY.shift_of_interval * half, shift, 0.0)
+
+
+def largest_shift(names: Sequence[str], value: Array, shift: Array) -> tuple[str, float]:
+    """Return the parameter of largest relative `shift` (k,) from `value` (k,), and its size.
+
+    Shifts are compared by the limits beyond which they matter.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.where(
-            move > IDENTIFY.shift_of_interval * half, move / np.abs(value[:count]), 0.0
-        )
+        relative = np.where(shift == 0.0, 0.0, np.abs(shift / value))
     worst = int(np.argmax(relative / [shift_limit(name) for name in names]))
     return names[worst], float(relative[worst])
 

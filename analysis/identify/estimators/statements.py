@@ -35,7 +35,8 @@ def nuisance_statement(
     check = _possible(prior, names, beta, error, moved is not None)
     if moved is None or moved[1] > shift_limit(moved[0]):
         return check
-    least = f"no parameter moves by more than {100 * moved[1]:.2g} %"
+    size = f"{100 * moved[1]:.2g} %"
+    least = f"no parameter moves by more than {size} without it, which the intervals include"
     if not moved[1]:
         share = IDENTIFY.shift_of_interval
         least = f"no parameter moves by more than {share:g} of its 95 % interval's half width"
@@ -75,8 +76,8 @@ def _possible(
     statement = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
     if wrong:
         statement = (
-            "the flow depends on the pressure drop in a way no orifice does (a tank pressure, a "
-            "sensor's offset, a leak?); the gains are those of the plain square root"
+            "the flow depends on the pressure drop in a way no orifice does (a supply, tank or "
+            "sensor pressure that is off, a leak?); the gains are those of the plain square root"
         )
     return Check("laminar transition", not wrong, statement)
 
