@@ -82,7 +82,7 @@ def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) ->
         return (f"{words[-1]} {joints[0]}",)
     if element == "chamber":
         return tuple(f"{chamber} {i}" for i in joints for chamber in CHAMBERS)
-    return (f"{'joint' if rig.electric else element} {joints[0]}",)
+    return tuple(f"{'joint' if rig.electric else element} {i}" for i in joints)
 
 
 def _sensors(

@@ -132,7 +132,7 @@ def judge_effects(
             JudgedEffect(
                 used.term.name,
                 rivals.place_of(used.term),
-                estimates,
+                {n: e for n, e in estimates.items() if n not in train_data.beta},
                 p,
                 removed,
                 (*inseparable, *others),
