@@ -72,12 +72,14 @@ class PlantEffect(BaseModel):
     `places` are the forms of place where it can be. `drawn_at` is where a random scenario puts it:
     ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); `sizes` are the ranges
     [SI] of its keys, drawn log-uniformly; keys in `signed` have a random sign. `forms` are the
-    values of its key `form`: different physics of the same cause, the first by default.
+    values of its key `form`: different physics of the same cause, the first by default. Random
+    scenarios have only those `drawn`: with a further one every seed would draw another scenario.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     places: ClassVar[tuple[str, ...]] = ("joint",)
+    drawn: ClassVar[bool] = True
     drawn_at: ClassVar[str]
     sizes: ClassVar[Mapping[str, Size]]
     signed: ClassVar[tuple[str, ...]] = ()

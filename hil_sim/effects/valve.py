@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from hil_sim.effects.base import PlantEffect, Tables
-from rig.model.quantity import Time, Voltage
+from rig.model.quantity import Pressure, Time, Voltage
 
 
 class ValveDeadband(PlantEffect):
@@ -55,6 +55,30 @@ class UnderlapLeakage(PlantEffect):
             t.joints["rounding"][self.joint] += self.rounding or 0.5 * self.width
         elif self.form == "notch":
             t.joints["notch"][self.joint] = self.width
+
+
+class LaminarOrifice(PlantEffect):
+    """Metering edges that are laminar below a pressure drop of `transition`, at every valve.
+
+    ``smooth``: the edges of the plant with a larger transition. ``cubic``: nothing is lost above
+    it. ``tanh``: a flow coefficient that rises with the Reynolds number.
+    """
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"transition": (0.3e6, 1.5e6)}
+
+    drawn = False
+    places = ("bench",)
+    forms = ("smooth", "cubic", "tanh")
+    name: Literal["laminar_orifice"]
+    where: str = "bench"
+    transition: Pressure = Field(gt=0)
+    form: Literal["smooth", "cubic", "tanh"] = "smooth"
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.bench["laminar"] = self.transition
+        t.bench["laminar_form"] = self.forms.index(self.form)
 
 
 class SpoolOffset(PlantEffect):

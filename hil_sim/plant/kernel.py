@@ -71,6 +71,26 @@ def orifice(drop: float, laminar: float) -> float:
 
 
 @jit
+def edge_root(drop: float, laminar: float, form: float) -> float:
+    """Return what an edge's flow is in proportion to [Pa^0.5], laminar below the drop `laminar`.
+
+    `form` 0: `orifice`. 1: a cubic below, the square root above, of one slope where they meet. 2: a
+    flow coefficient of tanh(2 Re / Re_t), Re in proportion to the drop's root (McCloy and Martin,
+    1980).
+    """
+    if form == 0.0:
+        return orifice(drop, laminar)
+    size = abs(drop)
+    root: float = sqrt(size)
+    share = size / laminar
+    if form == 2.0:
+        root *= tanh(2.0 * sqrt(share))
+    elif share < 1.0:
+        root = sqrt(laminar) * share * (1.25 - 0.25 * share * share)
+    return copysign(root, drop)
+
+
+@jit
 def opening(travel: float, lap: float, rounding: float, notch: float) -> float:
     """Return one edge's opening [V]; sharp at zero rounding, lap > 0 overlaps, < 0 underlaps.
 
@@ -168,7 +188,15 @@ def relief(p: float, bench: Any) -> float:
 
 @jit
 def port_flows(
-    x: float, s: float, p_cap: float, p_rod: float, port: float, tank: float, j: Any, lam: float
+    x: float,
+    s: float,
+    p_cap: float,
+    p_rod: float,
+    port: float,
+    tank: float,
+    j: Any,
+    lam: float,
+    form: float,
 ) -> Any:
     """Return the flows [m^3/s] into cap and rod, out of the supply and into the tank line.
 
@@ -183,13 +211,13 @@ def port_flows(
     demand, returned = 0.0, 0.0
     ahead = opening(x, j.lap_ahead, j.rounding, j.notch)
     if ahead > 0.0:
-        demand = j.c_pp * ahead * orifice(port - p_cap, lam)
-        returned = j.c_mp * ahead * orifice(p_rod - tank, lam)
+        demand = j.c_pp * ahead * edge_root(port - p_cap, lam, form)
+        returned = j.c_mp * ahead * edge_root(p_rod - tank, lam, form)
         q_cap, q_rod = q_cap + demand, q_rod - returned
     astern = opening(-x, j.lap_astern, j.rounding, j.notch)
     if astern > 0.0:
-        feed = j.c_mm * astern * orifice(port - p_rod, lam)
-        drain = j.c_pm * astern * orifice(p_cap - tank, lam)
+        feed = j.c_mm * astern * edge_root(port - p_rod, lam, form)
+        drain = j.c_pm * astern * edge_root(p_cap - tank, lam, form)
         q_cap, q_rod = q_cap - drain, q_rod + feed
         demand, returned = demand + feed, returned + drain
     return q_cap, q_rod, demand, returned
@@ -281,7 +309,7 @@ def rates(
         p_cap, p_rod = pressure(y[2 * n + i], bench), pressure(y[3 * n + i], bench)
 
         q_cap, q_rod, taken, given = port_flows(
-            spool[i], s, p_cap, p_rod, port, tank, j, bench.laminar
+            spool[i], s, p_cap, p_rod, port, tank, j, bench.laminar, bench.laminar_form
         )
         demand, returned = demand + taken, returned + given
         stiff = softening(y[2 * n + i], warmth, bench)

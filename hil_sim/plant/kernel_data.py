@@ -55,7 +55,8 @@ JOINT: Final = _records(
 )
 BENCH: Final = _records(
     "",
-    "half_bulk trapped air air_dissolution air_exponent laminar sin_slope cos_slope "
+    "half_bulk trapped air air_dissolution air_exponent laminar laminar_form sin_slope "
+    "cos_slope "
     "pump supply_volume relief_crack relief_slope relief_rounding "
     "line_gain line_laminar manifold_volume "
     "tank_pressure tank_resistance tank_laminar tank_lag "

@@ -139,7 +139,7 @@ def test_every_form_runs_and_moves_the_bench_otherwise(kind) -> None:
     more = ", retracting: 10 N" if kind.effect_name() == "asymmetric_friction" else more
     unit = {"force": "N", "extending": "N", "coefficient": "N/Pa", "width": "V",
             "line_drop": "Pa", "fraction": "", "torque": "N*m",
-            "drop": "Pa", "time": "s", "share": ""}[key]  # fmt: skip
+            "drop": "Pa", "time": "s", "share": "", "transition": "Pa"}[key]  # fmt: skip
     if kind.effect_name() == "asymmetric_viscous_friction":
         unit, more = "N*s/m", ", retracting: 10 N*s/m"
     more = ", frequency: 7 Hz" if kind.effect_name() == "periodic_disturbance" else more

@@ -42,7 +42,7 @@ CONTRACT = {
 # Forms of edge, line and seal, no sizes.
 DETAILS = (
     "return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition", "exponent",
-    "spread", "steepness",
+    "spread", "steepness", "sharpness",
 )  # fmt: skip
 
 

@@ -2,12 +2,12 @@
 
 Dry friction is a function of the velocity at the same instant (a hyperbolic tangent, an algebraic
 sigmoid, or Karnopp's band of standstill), never of the path; the supply sags in proportion to the
-flow drawn, at once or behind a lag; a leak is laminar or goes by the root of the pressure. Viscous
-friction may have slopes by direction or a cube; a spring may harden; a spool may have play and its
-edges a taper; the return may stand under the pressure of a laminar line; oil may stiffen with
-pressure. The equations of motion are those of `docs`' NOTES with joint 1 standing at mid-stroke,
-typed in again, integrated by a Runge-Kutta of fixed step. Sensors are sampled at their own
-instants, may lag, be late or see each other, and get white noise.
+flow drawn, at once or behind a lag; a leak is laminar or goes by the root of the pressure, edges
+may be laminar at small drops. Viscous friction may have slopes by direction or a cube; a spring may
+harden; a spool may have play and its edges a taper; the return may stand under the pressure of a
+laminar line; oil may stiffen with pressure. The equations of motion are those of `docs`' NOTES with
+joint 1 standing at mid-stroke, typed in again, integrated by a Runge-Kutta of fixed step. Sensors
+are sampled at their own instants, may lag, be late or see each other, and get white noise.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ TANH, SIGMOID, KARNOPP = range(3)
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
     STIFFER, BACK_POWER, SPRING_REST, KNEE, TIGHTER, WORN, SPOOL, SPOOL_DAMPING,
-) = range(29)  # fmt: skip
+    LAMINAR, REYNOLDS,
+) = range(31)  # fmt: skip
 MIDDLE = -1.44  # [rad] where springs are at rest
 
 
@@ -62,7 +63,9 @@ class Hidden:
     within `knee` [V] of the null the edges have half their gain; the levels of dry friction grow by
     e with every 1 / `tighter` [m] of the stroke; at mid-stroke, about 1 cm wide, the leak is 1 +
     `worn` times as large; the opening follows the spool's signal by a lag of second order
-    of natural frequency `spool_frequency` [Hz] and damping ratio `spool_damping`.
+    of natural frequency `spool_frequency` [Hz] and damping ratio `spool_damping`; of a drop dp
+    across an edge its root passes times x / (x + 1), x = 2 (dp / `laminar`)^(1/2), or, where
+    `reynolds` is 1, times tanh(x).
     """
 
     ahead: float = 0.0
@@ -94,6 +97,8 @@ class Hidden:
     worn: float = 0.0
     spool_frequency: float = 0.0
     spool_damping: float = 0.7
+    laminar: float = 0.0
+    reynolds: float = 0.0
 
     @property
     def array(self) -> Array:
@@ -151,6 +156,16 @@ def _return(cap, rod, u, par, hidden):
 @njit(cache=True)
 def _root(x):
     return math.sqrt(x) if x > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _edge(drop, hidden):
+    """Root of the drop across an edge [Pa^0.5], less where its flow is laminar."""
+    root = _root(drop)
+    if hidden[LAMINAR] <= 0.0:
+        return root
+    x = 2.0 * root / math.sqrt(hidden[LAMINAR])
+    return root * (math.tanh(x) if hidden[REYNOLDS] > 0.0 else x / (x + 1.0))
 
 
 @njit(cache=True)
@@ -227,11 +242,11 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
     if hidden[LEAK_ROOT] > 0.0:
         leak += hidden[LEAK_ROOT] * across / math.sqrt(abs(across) + 1e3)
     if u > 0.0:
-        into_cap = par[4] * u * _root(p_s - cap) - leak
-        into_rod = leak - par[6] * u * _root(rod - p_t)
+        into_cap = par[4] * u * _edge(p_s - cap, hidden) - leak
+        into_rod = leak - par[6] * u * _edge(rod - p_t, hidden)
     else:
-        into_cap = par[5] * u * _root(cap - p_t) - leak
-        into_rod = leak - par[7] * u * _root(p_s - rod)
+        into_cap = par[5] * u * _edge(cap - p_t, hidden) - leak
+        into_rod = leak - par[7] * u * _edge(p_s - rod, hidden)
     torque = G * (7.0e-4 * cap - 5.4e-4 * rod) - par[1] * w - par[2] * 9.8 * math.sin(q1 + q)
     turn = q - hidden[SPRING_REST]
     torque -= hidden[SPRING] * turn + hidden[HARDENING] * turn**3

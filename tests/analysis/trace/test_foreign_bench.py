@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analysis.effects.laminar_orifice import share_of_root
 from analysis.effects.mechanics import BaseInclination, JointSpring
 from analysis.identify.identify import identify
 from analysis.simulation.model import load_model, save_model
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
+from rig.model.parameters import gain_names
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
@@ -354,6 +356,31 @@ def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -
     assert any("to the power of 0.5" in note for note in result.notes)
     assert max(result.after[e] / result.noise_floor[e] for e in result.after) < 1.15
     assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("laminar", "reynolds"), [(3e5, 0), pytest.param(2e6, 1, marks=pytest.mark.slow)]
+)
+def test_edges_that_are_laminar_at_small_drops_are_named_and_their_gains_put_right(
+    rig: Rig, laminar: float, reynolds: int
+) -> None:
+    hidden = Hidden(laminar=laminar, reynolds=reynolds)
+    result = traced(rig, hidden, *FLOWS, "laminar_orifice", "sensor_offset")
+    assert result.verdict == "explained"
+    (orifice,) = result.effects
+    assert (orifice.name, orifice.where) == ("laminar_orifice", "bench")
+    drop = np.linspace(1e6, 5e6, 17)  # smaller ones seldom occur
+    x = 2.0 * np.sqrt(drop / laminar)
+    passes = np.tanh(x) if reynolds else x / (x + 1.0)
+    transition = orifice.parameters["dp_laminar"].value
+    sharpness = orifice.parameters["sharpness"].value if reynolds else 1.0
+    for name in gain_names(2):
+        gain = result.model_after.values[name]
+        assert result.model_before.values[name] < 0.995 * TRUTH[name]
+        assert gain == pytest.approx(TRUTH[name], rel=0.01)
+        share = gain / TRUTH[name] * share_of_root(drop, transition, sharpness)
+        assert share == pytest.approx(passes, rel=0.02)
+    assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.005)
 
 
 def test_a_worn_bore_leaks_most_where_it_is_worn(rig: Rig) -> None:

@@ -85,6 +85,7 @@ def test_every_residual_is_plotted_over_a_quantity_with_a_practical_unit(name: s
         ("external_leakage", "joint 2 cap", ["c_external_cap_2"], ("cap 2",)),
         ("valve_deadband", "joint 1", ["w_ahead_1"], ("valve 1",)),
         ("entrained_air", "bench", ["alpha_air"], ("cap 1", "rod 1", "cap 2", "rod 2")),
+        ("laminar_orifice", "bench", ["dp_laminar"], ("valve 1", "valve 2")),
         ("supply_sag", "bench", ["dp_supply"], ("supply",)),
         ("tank_pressure", "bench", ["p_tank"], ("tank",)),
         ("base_inclination", "bench", ["inclination"], ("base",)),

@@ -41,10 +41,11 @@ def examples(kind: type[Effect], rig: Rig) -> list[Effect]:
 def parameter_rows(rig: Rig) -> list[tuple[str, str, str, str, str]]:
     """Return (effect, where, parameter, unit, bounds or kind) of every parameter at joint 1."""
     rows = []
+    gains = {name for i in range(len(rig.joints)) for name in gain_names(i + 1)}
     for name, kind in catalogue().items():
         for effect in examples(kind, rig):
             for c in effect.coefficients(rig):
-                kept = "the orifice's gain" if c.parameter in gain_names(1) else "coefficient"
+                kept = "the orifice's gain" if c.parameter in gains else "coefficient"
                 rows.append((name, effect.place, c.parameter, c.unit or "-", kept))
             for s in effect.shapes(rig):
                 if s.fixed:  # a knot of a curve, where the data are

@@ -68,6 +68,7 @@ EXAMPLES: Final[tuple[Example, ...]] = (
     ),
     ("spool_offset", "joint 1", "where: joint 1, voltage: 3 mV", {"u_null_1": 3e-3}),
     ("underlap_leakage", "joint 2", "where: joint 2, width: 5 mV", {"w_underlap_2": 5e-3}),
+    ("laminar_orifice", "bench", "transition: 1 MPa", {"dp_laminar": 1e6}),
     ("spool_lag", "joint 2", "where: joint 2, time: 3 ms", {"tau_spool_2": 3e-3}),
     ("spool_hysteresis", "joint 2", "where: joint 2, width: 4 mV", {"w_hysteresis_2": 4e-3}),
     ("return_line", "bench", "drop: 1.5 MPa", {"dp_return": 1.5e6}),

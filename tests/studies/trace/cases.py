@@ -66,7 +66,9 @@ SINGLES: Final[tuple[Sizes, ...]] = (
         "sensor_offset", "channel rod_pressure_{j}", "offset",
         ("0.03 MPa", "0.1 MPa", "0.2 MPa"), "",
     ),
+    ("laminar_orifice", "bench", "transition", ("0.3 MPa", "0.7 MPa", "1.5 MPa"), ""),
 )  # fmt: skip
+QUIET: Final = ("entrained_air", "dead_volume", "supply_sag", "laminar_orifice")  # not in pairs
 # Things the catalogue has no entry for: what they are, the variables that tell it, the scenario.
 # A mechanism whose curve the data draw may stand for those of `FORM_OF`.
 STRANGERS: Final = (
@@ -217,7 +219,7 @@ def _singles(
 
 
 def _pairs(count: int, rng: np.random.Generator) -> list[Drawn]:
-    loud = [s for s in SINGLES if s[0] not in ("entrained_air", "dead_volume", "supply_sag")]
+    loud = [s for s in SINGLES if s[0] not in QUIET]
     out = []
     for _ in range(count):
         one, two = rng.choice(len(loud), size=2, replace=False)

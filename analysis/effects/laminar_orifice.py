@@ -1,0 +1,166 @@
+"""Laminar flow through the metering edges at small pressure drops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import Array, Effect, Shape
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    FLOW_CAP,
+    FLOW_ROD,
+    P_CAP,
+    P_ROD,
+    P_S,
+    P_TANK,
+    Coefficient,
+    Columns,
+    Kernel,
+    U,
+    equation,
+    kernel,
+)
+from analysis.terms.orifice import root_of_drop, signed_root
+from rig.model.parameters import gain_names, parameter_unit
+from rig.model.rig import Rig
+
+TRANSITION: Final = "dp_laminar"
+SHARPNESS: Final = "sharpness"
+SUM: Final = 1.0  # the sharpness of a form that has none: the drops add
+
+
+@dataclass(frozen=True)
+class LaminarOrifice(Effect):
+    """Edges that are laminar at small drops: dp^n = (Q / C u)^2n + (dp_t^(1/2) Q / C u)^n.
+
+    The drops of turbulent and of laminar flow add for n = 1 (Merritt 1967, chapter 3), and the
+    larger one alone counts for a large n, the form's sharpness. Far above dp_t the flow is the
+    orifice's C u dp^(1/2), far below C u dp / dp_t^(1/2). The columns are what the orifices' lack,
+    under the orifices' own gains, which are too small without it.
+    """
+
+    name: ClassVar[str] = "laminar_orifice"
+    family: ClassVar[str] = "valve"
+    mechanism: ClassVar[str] = "metering_curve"
+    element: ClassVar[str] = "valve"
+    hydraulic: ClassVar[bool] = True
+    prepares: ClassVar[bool] = False
+    alters: ClassVar[tuple[str, ...]] = ("fluid",)
+    least_shape: ClassVar[tuple[float, ...]] = (0.1e6,)  # [Pa]
+    variable: ClassVar[str] = "the pressure drop across the metering edges"
+    quantity: ClassVar[str] = "pressure"
+    confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag", "sensor_offset")
+    separated_by: ClassVar[str] = (
+        "loads that leave a small drop across each edge in turn, at several openings"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _laminar
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench: one oil and, mostly, one series of valves."""
+        return ("bench",)
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the gains of all joints, which `orifice` owns."""
+        names = [name for i in range(len(rig.joints)) for name in gain_names(i + 1)]
+        return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the drop of the transition and the sharpness of its form."""
+        return TRANSITION, SHARPNESS
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the drop of the transition [Pa], and the sharpness."""
+        p = rig.supply.pressure
+        return (
+            Shape(TRANSITION, "Pa", 0.0, 0.5 * p, (0.01 * p, 0.05 * p), 0.0),
+            Shape(SHARPNESS, "", 0.7, 6.0, (2.0,), saturates=True, detail=True),
+        )
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Return the signals unchanged."""
+        return signals
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the opening times what the roots lose, under the orifices' own names."""
+        transition, sharpness = self.whole(rig, shape)
+        out: Columns = {}
+        p_s, p_t = signals.p_s, signals.p_tank
+
+        def lost(drop: Array) -> Array:
+            share = share_of_root(np.maximum(np.abs(drop), 1.0), transition, sharpness or SUM)
+            return np.asarray(root_of_drop(drop) * (share - 1.0))
+
+        for i in signals.excited_joints:
+            pp, pm, mp, mm = gain_names(i + 1)
+            u, cap, rod = signals.u[:, i], signals.p_cap[:, i], signals.p_rod[:, i]
+            ahead, astern = np.maximum(u, 0.0), np.minimum(u, 0.0)
+            out[equation("flow_cap", i)] = {
+                pp: lost(p_s - cap) * ahead,
+                pm: lost(cap - p_t) * astern,
+            }
+            out[equation("flow_rod", i)] = {
+                mp: -lost(rod - p_t) * ahead, mm: -lost(p_s - rod) * astern
+            }  # fmt: skip
+        return out
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return dp_t, n, then the gains of each joint."""
+        gains = (values[n] for i in range(len(rig.joints)) for n in gain_names(i + 1))
+        transition, sharpness = self.whole(rig, shape)
+        return np.array([transition, sharpness or SUM, *gains])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Reject a transition at its bounds."""
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the drop across the edge that is open [Pa]."""
+        out: dict[str, Array] = {}
+        p_s, p_t = signals.p_s, signals.p_tank
+        for i in signals.excited_joints:
+            ahead, cap, rod = signals.u[:, i] > 0.0, signals.p_cap[:, i], signals.p_rod[:, i]
+            out[equation("flow_cap", i)] = np.where(ahead, p_s - cap, cap - p_t)
+            out[equation("flow_rod", i)] = np.where(ahead, rod - p_t, p_s - rod)
+        return out
+
+
+@njit(cache=True, error_model="numpy")
+def share_of_root(size, transition, sharpness):  # type: ignore[no-untyped-def]
+    """Return the share of dp^(1/2) that passes at drops of `size` [Pa], n = `sharpness`."""
+    laminar = (transition / size) ** (0.5 * sharpness)
+    return (2.0 / (laminar + (laminar * laminar + 4.0) ** 0.5)) ** (1.0 / sharpness)
+
+
+@njit(cache=True, error_model="numpy")
+def lost_root(drop, transition, sharpness):  # type: ignore[no-untyped-def]
+    """Return what laminar flow takes from the signed root [Pa^0.5] of one drop [Pa]."""
+    return signed_root(drop) * (share_of_root(max(abs(drop), 1.0), transition, sharpness) - 1.0)
+
+
+@kernel
+def _laminar(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    p_s, p_t, t, n = bench[P_S], bench[P_TANK], par[0], par[1]
+    for i in range(x.shape[1]):
+        u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
+        if u > 0.0:
+            out[FLOW_CAP, i] += par[2 + 4 * i] * lost_root(p_s - cap, t, n) * u
+            out[FLOW_ROD, i] -= par[4 + 4 * i] * lost_root(rod - p_t, t, n) * u
+        else:
+            out[FLOW_CAP, i] += par[3 + 4 * i] * lost_root(cap - p_t, t, n) * u
+            out[FLOW_ROD, i] -= par[5 + 4 * i] * lost_root(p_s - rod, t, n) * u
+
+
+TERMS = (LaminarOrifice,)
