@@ -16,6 +16,7 @@ import pytest
 from protocols.engine.states import TRANSITIONS, EngineState
 from rig.bench.screens.commands import Command
 from rig.bench.screens.sockets import Attachment
+from rig.cli.execution.attended import terminal_lines
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
 from tests.cli.bench import (
@@ -324,3 +325,16 @@ def test_a_parameter_in_other_units_is_the_same_and_another_value_another_run(
     wider = checked("amplitude=12mm", "rest=65 s")
     assert travel(wider) - travel(plain) == pytest.approx(2 * 4e-3, rel=0.1)
     assert wider["seconds"] == pytest.approx(plain["seconds"] + 60.0)
+
+
+def test_where_the_shell_has_closed_standard_input_nobody_can_answer(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    assert terminal_lines(None) is None
+    screen = bramah_here("monitor")
+    assert screen.returncode == 2
+    assert "the screen needs a terminal" in screen.stderr
+    loop = bramah_here("loop", "--rig", RIG, "--out", tmp_path / "loop")
+    assert loop.returncode == 2
+    assert "--unattended" in loop.stderr

@@ -6,10 +6,15 @@ import math
 import select
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
     from rig.cli.identification.tracking import Tracking
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Return whether a stream is a terminal; one that the shell has closed is None."""
+    return stream is not None and stream.isatty()
 
 
 def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:
@@ -18,7 +23,7 @@ def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:
     By default a run is attended if its standard input and standard error are terminals.
     """
     if attended is None:
-        attended = sys.stdin.isatty() and sys.stderr.isatty()
+        attended = is_terminal(sys.stdin) and is_terminal(sys.stderr)
     return _read_answer if attended else None
 
 

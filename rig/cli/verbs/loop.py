@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from rig.cli.errors import code_and_message
+from rig.cli.execution.attended import is_terminal
 from rig.cli.options import (
     EndpointOption,
     JsonOption,
@@ -74,7 +75,7 @@ def loop(
         raise InputError("--simulate starts a new bench: expected either --simulate or --endpoint")
     if scenario is not None and not simulate:
         raise InputError("--scenario needs --simulate: it cannot change a bench that runs already")
-    if not unattended and not sys.stdin.isatty():
+    if not unattended and not is_terminal(sys.stdin):
         raise InputError(
             "loop asks before each experiment that it designs; give --unattended where nobody "
             "can answer"

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.errors import WorkError
+from rig.cli.execution.attended import is_terminal
 from rig.cli.options import EndpointOption
 from rig.cli.text.output import progress
 
@@ -67,9 +68,8 @@ def monitor(
         return
     if web:
         raise typer.Exit(_serve(rig, runs, endpoint, port or 0))
-    if (
-        not sys.stdin.isatty() and "TEXTUAL_DRIVER" not in os.environ
-    ):  # the browser's page is the terminal
+    # With TEXTUAL_DRIVER the browser's page is the terminal.
+    if not is_terminal(sys.stdin) and "TEXTUAL_DRIVER" not in os.environ:
         raise InputError(
             "the screen needs a terminal, but standard input is none: expected --plain (lines of "
             "text) or --web (a browser)"
