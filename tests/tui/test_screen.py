@@ -484,6 +484,16 @@ async def test_four_joints_on_a_small_terminal_are_reached_by_scrolling() -> Non
         assert shown.text.count("piston ") == 2
 
 
+async def test_joints_that_do_not_all_fit_begin_with_those_that_move() -> None:
+    async with glass(Machine({HERE: running(2.0, Bench(joints=4))}), size=(80, 24)) as shown:
+        assert "joint 2 ≈ excited" in shown.text
+        assert "joint 3 ≈ excited" in shown.text
+        assert "joint 1" not in shown.text
+        for _ in range(4):
+            await shown.press("down")
+        assert "joint 1 ▣ locked" in shown.text
+
+
 async def test_quitting_says_that_the_run_goes_on() -> None:
     record = running()
     async with glass(Machine({HERE: record})) as shown:

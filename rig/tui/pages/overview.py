@@ -123,10 +123,15 @@ def alarm_mark(view: PlotView, alarm: Alarm) -> Row:
 
 
 def _joints(view: PlotView, joints: list[int], width: int, height: int) -> list[Row]:
-    """Return the joints side by side; others are reached by scrolling."""
+    """Return the joints side by side; others are reached by scrolling, locked ones last."""
     if not joints or height < 3:
         return block([], width, max(height, 0))
     across = max(min(width // WIDTH, len(joints)), 1)
+    if len(joints) > across * max(height // 9, 1):
+        snapshot = view.frame.snapshot
+        roles = snapshot.roles if snapshot is not None else []
+        locked = {joint for joint, role in enumerate(roles, 1) if role == "locked"}
+        joints = sorted(joints, key=lambda joint: joint in locked)
     first = min(view.look.offset, max(len(joints) - across, 0))
     chosen = joints[first:]
     rows_of = [chosen[k : k + across] for k in range(0, len(chosen), across)]
