@@ -60,10 +60,9 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     for family, solution in result.solutions.items():
         if not result.rows[family]:
             continue  # a search solves no regression
-        lines.append(
-            f"{family}: {result.rows[family]} rows, condition number "
-            f"{solution.condition_number:.1f}"
-        )
+        condition = solution.condition_number
+        shown = f"{condition:.1f}" if condition < 1e5 else f"{condition:.1e}"
+        lines.append(f"{family}: {result.rows[family]} rows, condition number {shown}")
     lines.append(f"masked rows: {result.masked_rows}; solved in {result.solve_seconds:.3f} s")
     if (estimator := result.model.provenance.get("estimator")) is not None:
         lines.append(f"estimator: {estimator}")
