@@ -15,8 +15,10 @@ from analysis.identify.checks import Check
 from analysis.identify.estimators.covariance import by_parts, lack_of_fit, spread
 from analysis.identify.estimators.equations import least_squares, pieces
 from analysis.identify.identify import identify
+from analysis.identify.output_error import fit as output_error_fit
 from analysis.identify.output_error.fit import output_error
 from analysis.identify.result import Identification, to_json
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import MOSTLY_NOISE, Solution, solve
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -181,7 +183,9 @@ def test_spikes_in_one_record_are_set_aside_by_the_robust_loss(multisine_run: Ru
 
 
 @pytest.mark.slow
-def test_output_error_converges_from_a_start_five_percent_off(multisine_run: Run) -> None:
+def test_output_error_converges_from_a_start_five_percent_off(
+    multisine_run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # One repeat: what instruments cannot do.
     one = replace(multisine_run, records=tuple(r for r in multisine_run.records if r.repeat == 1))
     signs = np.resize([1.0, -1.0], len(TRUTH))
@@ -196,6 +200,10 @@ def test_output_error_converges_from_a_start_five_percent_off(multisine_run: Run
     # One record a step: friction of the light joint is known to 2 % only.
     assert max(abs(v) for v in off.values()) < 0.03
     assert max(abs(v) for n, v in off.items() if n[0] in "bC") < 0.002
+    monkeypatch.setattr(output_error_fit, "IDENTIFY", replace(IDENTIFY, fit_rounds=1))
+    early = output_error(one.rig, [one], [Used(term) for term in baseline()], start).check
+    assert not early.ok
+    assert "not settled: the last still moved a parameter by" in early.detail
 
 
 def test_output_error_needs_a_model_that_is_complete(multisine_run: Run) -> None:

@@ -183,9 +183,15 @@ class Search:
         )
         failed = len(self.placed) - len(pairs)
         settled = moved < 1.0
+        last = (
+            f"the last moved no parameter by more than {moved:.2g} of its standard error"
+            if settled
+            else f"not settled: the last still moved a parameter by {moved:.2g} of its standard "
+            "error, and the intervals do not hold; take --estimator iv or ls"
+        )
         detail = (
             f"{len(pairs)} windows of {IDENTIFY.window:g} s, {rounds} rounds from least squares, "
-            f"the last moved no parameter by more than {moved:.2g} of its standard error"
+            f"{last}"
         )
         if failed:
             detail += f"; {failed} windows could not be simulated and were left out"
