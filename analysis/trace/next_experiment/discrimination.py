@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from analysis.design.twin_records import ideal
 from analysis.effects.base import Effect, shapes_of
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.least_squares import shortest
+from analysis.regression.least_squares import factored
 from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
@@ -45,6 +45,8 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
+RANK: Final = 1e-6  # of the largest singular value: weaker directions of a fit get no value
+
 
 @dataclass(frozen=True)
 class Explanation:
@@ -52,6 +54,11 @@ class Explanation:
 
     effects: tuple[Used, ...] = ()
     beta: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def key(self) -> object:
+        """Effects and coefficients, hashable: equal ones predict the same."""
+        return self.effects, tuple(self.beta.items())
 
     @property
     def keys(self) -> tuple[dict[str, Any], ...]:
@@ -184,6 +191,9 @@ class ComparisonRows:
                 parts.append(matrix_of(rows, train_data.names) * view.weight(equation))
                 labels.append(np.full(len(rows.rhs), equation, dtype=object))
         self.base, self.equation = np.concatenate(parts), np.concatenate(labels)
+        self._places = {e: np.flatnonzero(self.equation == e) for e in dict.fromkeys(self.equation)}
+        self._fitted: dict[object, Array] = {}
+        self._left: dict[object, dict[str, float]] = {}
 
     def columns(self, used: Used) -> dict[str, Array]:
         """Return an effect's columns (m,) by name; '' is the change of the signals it makes."""
@@ -240,16 +250,25 @@ class ComparisonRows:
         return np.column_stack(blocks)
 
     def residual(self, true: Explanation, wrong: Explanation) -> Array:
-        """Return the noise-free residual (m,) of the fit of `wrong` where `true` is true."""
-        X, y = self.imitation_columns(wrong), self.prediction(true)
-        return np.asarray(y - X @ shortest(X, y, 1e-6))
+        """Return the noise-free residual (m,) of the fit of `wrong` where `true` is true.
 
-    def energy(self, residual: Array) -> dict[str, float]:
-        """Return a residual's energy by equation."""
-        return {
-            str(e): float(residual[self.equation == e] @ residual[self.equation == e])
-            for e in dict.fromkeys(self.equation)
-        }
+        Many explanations are compared with one `wrong`, whose columns are factored once.
+        """
+        if wrong.key not in self._fitted:
+            factors = factored(self.imitation_columns(wrong))
+            self._fitted[wrong.key] = factors.U[:, factors.sigma > RANK * factors.sigma[0]]
+        y, U = self.prediction(true), self._fitted[wrong.key]
+        return np.asarray(y - U @ (U.T @ y))
+
+    def energy(self, true: Explanation, wrong: Explanation) -> dict[str, float]:
+        """Return the energy of `residual` by equation, computed once."""
+        key = true.key, wrong.key
+        if key not in self._left:
+            residual = self.residual(true, wrong)
+            self._left[key] = {
+                str(e): float(residual[at] @ residual[at]) for e, at in self._places.items()
+            }
+        return self._left[key]
 
 
 def separation(
@@ -259,8 +278,7 @@ def separation(
     assert new.view is not None
     distances = []
     for true, wrong in _directions(question):
-        before = old.energy(old.residual(true, wrong))
-        after = new.energy(new.residual(true, wrong))
+        before, after = old.energy(true, wrong), new.energy(true, wrong)
         by_equation = {
             e: float(
                 np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (EXPERIMENT.repeats * len(r.rhs)))
