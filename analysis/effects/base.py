@@ -132,7 +132,8 @@ class Effect(Term):
 
     `stage` orders the terms' `prepare` (see `ordered`): sensor errors are undone first, then come
     effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
-    others need not be rebuilt for another shape. `rescales` marks effects that multiply signals and
+    others need not be rebuilt for another shape. `adds_to_gains` marks effects whose columns add to
+    those of the orifices, under the same gains. `rescales` marks effects that multiply signals and
     their noise by a factor. `hydraulic` marks effects on oil, valve or
     cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
     [SI] of the smallest size of interest on a bench of some kW at some MPa.
@@ -166,6 +167,7 @@ class Effect(Term):
     stage: ClassVar[int] = PLANT
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False
+    adds_to_gains: ClassVar[bool] = False
     rescales: ClassVar[bool] = False
     amplifies: ClassVar[bool] = False
     exact: ClassVar[bool] = False

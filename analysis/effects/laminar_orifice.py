@@ -26,8 +26,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.orifice import root_of_drop, signed_root
-from rig.model.parameters import gain_names, parameter_unit
+from analysis.terms.orifice import Orifice, edge_columns, root_of_drop, signed_root
 from rig.model.rig import Rig
 
 TRANSITION: Final = "dp_laminar"
@@ -50,7 +49,7 @@ class LaminarOrifice(Effect):
     mechanism: ClassVar[str] = "metering_curve"
     element: ClassVar[str] = "valve"
     hydraulic: ClassVar[bool] = True
-    prepares: ClassVar[bool] = False
+    adds_to_gains: ClassVar[bool] = True
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     least_shape: ClassVar[tuple[float, ...]] = (0.1e6,)  # [Pa]
     variable: ClassVar[str] = "the pressure drop across the metering edges"
@@ -72,8 +71,7 @@ class LaminarOrifice(Effect):
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the gains of all joints, which `orifice` owns."""
-        names = [name for i in range(len(rig.joints)) for name in gain_names(i + 1)]
-        return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
+        return Orifice().coefficients(rig)
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the drop of the transition and the sharpness of its form."""
@@ -87,37 +85,20 @@ class LaminarOrifice(Effect):
             Shape(SHARPNESS, "", 0.7, 6.0, (2.0,), saturates=True, detail=True),
         )
 
-    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Return the signals unchanged."""
-        return signals
-
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the opening times what the roots lose, under the orifices' own names."""
         transition, sharpness = self.whole(rig, shape)
-        out: Columns = {}
-        p_s, p_t = signals.p_s, signals.p_tank
 
         def lost(drop: Array) -> Array:
             share = share_of_root(np.maximum(np.abs(drop), 1.0), transition, sharpness or SUM)
             return np.asarray(root_of_drop(drop) * (share - 1.0))
 
-        for i in signals.excited_joints:
-            pp, pm, mp, mm = gain_names(i + 1)
-            u, cap, rod = signals.u[:, i], signals.p_cap[:, i], signals.p_rod[:, i]
-            ahead, astern = np.maximum(u, 0.0), np.minimum(u, 0.0)
-            out[equation("flow_cap", i)] = {
-                pp: lost(p_s - cap) * ahead,
-                pm: lost(cap - p_t) * astern,
-            }
-            out[equation("flow_rod", i)] = {
-                mp: -lost(rod - p_t) * ahead, mm: -lost(p_s - rod) * astern
-            }  # fmt: skip
-        return out
+        return edge_columns(signals, lost)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return dp_t, n, then the gains of each joint."""
-        gains = (values[n] for i in range(len(rig.joints)) for n in gain_names(i + 1))
         transition, sharpness = self.whole(rig, shape)
+        gains = (values[c.parameter] for c in self.coefficients(rig))
         return np.array([transition, sharpness or SUM, *gains])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:

@@ -45,6 +45,7 @@ class UnderlapLeakage(ValveEffect):
     name: ClassVar[str] = "underlap_leakage"
     least_shape: ClassVar[tuple[float, ...]] = (4e-3,)  # [V]
     prepares: ClassVar[bool] = False
+    adds_to_gains: ClassVar[bool] = True
     variable: ClassVar[str] = "the spool near its null and the chamber pressures"
     confounders: ClassVar[tuple[str, ...]] = (
         "valve_deadband",
@@ -77,10 +78,6 @@ class UnderlapLeakage(ValveEffect):
         grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke, 0.1 * stroke)
         own, r, c = self.shape_names()
         return Shape(own, "V", 0.0, 0.5 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
-
-    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Return the signals unchanged."""
-        return signals
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the additional openings times the roots, under the orifices' own names."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -57,21 +57,7 @@ class Orifice(Term):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the four roots times the opening, in the chamber that each edge serves."""
-        out: Columns = {}
-        for i in signals.excited_joints:
-            pp, pm, mp, mm = gain_names(i + 1)
-            u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
-            cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
-            opened, closed = np.maximum(u, 0.0), np.minimum(u, 0.0)
-            out[equation("flow_cap", i)] = {
-                pp: root_of_drop(p_s - cap) * opened,
-                pm: root_of_drop(cap - p_t) * closed,
-            }
-            out[equation("flow_rod", i)] = {
-                mp: -root_of_drop(rod - p_t) * opened,
-                mm: -root_of_drop(p_s - rod) * closed,
-            }
-        return out
+        return edge_columns(signals, root_of_drop)
 
     def valid(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Mapping[str, Mask]:
         """Return where each chamber's pressure lies in [p_t, p_s]."""
@@ -82,6 +68,28 @@ class Orifice(Term):
                 p = pressures[:, i]
                 out[equation(kind, i)] = (p >= p_t) & (p <= p_s)
         return out
+
+
+def edge_columns(signals: Signals, root: Callable[[Array], Array]) -> Columns:
+    """Return the columns of the gains of the excited joints: openings times `root` of the drops.
+
+    `root` maps the pressure drops of an edge (n,) [Pa] to what its flow is proportional to (n,).
+    """
+    out: Columns = {}
+    for i in signals.excited_joints:
+        pp, pm, mp, mm = gain_names(i + 1)
+        u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
+        cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
+        opened, closed = np.maximum(u, 0.0), np.minimum(u, 0.0)
+        out[equation("flow_cap", i)] = {
+            pp: root(p_s - cap) * opened,
+            pm: root(cap - p_t) * closed,
+        }
+        out[equation("flow_rod", i)] = {
+            mp: -root(rod - p_t) * opened,
+            mm: -root(p_s - rod) * closed,
+        }
+    return out
 
 
 @functools.lru_cache

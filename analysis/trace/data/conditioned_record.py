@@ -84,15 +84,16 @@ def is_hidden_by_lock(term: Term, conditioned: ConditionedRecord) -> bool:
     return int(where.split()[1]) in conditioned.record.locked
 
 
-def changes_signals(term: Term) -> bool:
-    """Return whether a term changes the signals of all terms, or the samples that are valid."""
+def changes_rows(term: Term) -> bool:
+    """Return whether a term changes the rows of others: signals, valid samples or columns."""
     kind = type(term)
-    return kind.prepare is not Term.prepare or kind.valid is not Term.valid
+    signals = kind.prepare is not Term.prepare or kind.valid is not Term.valid
+    return signals or getattr(kind, "adds_to_gains", False)
 
 
 def families_of(rig: Rig, term: Term) -> frozenset[str]:
     """Return the families of rows in which a term has columns or changes the signals."""
-    altered = getattr(term, "alters", FAMILIES) if changes_signals(term) else ()
+    altered = getattr(term, "alters", FAMILIES) if changes_rows(term) else ()
     return frozenset((*altered, *(c.family for c in term.coefficients(rig))))
 
 
@@ -155,7 +156,7 @@ def shared_rows(
     out: dict[str, Rows] = {}
     for family in conditioned.families:
         acting = [u for u, families in here if family in families]
-        added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
+        added = [u for u in acting if isinstance(u.term, Effect) and not changes_rows(u.term)]
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
         # Signals depend only on the terms that change them, so that families of rows share them.
@@ -239,7 +240,7 @@ def candidate_columns(
     `prepared` and `rows` are the signals and rows under `terms`, `beta` the rows' coefficients
     (1/b for b). The pseudo-column of a change of signals (see the module) is named ''.
     """
-    if not changes_signals(used.term):
+    if not changes_rows(used.term):
         return _added_columns(rig, conditioned, lambda: prepared, rows, used, cache)
     acting = _families(rig, used.term, cache)
     families = tuple(f for f in conditioned.families if f in acting)

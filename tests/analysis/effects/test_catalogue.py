@@ -85,6 +85,12 @@ def test_places_are_those_of_the_contract_and_every_candidate_has_its_own_parame
             assert owners.setdefault(name, (e.name, e.where)) == (e.name, e.where)
 
 
+def test_an_effect_with_columns_of_the_gains_says_so(rig: Rig) -> None:
+    gains = {name for i in (1, 2) for name in gain_names(i)}
+    for e in effects(rig):
+        assert e.adds_to_gains is any(c.parameter in gains for c in e.coefficients(rig)), e.name
+
+
 def test_shapes_are_looked_at_within_their_bounds(rig: Rig) -> None:
     for e in effects(rig):
         shapes = e.shapes(rig)
