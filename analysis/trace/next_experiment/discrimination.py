@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from analysis.design.twin_records import ideal
 from analysis.effects.base import Effect, shapes_of
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.least_squares import factored
 from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
@@ -40,6 +39,7 @@ from analysis.trace.data.conditioned_record import (
 from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData, variant_columns
 from analysis.trace.next_experiment.excitations import CandidateExcitation
+from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import EXPERIMENT
 from rig.model.rig import Rig
 
@@ -255,10 +255,9 @@ class ComparisonRows:
         Many explanations are compared with one `wrong`, whose columns are factored once.
         """
         if wrong.key not in self._fitted:
-            factors = factored(self.imitation_columns(wrong))
-            self._fitted[wrong.key] = factors.U[:, factors.sigma > RANK * factors.sigma[0]]
-        y, U = self.prediction(true), self._fitted[wrong.key]
-        return np.asarray(y - U @ (U.T @ y))
+            self._fitted[wrong.key] = orthonormal(self.imitation_columns(wrong), RANK)
+        y, basis = self.prediction(true), self._fitted[wrong.key]
+        return np.asarray(y - basis @ (basis.T @ y))
 
     def energy(self, true: Explanation, wrong: Explanation) -> dict[str, float]:
         """Return the energy of `residual` by equation, computed once."""

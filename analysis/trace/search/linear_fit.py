@@ -100,12 +100,15 @@ def project(
     )  # fmt: skip
 
 
-def orthonormal(columns: Array) -> Array:
-    """Return an orthonormal basis (M, r) of the columns' span."""
+def orthonormal(columns: Array, rank: float = TRACE.rank_limit) -> Array:
+    """Return an orthonormal basis (M, r) of the columns' span.
+
+    Directions of the scaled columns below `rank` times the largest singular value are left out.
+    """
     scale = np.linalg.norm(columns, axis=0)
     kept = columns[:, scale > 0] / scale[scale > 0]
     U, sigma, _ = np.linalg.svd(kept, full_matrices=False)
-    return np.asarray(U[:, sigma > TRACE.rank_limit * sigma[0]]) if len(sigma) else U
+    return np.asarray(U[:, sigma > rank * sigma[0]]) if len(sigma) else U
 
 
 def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], least: Array) -> Array:
