@@ -15,7 +15,7 @@ from pathlib import Path
 import typer
 from typer.exceptions import TyperException
 
-from rig.cli.text.output import discard, progress
+from rig.cli.text.output import discard, is_terminal, progress
 
 OK = 0
 FAILED = 1
@@ -33,7 +33,7 @@ class WorkError(Exception):
 
 def coloured() -> bool:
     """Return whether standard error is a terminal and NO_COLOR is not set."""
-    return sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    return is_terminal(sys.stderr) and not os.environ.get("NO_COLOR")
 
 
 def alarm(text: str) -> str:

@@ -16,6 +16,7 @@ import pytest
 from protocols.engine.states import TRANSITIONS, EngineState
 from rig.bench.screens.commands import Command
 from rig.bench.screens.sockets import Attachment
+from rig.cli.errors import alarm
 from rig.cli.execution.attended import terminal_lines
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
@@ -338,3 +339,10 @@ def test_where_the_shell_has_closed_standard_input_nobody_can_answer(
     loop = bramah_here("loop", "--rig", RIG, "--out", tmp_path / "loop")
     assert loop.returncode == 2
     assert "--unattended" in loop.stderr
+
+
+def test_an_alarm_has_no_colour_where_standard_error_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sys.stderr", None)
+    assert alarm("outputs not confirmed at zero") == "outputs not confirmed at zero"

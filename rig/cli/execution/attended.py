@@ -6,15 +6,12 @@ import math
 import select
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
+
+from rig.cli.text.output import is_terminal
 
 if TYPE_CHECKING:
     from rig.cli.identification.tracking import Tracking
-
-
-def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether a stream is a terminal; one that the shell has closed is None."""
-    return stream is not None and stream.isatty()
 
 
 def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:

@@ -24,7 +24,7 @@ from protocols.files.plan import Plan, resolve
 from protocols.files.writer import protocol_text
 from rig.cli.proof.planned import designed_protocol, designed_step, empty_lines, planned_steps
 from rig.cli.proof.twin_choice import TwinParameters
-from rig.cli.text.output import progress, table
+from rig.cli.text.output import condition_text, progress, table
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -148,8 +148,8 @@ def prediction_text(forecast: CheckedForecast) -> str:
     lines = ["predicted from the stated sensor noise, relative to the value on the twin:"]
     lines.append(table(header, rows))
     for family, (rank, size) in p.rank.items():
-        condition = p.condition[family]
-        lines.append(f"{family}: rank {rank} of {size}, condition number {condition:.1f}")
+        condition = condition_text(p.condition[family])
+        lines.append(f"{family}: rank {rank} of {size}, condition number {condition}")
     if p.masked_share > 0:
         lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
     lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]

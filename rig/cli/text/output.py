@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 LINE_SECONDS: Final = 3.0  # [s] between the lines of a countdown, and before the first
 
@@ -28,11 +28,21 @@ def progress(message: str) -> None:
         discard(sys.stderr.fileno())
 
 
+def is_terminal(stream: TextIO | None) -> bool:
+    """Return whether a stream is a terminal; one that the shell has closed is None."""
+    return stream is not None and stream.isatty()
+
+
 def discard(descriptor: int) -> None:
     """Discard what is still to be written to an open file and all that is written later."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, descriptor)
     os.close(null)
+
+
+def condition_text(condition: float) -> str:
+    """Return a condition number with one decimal, a large one with an exponent."""
+    return f"{condition:.1f}" if condition < 1e5 else f"{condition:.1e}"
 
 
 def clock_text(seconds: float) -> str:

@@ -10,7 +10,7 @@ from analysis.identify.result import Identification
 from analysis.report.format import MINUS, column_percent
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
-from rig.cli.text.output import table
+from rig.cli.text.output import condition_text, table
 from rig.model.units import RESIDUALS, RESULTS, DisplayUnit, typeset
 
 
@@ -60,9 +60,8 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     for family, solution in result.solutions.items():
         if not result.rows[family]:
             continue  # a search solves no regression
-        condition = solution.condition_number
-        shown = f"{condition:.1f}" if condition < 1e5 else f"{condition:.1e}"
-        lines.append(f"{family}: {result.rows[family]} rows, condition number {shown}")
+        condition = condition_text(solution.condition_number)
+        lines.append(f"{family}: {result.rows[family]} rows, condition number {condition}")
     lines.append(f"masked rows: {result.masked_rows}; solved in {result.solve_seconds:.3f} s")
     if (estimator := result.model.provenance.get("estimator")) is not None:
         lines.append(f"estimator: {estimator}")

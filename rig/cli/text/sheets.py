@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from protocols.design.check_report import CheckReport, Moment, MotionPrediction
 from protocols.design.proof import Proof, Verdicts
 from protocols.files.plan import Plan
-from rig.cli.text.output import clock_text, table
+from rig.cli.text.output import clock_text, condition_text, table
 from rig.model.units import LIMITS, display_unit
 
 _BAR = 40  # width of the timeline [characters]
@@ -136,7 +136,7 @@ def proof_text(proof: Proof) -> str:
         if verdict.complete:
             lines.append(
                 f"{family}: all {size} parameters are determined, condition number "
-                f"{verdict.condition:.1f}"
+                f"{condition_text(verdict.condition)}"
             )
             continue
         lines.append(f"{family}: rank {verdict.rank} of {size}")
@@ -148,5 +148,5 @@ def proof_text(proof: Proof) -> str:
 
 def _so_far(verdicts: Verdicts, family: str) -> str:
     verdict = verdicts[family]
-    condition = f"{verdict.condition:.1f}" if verdict.complete else "—"
+    condition = condition_text(verdict.condition) if verdict.complete else "—"
     return f"{verdict.rank} of {len(verdict.names)}, {condition}"

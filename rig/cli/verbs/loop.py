@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from rig.cli.errors import code_and_message
-from rig.cli.execution.attended import is_terminal
 from rig.cli.options import (
     EndpointOption,
     JsonOption,
@@ -20,7 +19,7 @@ from rig.cli.options import (
     ScaleOption,
     writable_file,
 )
-from rig.cli.text.output import printed_at_end, progress, write_json
+from rig.cli.text.output import is_terminal, printed_at_end, progress, write_json
 
 
 def loop(

@@ -11,9 +11,8 @@ from typing import Annotated
 import typer
 
 from rig.cli.errors import WorkError
-from rig.cli.execution.attended import is_terminal
 from rig.cli.options import EndpointOption
-from rig.cli.text.output import progress
+from rig.cli.text.output import is_terminal, progress
 
 
 def monitor(
