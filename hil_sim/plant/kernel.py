@@ -72,7 +72,7 @@ def orifice(drop: float, laminar: float) -> float:
 
 @jit
 def edge_root(drop: float, laminar: float, form: float) -> float:
-    """Return what an edge's flow is in proportion to [Pa^0.5], laminar below the drop `laminar`.
+    """Return the flow of an edge over gain and opening [Pa^0.5], laminar below the drop `laminar`.
 
     `form` 0: `orifice`. 1: a cubic below, the square root above, of one slope where they meet. 2: a
     flow coefficient of tanh(2 Re / Re_t), Re in proportion to the drop's root (McCloy and Martin,
