@@ -85,6 +85,7 @@ def test_parameters_are_found_up_to_one_scale(joints: int, rig: Rig) -> None:
         assert found[name] == pytest.approx(2.0 * value, rel=allowed), name
 
 
+@pytest.mark.slow
 def test_output_error_takes_out_what_noise_did_to_the_rows(rig: Rig) -> None:
     described, values, swings = let_go(2, rig)
     rng = np.random.default_rng(9)

@@ -242,6 +242,7 @@ def test_a_bench_whose_area_is_off_is_covered_with_its_tolerance_only(wrong_area
     assert all(held(identify([stating(wrong_area, Tolerances(area=0.003))]), truth).values())
 
 
+@pytest.mark.slow
 def test_a_trace_includes_them_once_before_and_after(rig: Rig) -> None:
     train, held_out = pair_of_runs(rig, c_internal=2e-12)
     leaks = catalogue(rig, ("internal_leakage",))

@@ -91,6 +91,7 @@ def test_the_model_is_not_judged_by_samples_that_were_made_up(
         validate(model, [with_lost(both_run, (2000, 2300))])
 
 
+@pytest.mark.slow
 def test_a_report_can_be_made_of_records_with_gaps(multisine_run: Run) -> None:
     run = with_lost(multisine_run, (3000, 3020))
     assert "lost samples" in render_report(runs=[run], identification=identify([run]))

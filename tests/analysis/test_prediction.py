@@ -48,6 +48,7 @@ def measured(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
     return replace(record, channels=channels)
 
 
+@pytest.mark.slow
 def test_the_scatter_of_simulated_experiments_is_the_one_predicted(
     rig: Rig, played: list[Played], predicted: Prediction
 ) -> None:

@@ -96,6 +96,7 @@ def test_record_by_record_the_same_terms_give_the_same_numbers(folder: Path, rub
         bramah("identify", rubbed, "--with", "valve_deadband@joint 2", "--stream")
 
 
+@pytest.mark.slow
 def test_a_shape_that_the_records_give_is_stated_with_its_interval(
     rubbed: Path, tmp_path: Path
 ) -> None:

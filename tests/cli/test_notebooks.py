@@ -56,6 +56,7 @@ def test_from_a_run_to_a_model_that_knows_the_worn_seal(
     assert (tmp_path / "model.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_step_is_changed_and_its_records_taken_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -59,6 +59,7 @@ def test_keys_in_a_terminal_stop_real_runs_and_are_timed_by_the_device(runtime: 
         assert 0.0 < zeroed < np.inf
 
 
+@pytest.mark.slow
 def test_a_run_that_nobody_stops_loses_nothing_when_its_screen_is_killed(runtime: Path) -> None:
     with (
         simulated_bench("digger-3dof", seed=1, real_time=True) as endpoint,

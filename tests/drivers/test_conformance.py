@@ -19,6 +19,7 @@ from tests.drivers.memory_bench import memory_subject
 from tests.drivers.valve_bus import valves_subject
 from tests.drivers.wires import device_process
 from tests.hil_sim.integrator import seed_rig
+from tests.variants import kept
 
 pytest_plugins = ["drivers.conformance.plugin"]
 SUBJECT = memory_subject()
@@ -31,13 +32,7 @@ WIRES: dict[str, Callable[[], Subject]] = {
 }
 
 
-FURTHER = ("modbus-rtu", "serial", "can, in its adapter", "canopen-408", "can-slcan")
-
-
-@pytest.mark.parametrize(
-    "wire",
-    [pytest.param(wire, marks=[pytest.mark.slow] * (wire in FURTHER)) for wire in WIRES],
-)
+@pytest.mark.parametrize("wire", kept(WIRES, (list(WIRES).index(TCP),)))
 def test_a_shipped_driver_conforms_over_a_wire_that_fails(wire: str) -> None:
     subject = WIRES[wire]()
     report = run(subject, effort=QUICK if wire == TCP else SHORT)

@@ -63,6 +63,7 @@ def test_with_the_dead_band_known_an_unseen_ramp_is_followed_ten_times_closer() 
     assert any("rod_pressure_1" in d.variable for d in left.depends_on[:2])
 
 
+@pytest.mark.slow
 @measured
 def test_the_counterbalance_valve_stays_unexplained() -> None:
     data = study.load(FOLDER)

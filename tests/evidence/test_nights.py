@@ -9,9 +9,10 @@ import pytest
 from tests.studies.nights.endurance import endure
 from tests.studies.nights.faulty_queue import faulty_queue
 from tests.studies.nights.kills import kills_on
+from tests.variants import kept
 
 
-@pytest.mark.parametrize("wire", ["modbus-rtu", "serial"])
+@pytest.mark.parametrize("wire", kept(["modbus-rtu", "serial"], (1,)))
 def test_runs_killed_on_a_real_wire_lose_nothing_and_leave_the_outputs_at_zero(
     wire: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

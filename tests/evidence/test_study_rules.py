@@ -36,6 +36,7 @@ def test_a_rule_that_keeps_a_wrong_name_away_is_counted_so() -> None:
     assert "spool_offset at joint 2" in text(page)
 
 
+@pytest.mark.slow
 def test_an_answer_without_rules_kept_from_others_is_that_of_the_whole_trace(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,6 +89,7 @@ def test_what_no_data_can_separate_is_said_to_be_so(matrix: isolability.Isolabil
     assert matrix.distance[leak, spring] == pytest.approx(matrix.distance[leak, leak])
 
 
+@pytest.mark.slow
 def test_plain_methods_add_more_than_the_cause_and_the_page_says_how_much(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

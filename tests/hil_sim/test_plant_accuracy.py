@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rig.cli.bench.plant import accuracy, speed
 
 
@@ -11,6 +13,7 @@ def test_the_fixed_step_agrees_with_scipy() -> None:
     assert figures["pressure_error"] < 1e-6
 
 
+@pytest.mark.slow
 def test_speed_is_told_with_a_comparison_at_equal_accuracy() -> None:
     figures = speed(seconds=0.2)
     assert figures["lsoda_error"] <= figures["plant_error"] < 1e-6

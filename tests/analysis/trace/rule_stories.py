@@ -609,7 +609,21 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (the_order_of_the_repeats_changes_nothing, ("first repeat alone",)),
     (intervals_are_as_wide_as_estimates_scatter, ("intervals x 0.5", "intervals x 3")),
 )  # fmt: skip
-# Slow stories that `test_foreign_bench` asserts with all rules.
+# Stories that take seconds each, of rules that fewer benches need.
+SLOW: Final = (
+    friction_beside_a_pressure_offset_is_not_taken_for_two_levels,
+    a_spring_that_fits_like_an_inclination_is_its_rival,
+    a_high_return_pressure_is_found_beside_an_underlap,
+    wrong_volumes_at_one_joint_name_nothing_at_the_other,
+    levels_whose_difference_the_weight_takes_up_are_confounded_with_one,
+    one_level_on_an_inclined_base_is_not_taken_for_two_levels,
+    a_breakaway_is_found_with_the_level_below_it_beside_a_lag,
+    an_effect_too_small_to_be_named_widens_an_interval,
+    of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first,
+    noise_above_the_stated_one_is_noise_where_nothing_repeats,
+    what_stays_while_a_joint_sticks_speaks_against_no_friction,
+)
+# Stories that `test_foreign_bench` asserts with all rules.
 ELSEWHERE: Final = (
     friction_without_a_memory_is_coulomb_friction_too, a_drop_without_a_name_is_drawn_as_a_curve,
 )  # fmt: skip

@@ -42,6 +42,7 @@ def sprung(quiet: tuple[Run, Run]) -> Trace:
     return trace([train], [held_out], catalogue(train.rig, FEW), look_ahead=False)
 
 
+@pytest.mark.slow
 def test_a_spring_that_goes_with_the_cube_is_read_off_with_its_stiffness(sprung: Trace) -> None:
     (found,) = sprung.formulas
     assert found.equation == "torque_2"

@@ -73,6 +73,7 @@ def test_the_largest_changes_are_noted_and_all_are_in_the_result(small: Trace) -
     assert shifts[-1] >= 0.01
 
 
+@pytest.mark.slow
 def test_a_special_case_of_a_named_effect_is_none_that_could_hide_beside_it(rig: Rig) -> None:
     """Friction of one level is part of that of two, and would change both without limit."""
     names = ("asymmetric_friction", "coulomb_friction", "stribeck_friction")

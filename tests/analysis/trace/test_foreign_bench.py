@@ -188,6 +188,7 @@ def test_slopes_by_direction_are_asymmetric_viscous_friction(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
 
 
+@pytest.mark.slow
 def test_slopes_that_differ_little_are_named_where_no_dry_friction_is_beside_them(
     rig: Rig,
 ) -> None:
@@ -200,6 +201,7 @@ def test_slopes_that_differ_little_are_named_where_no_dry_friction_is_beside_the
     assert ahead - astern == pytest.approx(50.0, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [3.14, pytest.param(7.3, marks=pytest.mark.slow)])
 def test_a_hum_that_begins_with_the_record_is_a_periodic_disturbance(
     rig: Rig, frequency: float
@@ -261,6 +263,7 @@ def test_dry_friction_that_grows_along_the_stroke_is_a_curve_that_grows(rig: Rig
     assert result.model_after.values["W2"] == pytest.approx(TRUTH["W2"], rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tighter", [3.0, pytest.param(16.0, marks=pytest.mark.slow)])
 def test_friction_that_changes_along_the_stroke_is_neither_a_level_nor_a_slope(
     rig: Rig, tighter: float
@@ -273,6 +276,7 @@ def test_friction_that_changes_along_the_stroke_is_neither_a_level_nor_a_slope(
     assert result.after["torque_2"] < 1.3 * result.noise_floor["torque_2"]
 
 
+@pytest.mark.slow
 def test_a_preloaded_spring_rests_where_the_joint_does_not_come(rig: Rig) -> None:
     """The joint reaches from -1.83 to -0.96 rad."""
     result = traced(rig, Hidden(spring=30.0, spring_rest=-0.7), *FORCES, free_forms=False)
@@ -344,6 +348,7 @@ def test_edges_with_half_their_gain_about_the_null_are_no_dead_band(rig: Rig) ->
     assert [(e.name, e.free) for e in result.effects] == [("metering_curve", True)]
 
 
+@pytest.mark.slow
 def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -> None:
     result = traced(rig, Hidden(leak_root=5e-9), *FLOWS)
     assert result.verdict == "explained"
@@ -358,6 +363,7 @@ def test_a_leak_past_a_sharp_edge_goes_with_the_root_of_the_pressure(rig: Rig) -
     assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("laminar", "reynolds"), [(3e5, 0), pytest.param(2e6, 1, marks=pytest.mark.slow)]
 )
@@ -383,6 +389,7 @@ def test_edges_that_are_laminar_at_small_drops_are_named_and_their_gains_put_rig
     assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.005)
 
 
+@pytest.mark.slow
 def test_a_worn_bore_leaks_most_where_it_is_worn(rig: Rig) -> None:
     result = traced(rig, Hidden(leak=1e-12, worn=3.0), *FLOWS)
     assert result.verdict == "explained"
@@ -422,6 +429,7 @@ def test_what_stands_between_the_world_and_the_records_is_named(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_spool_of_second_order_is_one_lag_with_its_damping_and_leaves_the_bulk_modulus(
     rig: Rig,
 ) -> None:
@@ -469,6 +477,7 @@ def test_a_supply_that_no_sensor_measures_is_found_to_have_another_pressure(rig:
     assert any("no sensor measures the supply" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_a_supply_whose_sag_has_no_name_in_the_catalogue_is_a_curve_over_the_flow(rig: Rig) -> None:
     """Without `supply_sag` among the candidates the data draw the line that is there."""
     train, held_out = pair_of_runs(rig, Hidden(sag=2e6))

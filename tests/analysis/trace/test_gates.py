@@ -21,8 +21,9 @@ from tests.analysis.trace import foreign_bench, gate_cases
 from tests.analysis.trace.foreign_bench import Hidden
 from tests.analysis.trace.gate_cases import LEAK
 from tests.analysis.trace.hidden import pair_of_runs
-from tests.analysis.trace.rule_stories import ELSEWHERE, NO_BENCH, STORIES, Benches, Story
+from tests.analysis.trace.rule_stories import ELSEWHERE, NO_BENCH, SLOW, STORIES, Benches, Story
 from tests.studies.trace.rules import FAULTS, RULES, by_name, switched_off
+from tests.variants import kept
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,11 @@ def benches(rig: Rig) -> Benches:
     return Benches(rig)
 
 
-@pytest.mark.parametrize(("story", "broken"), STORIES, ids=[s.__name__ for s, _ in STORIES])
+@pytest.mark.parametrize(
+    ("story", "broken"),
+    kept(STORIES, [k for k, (story, _) in enumerate(STORIES) if story not in SLOW]),
+    ids=[s.__name__ for s, _ in STORIES],
+)
 def test_what_a_gate_is_for_holds_and_is_lost_without_it(
     benches: Benches, story: Story, broken: tuple[str, ...]
 ) -> None:

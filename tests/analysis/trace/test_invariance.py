@@ -117,6 +117,7 @@ def shuffled(run: Run) -> Run:
     return replace(run, records=tuple(records))
 
 
+@pytest.mark.slow
 def test_records_and_channels_in_another_order(runs: tuple[Run, Run], as_it_is: Trace) -> None:
     train, held_out = map(shuffled, runs)
     assert [r.name for r in train.records] != [r.name for r in runs[0].records]
@@ -212,6 +213,7 @@ def in_changed_places(run: Run) -> Run:
     return replace(run, rig=other, records=tuple(map(renamed, run.records)))
 
 
+@pytest.mark.slow
 def test_joints_in_changed_places(runs: tuple[Run, Run], as_it_is: Trace) -> None:
     train, held_out = map(in_changed_places, runs)
     assert train.rig.joints[0].linkage.angle(0.0) == pytest.approx(
@@ -239,6 +241,7 @@ def at_rest(run: Run, locked: tuple[int, ...]) -> Run:
     return replace(run, records=(*still, *run.records))
 
 
+@pytest.mark.slow
 def test_a_further_step_in_which_nothing_moves(runs: tuple[Run, Run], as_it_is: Trace) -> None:
     result = traced((at_rest(runs[0], (1, 2)),), runs[1])
     assert [e.where for e in result.effects] == ["joint 2"]

@@ -216,6 +216,7 @@ def test_what_the_judging_records_know_far_better_is_no_error_of_the_model(
     assert held_out.refitted_names(wrong, settled) == ["M2"]
 
 
+@pytest.mark.slow
 def test_an_equation_whose_rows_a_step_masks_is_traced_with_the_other_steps(rig: Rig) -> None:
     """A chamber stands above the supply's pressure for most of one step."""
     train, held_out = pair_of_runs(rig, c_internal=LEAK)

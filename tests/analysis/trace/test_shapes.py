@@ -59,6 +59,7 @@ def test_what_the_records_do_not_have_comes_out_as_next_to_nothing(rig: Rig) -> 
     assert max(sizes["w_ahead_2"], sizes["w_astern_2"]) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_search_that_ended_in_a_local_minimum_beside_another_effect_is_begun_anew(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

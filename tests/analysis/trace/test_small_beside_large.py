@@ -36,6 +36,7 @@ def test_a_gain_wrong_by_parts_in_a_thousand_is_not_called_crosstalk_of_the_othe
     assert s.vetoes(s.winner) == ""
 
 
+@pytest.mark.slow
 def test_a_spring_is_found_beside_a_gain_that_took_part_of_it(rig: Rig) -> None:
     """Alone the gain comes out as 1.078: the spring earns its place once the gain may move too."""
     runs = pair_of_runs(rig, gain_cap_pressure=1.05, k_spring=20.0)
@@ -47,6 +48,7 @@ def test_a_spring_is_found_beside_a_gain_that_took_part_of_it(rig: Rig) -> None:
     assert s.vetoes(s.winner) == ""
 
 
+@pytest.mark.slow
 def test_what_a_dead_band_leaves_above_the_noise_is_an_offset_and_not_an_error_of_its_form(
     rig: Rig,
 ) -> None:

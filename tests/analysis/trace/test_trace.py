@@ -152,6 +152,7 @@ def test_the_result_has_the_contracts_keys(leaking: Trace) -> None:
     assert set(data["error"]["after"]) == {"torque_2", "flow_cap_2", "flow_rod_2"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [BOTH, pytest.param((), marks=pytest.mark.slow)])
 def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig, names: tuple[str, ...]) -> None:
     train, held_out = pair_of_runs(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
@@ -186,6 +187,7 @@ def test_a_quiet_effect_is_found_beside_a_loud_one_of_other_equations(rig: Rig) 
     assert result.worst(result.after) < 1.3
 
 
+@pytest.mark.slow
 def test_a_leak_that_began_between_the_runs_gets_no_clue_from_the_noise_before_it(
     rig: Rig, quiet: tuple[Run, Run]
 ) -> None:
@@ -228,6 +230,7 @@ def test_a_spring_that_hardens_is_one_spring_as_far_as_forms_may_differ(rig: Rig
     assert [e.name for e in much.effects] == ["position_force"]
 
 
+@pytest.mark.slow
 def test_one_repeat_says_what_it_costs(rig: Rig) -> None:
     train = experiment(rig, repeats=1, c_internal=2e-12)
     held_out = experiment(rig, repeats=1, seed=2, rms=0.02, c_internal=2e-12)
@@ -292,6 +295,7 @@ def test_the_baseline_before_is_what_identify_finds(leaking: Trace, rig: Rig) ->
     assert leaking.model_before.values == pytest.approx(alone.values, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_a_null_that_may_be_the_sensors_own_is_confounded_with_it(rig: Rig) -> None:
     train, held_out = pair_of_runs(rig, u_null=3e-3)
     result = trace([train], [held_out])
