@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import io
 import json
 import os
 import select
@@ -34,6 +35,7 @@ ROOT: Final = Path(__file__).parents[1]
 LENGTH: Final = 8  # bytes of a request's length, of a number of a process and of an exit code
 ADDRESS: Final = "BRAMAH_TESTS_FORK"  # environment variable: where the process to fork from listens
 STREAMS: Final = 3  # standard output, standard error, status
+MOST: Final = 8  # open files sent with a request: these streams, and what is inherited
 COMMAND: Final = "rig.cli.main"
 IMPORTED: Final = (
     "rig.cli.verbs.run", "rig.cli.verbs.sim", "rig.cli.execution.protocol_run", "rig.bench.session",
@@ -44,7 +46,9 @@ IMPORTED: Final = (
 class Forked:
     """A forked process of `bramah` or of a module, as `subprocess.Popen` has one.
 
-    Its output is text in pipes; `told` leaves its errors where this process has its own.
+    Its output is text in pipes; `told` leaves its errors where this process has its own. With
+    `files`, numbers of open files, they are its standard output and error. It also has the open
+    files `inherited` until it ends.
     """
 
     def __init__(
@@ -54,21 +58,27 @@ class Forked:
         module: str = COMMAND,
         *,
         told: bool = False,
+        files: tuple[int, int] | None = None,
+        inherited: Sequence[int] = (),
     ) -> None:
         self.args = [str(word) for word in words]
         self.returncode: int | None = None
         self._status, status = socket.socketpair()
-        ends = [os.pipe(), os.pipe()]
+        ends = [] if files else [os.pipe(), os.pipe()]
         request = {
             "module": module, "words": self.args, "cwd": str(cwd or Path.cwd()),
             "environment": {**os.environ},
         }  # fmt: skip
-        outputs = [ends[0][1], 2 if told else ends[1][1]]
-        _ask(request, [*outputs, status.fileno()])
+        outputs = files or (ends[0][1], 2 if told else ends[1][1])
+        _ask(request, [*outputs, status.fileno(), *inherited])
         status.close()
         for _, write in ends:
             os.close(write)
-        self.stdout, self.stderr = (os.fdopen(read, encoding="utf-8") for read, _ in ends)
+        self.stdout, self.stderr = (
+            (os.fdopen(read, encoding="utf-8") for read, _ in ends)
+            if ends
+            else (io.StringIO(), io.StringIO())
+        )
         self.pid = int(self._status.recv(LENGTH))
 
     def __enter__(self) -> Forked:
@@ -198,7 +208,7 @@ def forked_at_requests(listener: socket.socket) -> str:
             sys.exit()
         link, _ = listener.accept()
         with link:
-            head, streams, _, _ = socket.recv_fds(link, LENGTH, STREAMS)
+            head, streams, _, _ = socket.recv_fds(link, LENGTH, MOST)
             length, raw = int.from_bytes(head, "big"), b""
             while len(raw) < length:
                 raw += link.recv(length - len(raw))
@@ -218,7 +228,7 @@ def _as_started_anew(request: dict[str, Any], streams: list[int]) -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for place, stream in enumerate((nothing, *streams[:2])):
         os.dup2(stream, place)
-    for stream in (nothing, *streams):
+    for stream in (nothing, *streams[:STREAMS]):
         os.close(stream)
     sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     sys.stderr = os.fdopen(2, "w", 1, "utf-8", "backslashreplace", closefd=False)
@@ -231,8 +241,8 @@ def _as_started_anew(request: dict[str, Any], streams: list[int]) -> None:
 
 def _tell_the_end(child: int, streams: list[int]) -> None:
     """Tell number and exit code of a process, and end."""
-    *outputs, status = streams
-    for stream in (0, 1, 2, *outputs):
+    status = streams[STREAMS - 1]
+    for stream in {0, 1, 2, *streams} - {status}:
         os.close(stream)
     with suppress(OSError):
         os.write(status, b"%08d" % child)
@@ -242,12 +252,31 @@ def _tell_the_end(child: int, streams: list[int]) -> None:
     os._exit(0)
 
 
+def _end(code: int | str | None) -> None:
+    """End as the interpreter does, but without clearing its memory, which would copy all of it."""
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (AttributeError, OSError, ValueError):  # closed, or the disk is full
+            sys.exit(code)
+    if not isinstance(code, int | None):
+        sys.exit(code)
+    os._exit((code or 0) & 0xFF)
+
+
 if __name__ == "__main__":
     gc.disable()
     imported()
     gc.freeze()
     program = forked_at_requests(socket.socket(fileno=int(sys.argv[1])))
-    if program == COMMAND:
-        import_module(COMMAND).run()
-    else:
-        run_module(program, run_name="__main__")
+    end: int | str | None = None
+    try:
+        if program == COMMAND:
+            import_module(COMMAND).run()
+        else:
+            run_module(program, run_name="__main__")
+    except SystemExit as asked:
+        end = asked.code
+    _end(end)

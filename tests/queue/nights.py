@@ -7,28 +7,40 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
+
+import pytest
 
 from rig.bench.latch import BenchState
+from rig.queue import processes
 from rig.queue.hook import Hook
 from rig.queue.items import Item, QueueJob
+from rig.queue.locks import LockFile
 from rig.queue.runner import QueueReport, QueueSettings, Runner
 from rig.queue.store import QueueStore
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
+from tests.forked import Forked
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = (sys.executable, "-m", "tests.queue.program")
+Process = Forked | subprocess.Popen[bytes]
 QUICK = QueueSettings(poll=0.02, wait_poll=0.05, probe_every=0.05, probe_seconds=60.0)
 LONG = 120.0  # [s] a hang ends in an error that says so
 
 
 class Night:
-    """A queue file in a folder; `add` takes the mode of `program`."""
+    """A queue file in a folder; `add` takes the mode of `program`.
 
-    def __init__(self, folder: Path) -> None:
+    Runners and items are forked (`tests.forked`); unless `forked`, they are started anew.
+    """
+
+    def __init__(self, folder: Path, *, forked: bool = True) -> None:
         self.folder = folder
+        self.forked = forked
         self.path = folder / "queue.sqlite"
         self.said: list[str] = []
 
@@ -41,7 +53,7 @@ class Night:
     def run(
         self, *command: str, serve: bool = False, settings: QueueSettings = QUICK
     ) -> QueueReport:
-        with QueueStore(self.path) as store:
+        with QueueStore(self.path) as store, self._starts():
             hook = Hook(command, self.folder / "hook.log", seconds=1.5)
             with Runner(
                 store, self.say, hook, serve=serve, program=PROGRAM, settings=settings
@@ -79,12 +91,22 @@ class Night:
         run = Path(self.item(number).run)
         return any(event["event"] == "record complete" for event in read_events(run))
 
-    def process(self) -> subprocess.Popen[bytes]:
+    def process(self) -> Process:
         """Start a runner as a process, without the runs' progress."""
-        line = [sys.executable, "-m", "tests.queue.nights", str(self.folder)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         with (self.folder / "runner.log").open("ab") as log:
+            if self.forked:
+                files = log.fileno(), log.fileno()
+                return Forked([self.folder], ROOT, "tests.queue.nights", files=files)
+            line = [sys.executable, "-m", "tests.queue.nights", str(self.folder), "anew"]
+            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
             return subprocess.Popen(line, env=environment, cwd=ROOT, stdout=log, stderr=log)
+
+    @contextmanager
+    def _starts(self) -> Iterator[None]:
+        with pytest.MonkeyPatch.context() as patch:
+            if self.forked:
+                patch.setattr(processes, "start", _forked)
+            yield
 
 
 def until(true: Callable[[], bool], what: str) -> None:
@@ -98,6 +120,21 @@ def until(true: Callable[[], bool], what: str) -> None:
 def reset() -> None:
     """Clear the bench's latched trip, as a person does."""
     BenchState(load_rig("shinshu-2dof").wire).clear("looked at it", None)
+
+
+def _forked(
+    words: Sequence[str], output: IO[bytes], errors: IO[bytes] | int, lock: LockFile | None = None
+) -> Forked:
+    """As `processes.start`, with the program forked."""
+    assert tuple(words[: len(PROGRAM)]) == PROGRAM
+    said = output.fileno()
+    files = said, said if isinstance(errors, int) else errors.fileno()
+    inherited = () if lock is None else (lock.fileno(),)
+    try:
+        return Forked(words[len(PROGRAM) :], module=PROGRAM[-1], files=files, inherited=inherited)
+    finally:
+        if lock is not None:
+            lock.close()
 
 
 def _die_at(place: str, after: bool) -> None:
@@ -117,4 +154,4 @@ if __name__ == "__main__":
     if "TEST_KILL" in os.environ:
         where, when = os.environ.pop("TEST_KILL").split()
         _die_at(where, when == "1")
-    sys.exit(Night(Path(sys.argv[1])).run().code)
+    sys.exit(Night(Path(sys.argv[1]), forked=len(sys.argv) == 2).run().code)

@@ -24,6 +24,7 @@ def night(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Night:
 def test_an_item_killed_together_with_its_runner_is_interrupted_and_recovered(
     night: Night,
 ) -> None:
+    night.forked = False
     night.add("endless")
     night.add("done")
     runner = night.process()
