@@ -23,7 +23,7 @@ from tests.variants import kept
 
 pytest_plugins = ["drivers.conformance.plugin"]
 SUBJECT = memory_subject()
-QUICK = RandomCallBudget(sequences=12, calls=20, shorten=False)
+QUICK = RandomCallBudget(sequences=5, calls=16, shorten=False)
 SHORT = RandomCallBudget(sequences=3, calls=12, shorten=False)
 WIRES: dict[str, Callable[[], Subject]] = {
     **{wire: partial(on_wire, wire, names) for wire, names in FEW.items()},

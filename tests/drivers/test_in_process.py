@@ -54,7 +54,7 @@ def test_it_conforms(make: Any) -> None:
     def bench() -> Iterator[DeviceUnderTest]:
         yield DeviceUnderTest(seed_rig(), lambda rig: over(make(rig), rig))
 
-    report = run(Subject("in-process", bench, BARE), effort=RandomCallBudget(20, 20, shorten=False))
+    report = run(Subject("in-process", bench, BARE), effort=RandomCallBudget(6, 20, shorten=False))
     assert report.of(CheckVerdict.FAILED) == ()
     assert len(report.of(CheckVerdict.PASSED)) >= 25
 

@@ -24,7 +24,7 @@ def test_a_spool_that_bends_between_samples_is_nothing_to_name(
     bench = case_of(41, kind=NONE, spool=plant.FIRST_ORDER).bench
     joints = tuple({**own, "spool_time": 1.2e-3} for own in bench.joints)
     bench = replace(bench, joints=joints, noise=0.25, rms=0.05, seconds=4.0)
-    train = records_of(bench, ("step2",), 410, 1.0, repeats=8)
+    train = records_of(bench, ("step2",), 410, 1.0, repeats=4)
     held_out = records_of(bench, ("step2",), 411, 0.7, repeats=2)
     late = catalogue(bench.rig, (ChannelDelay.name,))
 
