@@ -26,6 +26,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from runpy import run_module
@@ -74,11 +75,9 @@ class Forked:
         status.close()
         for _, write in ends:
             os.close(write)
-        self.stdout, self.stderr = (
-            (os.fdopen(read, encoding="utf-8") for read, _ in ends)
-            if ends
-            else (io.StringIO(), io.StringIO())
-        )
+        said = [os.fdopen(read, encoding="utf-8") for read, _ in ends] if ends else [None, None]
+        self.stdout: TextIO = said[0] or io.StringIO()
+        self.stderr: TextIO = said[1] or io.StringIO()
         self.pid = int(self._status.recv(LENGTH))
 
     def __enter__(self) -> Forked:
@@ -186,11 +185,15 @@ def imported() -> None:
     for module in IMPORTED:
         import_module(module)
     del sys.modules["aiohttp"]
+    from drivers import registry
     from hil_sim.plant.plant import Plant
     from hil_sim.scenario.file import Scenario
     from rig.runs.rigs import load_rig
 
-    Plant(load_rig("shinshu-2dof"), Scenario(), 0)
+    registry.entry_points = cache(registry.entry_points)  # type: ignore[assignment, attr-defined]
+    rig = load_rig("shinshu-2dof")
+    registry.driver_class(rig.wire.kind)
+    Plant(rig, Scenario(), 0)
     assert threading.active_count() == 1
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import cache
 from importlib import resources
 from typing import Any
 
@@ -27,10 +28,15 @@ SPOOL_PER_VOLT = 0.1
 Codes = NDArray[np.int64]
 
 
+@cache
+def _shipped() -> Rig:
+    text = (resources.files("rig") / "shipped" / "shinshu-2dof.yaml").read_text("utf-8")
+    return parse_model(Rig, text, "shinshu-2dof.yaml")
+
+
 def seed_rig(**wire: object) -> Rig:
     """The shipped two-joint rig, its wire changed where asked."""
-    text = (resources.files("rig") / "shipped" / "shinshu-2dof.yaml").read_text("utf-8")
-    rig = parse_model(Rig, text, "shinshu-2dof.yaml")
+    rig = _shipped()
     changed = Wire(**{**rig.wire.model_dump(), **wire})
     return rig.model_copy(update={"wire": changed})
 
