@@ -61,6 +61,7 @@ def test_detection_lines_stay_empty(design: Design) -> None:
     assert not used & {19, 23}
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_design(rig: Rig) -> None:
     one, other = designed(rig, budget=5), designed(rig, budget=5)
     for a, b in zip(one.steps, other.steps, strict=True):

@@ -126,6 +126,7 @@ def test_methods_for_pressures_and_flows_are_refused(run: Run, method: str) -> N
         identify([run], method=method)
 
 
+@pytest.mark.slow
 def test_noise_that_the_rig_file_does_not_state_biases_least_squares_and_is_seen(
     robot: ElectricRig, arm: plant.Arm
 ) -> None:

@@ -129,6 +129,7 @@ def test_instruments_are_not_biased_and_the_tool_prefers_them_unasked(
     assert low < iv.estimates["M2"].value < high
 
 
+@pytest.mark.slow
 def test_a_spool_that_leads_its_samples_does_not_soften_the_oil(multisine_run: Run) -> None:
     """What a held command does between samples; a flow that follows the spool's rate is not b's."""
     lead = 0.1  # of a sample's interval
@@ -212,6 +213,7 @@ def test_output_error_needs_a_model_that_is_complete(multisine_run: Run) -> None
         identify([replace(multisine_run, records=tuple(first))], estimator="output-error")
 
 
+@pytest.mark.slow
 def test_bootstrap_and_cluster_intervals_agree_on_clean_data(multisine_run: Run) -> None:
     cluster = identify([multisine_run], estimator="ls")
     drawn = identify([multisine_run], estimator="ls", bootstrap=100, rng=np.random.default_rng(1))

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from analysis.identify.identify import identify
 from analysis.identify.result import PLAIN
@@ -50,6 +51,7 @@ def test_a_lock_that_gives_is_decided_for_all_repeats_in_both_ways(
     assert_same(identify_folders([str(folder)]), identify([run], estimator=PLAIN))
 
 
+@pytest.mark.slow
 def test_an_effect_is_added_to_the_model_in_both_ways(tmp_path: Path, multisine_run: Run) -> None:
     folder = write_run(tmp_path / "monday", multisine_run)
     result = identify_folders([str(folder)], effects=["torque_offset"])
@@ -58,6 +60,7 @@ def test_an_effect_is_added_to_the_model_in_both_ways(tmp_path: Path, multisine_
     assert len(result.estimates) == 18
 
 
+@pytest.mark.slow
 def test_an_electric_robot_streams_too(tmp_path: Path) -> None:
     """With the base's slope, whose parameters are fewer than the rows' unknowns."""
     robot = load_rig("electric-2dof")

@@ -24,6 +24,7 @@ from rig.runs.exchange.fixtures import write_run
 from rig.runs.rigs import load_rig
 from tests.analysis.test_accumulate import assert_same
 from tests.analysis.trace.hidden import pair_of_runs
+from tests.variants import every_second
 
 EVERY = Tolerances(area=0.003, volume=0.05, pin=2e-4, mid_length=5e-4)
 QUANTILE = 1.96
@@ -102,6 +103,7 @@ def test_a_number_that_all_share_moves_all_together(
     assert covariance[M1, C] > 0.1 * std[M1] * std[C]
 
 
+@pytest.mark.slow
 def test_areas_and_volumes_of_one_scale_move_gains_and_inertia_in_proportion(
     multisine_run: Run,
 ) -> None:
@@ -127,7 +129,7 @@ def test_the_cap_area_moves_the_gains_of_the_cap_edges(multisine_run: Run) -> No
     assert max(abs(each["C_mp_2"]), abs(each["C_mm_2"]), abs(each["C_pp_1"])) < 0.01
 
 
-@pytest.mark.parametrize("key", ["base_pin", "arm_pin", "mid_length", "cap_area"])
+@pytest.mark.parametrize("key", every_second(["base_pin", "arm_pin", "mid_length", "cap_area"]))
 def test_the_shifts_are_those_of_whole_records_with_another_rig_file(
     stated: Identification, multisine_run: Run, key: str
 ) -> None:
@@ -175,6 +177,7 @@ def test_runs_that_state_different_tolerances_count_with_the_largest(multisine_r
     assert "(0.3 %)" in check_of(one)
 
 
+@pytest.mark.slow
 def test_streamed_folders_have_the_same_intervals(tmp_path: Path, multisine_run: Run) -> None:
     first = tuple(r for r in multisine_run.records if r.repeat == 1)
     run = stating(replace(multisine_run, records=first), EVERY)

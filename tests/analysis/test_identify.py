@@ -73,6 +73,7 @@ def test_joints_in_a_horizontal_plane_have_no_weight_to_identify(rig: Rig) -> No
     assert all(c.ok for c in result.checks if c.name.startswith(("identifiable", "base")))
 
 
+@pytest.mark.slow
 def test_slow_motion_shows_its_inertias_beside_noisy_sensors(rig: Rig) -> None:
     """Lines up to 0.8 Hz and sensors four times as noisy as stated, one record of each step."""
     wave = multisine(np.random.default_rng(1), rig.sample_rate, 20.0, 0.8)
@@ -84,6 +85,7 @@ def test_slow_motion_shows_its_inertias_beside_noisy_sensors(rig: Rig) -> None:
     assert estimates["R12"].value == pytest.approx(rig.nominal["R12"], rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_papers_own_filter_is_offered_and_its_bias_is_real(sine_run: Run) -> None:
     sine_run = replace(sine_run, records=tuple(r for r in sine_run.records if r.repeat < 3))
     filtering = FILTERINGS["moving-average"]

@@ -111,6 +111,7 @@ def test_too_late_for_the_rate_leaves_no_b() -> None:
     assert np.isnan(told.parameters["b"].half)
 
 
+@pytest.mark.slow
 def test_the_predicted_interval_of_b_alone_is_widened_and_by_more_with_more_jitter() -> None:
     rig, plan = rig_at(RATE), at_rate(RATE)
     clocked = predict(rig, plan)

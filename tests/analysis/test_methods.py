@@ -216,6 +216,7 @@ def test_a_search_that_cannot_start_says_why(sine_run: Run, rig: Rig) -> None:
         identify([sine_run], "ga", search=replace(SMALL, seconds=60.0))
 
 
+@pytest.mark.slow
 def test_every_experiment_by_itself_scatters_about_all_of_them_together(sine_run: Run) -> None:
     each = experiments(sine_run)
     together = identify([sine_run], estimator="plain").estimates

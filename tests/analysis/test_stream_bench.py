@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from rig.cli.bench.stream import row_figures
 
 
+@pytest.mark.slow
 def test_rows_stream_in_little_memory_to_numpy_s_solution(tmp_path: Path) -> None:
     found = row_figures(tmp_path, rows=100_001)
     assert found["rows"] == 100_001

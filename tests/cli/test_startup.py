@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 
@@ -56,6 +57,9 @@ def test_help_loads_no_library_but_the_command_lines(arguments: tuple[str, ...])
 def test_a_protocol_is_proved_without_the_slow_libraries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    compiled = Path(os.environ[CACHE_VARIABLE], "rates")
+    if compiled.exists():
+        copytree(compiled, tmp_path / "rates")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))  # no proof is kept there yet
     checked = ("check", "lock-and-excite", "--rig", "shinshu-2dof", "--step", "step1")
     modules = loaded(*checked)

@@ -37,6 +37,7 @@ def test_a_folder_without_the_records_is_refused_in_words(tmp_path: Path) -> Non
         study.load(tmp_path)
 
 
+@pytest.mark.slow
 @measured
 def test_a_dead_band_with_two_edges_is_what_the_flows_lack_most() -> None:
     data = study.load(FOLDER)

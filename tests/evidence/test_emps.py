@@ -14,7 +14,6 @@ import pytest
 from analysis.trace.engine import trace
 from rig.runs.exchange.importer import import_records
 from tests.studies.machines import emps as study
-from tests.variants import kept
 
 PLACE = Path(os.environ.get("BRAMAH_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FILE = PLACE / "emps" / "DATA_EMPS.mat"
@@ -79,7 +78,8 @@ def test_the_machines_own_controller_gives_its_position_and_drive(data: study.Em
     assert np.linalg.norm(v - drive) / np.linalg.norm(drive) < 0.06
 
 
-@pytest.mark.parametrize("period", kept([0, study.PERIOD], (0,)))
+@pytest.mark.slow
+@pytest.mark.parametrize("period", [0, study.PERIOD])
 def test_the_trace_names_the_same_two_causes_with_and_without_the_period(period: int) -> None:
     halves = study.load(FILE, period)
     found = trace([halves.first], [halves.second], look_ahead=False)

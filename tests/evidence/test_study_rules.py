@@ -73,6 +73,7 @@ def matrix(rig: Rig) -> isolability.Isolability:
     return isolability.isolability(experiment(rig))
 
 
+@pytest.mark.slow
 def test_another_effect_in_its_place_never_leaves_more_than_none(
     matrix: isolability.Isolability,
 ) -> None:

@@ -14,6 +14,7 @@ from hil_sim.scenario.file import parse_scenario
 from hil_sim.scenario.truth import load_machine
 from tests.hil_sim.plant_trace import CLOSED, bench, scenario, sine, story
 from tests.hil_sim.test_plant_effects import sliding
+from tests.variants import every_second
 
 RIG = bench(1000.0)
 MOVE_2 = [CLOSED, sine(RIG, 0.8, 1.0, position_gain=20.0)]
@@ -24,7 +25,7 @@ def tables(effect: str):
     return build(RIG, load_machine(RIG), scenario(effect), PERIODS)
 
 
-@pytest.mark.parametrize("form", ["bristle", "dahl", "tanh", "root"])
+@pytest.mark.parametrize("form", every_second(["bristle", "dahl", "tanh", "root"]))
 def test_friction_of_any_form_takes_its_level_from_fast_sliding(form: str) -> None:
     more = f"force: 80 N, form: {form}, width: 1 mm/s"
     v, force = sliding(story(MOVE_2, 2.0, f"{{name: coulomb_friction, where: joint 2, {more}}}"))
@@ -132,7 +133,7 @@ def test_cross_talk_shows_the_other_chamber_or_its_quick_part() -> None:
 MOVERS = [c for c in CLASSES if c.forms and c.drawn_at != "pressure"]
 
 
-@pytest.mark.parametrize("kind", MOVERS, ids=lambda c: c.effect_name())
+@pytest.mark.parametrize("kind", every_second(MOVERS), ids=lambda c: c.effect_name())
 def test_every_form_runs_and_moves_the_bench_otherwise(kind) -> None:
     key, (_, most) = next(iter(kind.sizes.items()))
     more = ", speed: 20 mm/s" if kind.effect_name() == "stribeck_friction" else ""

@@ -15,6 +15,7 @@ from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 from tests.analysis.effects.fitting import model_of
 from tests.analysis.small_bench import TRUTH
+from tests.variants import every_second
 
 DELTA = bench.SHAPES["presliding"]
 CASES = {
@@ -30,7 +31,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", every_second(CASES))
 def test_a_run_begun_in_the_midst_of_a_motion_follows_the_other_programs_bench(
     rig: Rig, name: str
 ) -> None:

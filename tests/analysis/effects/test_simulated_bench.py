@@ -15,6 +15,7 @@ from protocols.files.plan import Overrides
 from rig.model.rig import Rig
 from tests.analysis.effects.fitting import Data, fitted
 from tests.studies.direct_bench import simulated_run
+from tests.variants import every_second
 
 ONE_STEP = Overrides(repeats=1, steps=("step1",))
 CASES = [
@@ -37,7 +38,9 @@ def floor(rig: Rig) -> dict[str, float]:
     return records(rig, "").solved([]).rms
 
 
-@pytest.mark.parametrize(("name", "where", "said", "sizes"), CASES, ids=[c[0] for c in CASES])
+@pytest.mark.parametrize(
+    ("name", "where", "said", "sizes"), every_second(CASES), ids=[c[0] for c in CASES]
+)
 def test_the_simulators_own_form_is_sized_within_a_tenth(
     rig: Rig, floor: dict[str, float], name: str, where: str, said: str, sizes: dict[str, float]
 ) -> None:

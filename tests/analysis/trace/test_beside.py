@@ -59,6 +59,7 @@ def test_the_column_is_there_where_temperature_was_measured_and_moved(
     assert temperature_terms(terms, blind) == ()
 
 
+@pytest.mark.slow
 def test_a_warmer_day_is_judged_at_its_own_temperature(rig: Rig, days: tuple[Run, Run]) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
     train, judged = (conditioned_records(rig, [run]) for run in days)

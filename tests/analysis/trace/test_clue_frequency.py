@@ -65,6 +65,7 @@ def test_hum_between_two_lines_is_told_by_its_frequency(rig: Rig, quiet: tuple[R
     assert hertz == pytest.approx(5.35, abs=0.02)
 
 
+@pytest.mark.slow
 def test_what_goes_with_the_motion_has_no_frequency_of_its_own(
     rig: Rig, quiet: tuple[Run, Run]
 ) -> None:

@@ -277,6 +277,7 @@ def test_what_a_coarse_converter_rounds_alike_in_every_repeat_is_no_residual(rig
     assert max(f.ratio for f in other.floors) > 1.0
 
 
+@pytest.mark.slow
 def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(rig: Rig) -> None:
     """7.3 Hz on joint 2, in another phase in every repeat: part of the floor, no residual."""
     wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)

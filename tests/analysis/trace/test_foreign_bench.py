@@ -58,6 +58,7 @@ def traced(
     return trace([train], [held_out], candidates, look_ahead=False, free_forms=free_forms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "width"),
     [
@@ -502,6 +503,7 @@ def test_a_supply_that_sags_in_proportion_to_the_flow_is_named(rig: Rig, drop: f
     assert [(e.name, e.where) for e in result.effects] == [("supply_sag", "bench")]
 
 
+@pytest.mark.slow
 def test_a_sag_is_named_and_identified_whatever_b_the_rig_file_states(rig: Rig) -> None:
     """The flow drawn fills compressible oil too, with the b that the records show."""
     train, held_out = pair_of_runs(rig, Hidden(sag=2e6))

@@ -78,6 +78,7 @@ def test_what_only_the_judging_rows_show_changes_no_name_but_the_verdict(
     assert note.endswith("times the noise floor in the records that judge")
 
 
+@pytest.mark.slow
 def test_what_only_the_choosing_rows_show_is_in_no_reported_error(
     rig: Rig, leaky: tuple[Run, Run], found: Trace
 ) -> None:

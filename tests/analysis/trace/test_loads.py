@@ -122,6 +122,7 @@ def rubbing(run: Run, level: float) -> Run:
     return with_force(run, lambda record: level * np.tanh(piston_speed(record) / 2e-3))
 
 
+@pytest.mark.slow
 def test_a_load_is_found_beside_louder_friction(rig: Rig, runs: tuple[Run, Run]) -> None:
     train, held_out = (rubbing(run, 400.0) for run in runs)
     terms = tuple(map(Used, baseline_of(rig)))

@@ -14,6 +14,7 @@ from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
 from tests.analysis.trace.gate_cases import searched
 from tests.studies.foreign.bench import runs_of
 from tests.studies.foreign.cases import case_of
+from tests.variants import kept
 
 
 def test_two_levels_that_energy_takes_for_one_are_asymmetric_friction(rig: Rig) -> None:
@@ -51,7 +52,7 @@ def test_levels_are_found_where_a_change_of_gravity_makes_most_of_their_differen
         assert low < size < high
 
 
-@pytest.mark.parametrize(("breakaway", "determined"), [(0.0, False), (16.0, True)])
+@pytest.mark.parametrize(("breakaway", "determined"), kept([(0.0, False), (16.0, True)], (1,)))
 def test_a_breakaway_is_added_only_where_records_determine_all_its_numbers(
     rig: Rig, breakaway: float, determined: bool
 ) -> None:

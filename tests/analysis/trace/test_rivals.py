@@ -49,6 +49,7 @@ def test_levels_by_direction_are_listed_where_another_law_fits_as_well_anyway(
     assert {r.name for r in effect.rivals if r.tied} == tied
 
 
+@pytest.mark.slow
 def test_a_richer_name_of_a_named_law_is_not_preferred_to_it_for_less_energy(
     rig: Rig,
 ) -> None:

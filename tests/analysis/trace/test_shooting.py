@@ -41,6 +41,7 @@ def lagging(rig: Rig, tau: float) -> tuple[Model, Effect]:
     return model_of(rig, effect, dict(TRUTH), (tau,)), effect
 
 
+@pytest.mark.slow
 def test_shooting_finds_the_lag_from_a_start_that_is_half_of_it(
     rig: Rig, runs: tuple[Run, Run]
 ) -> None:

@@ -17,6 +17,7 @@ from tests.studies.foreign.bench import records_of
 from tests.studies.foreign.cases import NONE, case_of
 
 
+@pytest.mark.slow
 def test_a_spool_that_bends_between_samples_is_nothing_to_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
@@ -67,6 +68,7 @@ def test_a_force_that_the_held_out_records_lack_is_refused() -> None:
     assert "periodic_disturbance" in {f.name for f in result.refused}
 
 
+@pytest.mark.slow
 def test_forces_at_several_frequencies_get_no_advice_to_excite_more() -> None:
     at = (2.3, 3.7, 5.9, 8.3)
     runs = shaken(1, 0.25, 6, 3 * AMPLITUDE, at), shaken(2, 0.25, 1, 3 * AMPLITUDE, at)
