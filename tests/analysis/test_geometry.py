@@ -165,6 +165,7 @@ def test_the_check_and_the_json_name_the_numbers(stated: Identification) -> None
     assert area["shifts"]["W2"] == pytest.approx(0.0149 * W2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_runs_that_state_different_tolerances_count_with_the_largest(multisine_run: Run) -> None:
     halves = [
         replace(multisine_run, records=tuple(r for r in multisine_run.records if r.repeat in part))

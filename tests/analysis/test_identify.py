@@ -56,6 +56,7 @@ def test_sixteen_parameters_come_back_from_the_multisine(found: Identification) 
     assert worst(found, ("b",)) < 0.002
 
 
+@pytest.mark.slow
 def test_and_from_the_papers_sine_as_well(sine_run: Run) -> None:
     result = identify([sine_run])
     assert worst(result, MECHANICS_AND_GAINS) < 0.004

@@ -94,6 +94,7 @@ def test_each_steps_own_values_are_what_identifying_that_step_alone_gives(
                     assert entry["value"] == pytest.approx(alone[name].value, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_without_drift_all_ways_end_near_the_truth(multisine_run: Run) -> None:
     result = identify([multisine_run], "sequential")
     for name, entry in result.extra["sequential"]["E2"].items():

@@ -83,6 +83,7 @@ def test_the_model_taken_over_keeps_its_shapes(folder: Path, rubbed: Path) -> No
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_record_by_record_the_same_terms_give_the_same_numbers(folder: Path, rubbed: Path) -> None:
     line = ("identify", rubbed, "--like", folder / "rubbing.json", "--json", "-")
     whole, streamed = (

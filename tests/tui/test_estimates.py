@@ -11,7 +11,6 @@ from rig.tui.following.link import TrackedPoint
 from rig.tui.pages.estimates import half_widths, warnings_of
 from tests.tui.glass import Machine, Recorded, endpoint, glass
 from tests.tui.recorded import Bench, followed, run, tracked
-from tests.variants import every_second
 
 SIZES = ((80, 24), (120, 40), (200, 60))
 
@@ -34,7 +33,7 @@ def experiment(*, bad: bool) -> Machine:
     return Machine({endpoint(): record})
 
 
-@pytest.mark.parametrize("size", every_second(SIZES))
+@pytest.mark.parametrize("size", SIZES)
 async def test_a_good_experiment_shows_intervals_and_residual_without_a_warning(
     size: tuple[int, int],
 ) -> None:
@@ -49,7 +48,7 @@ async def test_a_good_experiment_shows_intervals_and_residual_without_a_warning(
         assert any("⠁" <= letter <= "⣿" for letter in shown.text), "a curve is drawn"
 
 
-@pytest.mark.parametrize("size", every_second(SIZES))
+@pytest.mark.parametrize("size", SIZES)
 async def test_a_bad_experiment_says_so_in_marked_sentences_within_its_first_minute(
     size: tuple[int, int],
 ) -> None:

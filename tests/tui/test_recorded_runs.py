@@ -22,7 +22,6 @@ from tests.services.children import RIG
 from tests.tui.glass import Glass
 from tests.tui.stored import log_bytes, run_folder, trace_json
 from tests.tui.test_runs_page import Office
-from tests.variants import every_second
 
 SIZES = ((80, 24), (120, 40), (200, 60))
 
@@ -126,7 +125,7 @@ def trace_bytes() -> bytes:
     return json.dumps(trace_json() | {"free_run": None}).encode()
 
 
-@pytest.mark.parametrize("size", every_second(SIZES))
+@pytest.mark.parametrize("size", SIZES)
 async def test_a_trace_shows_verdict_effects_errors_and_a_free_run_before_and_after(
     runs: Path, size: tuple[int, int]
 ) -> None:

@@ -32,6 +32,7 @@ def limit(result: Trace, name: str) -> DetectionLimit:
     return next(d for d in result.detection_limits if d.name == name)
 
 
+@pytest.mark.slow
 def test_large_motions_leave_nothing_to_hide(rig: Rig) -> None:
     result = traced(rig, 0.03)
     assert result.verdict == "clean"

@@ -403,6 +403,7 @@ def test_a_worn_bore_leaks_most_where_it_is_worn(rig: Rig) -> None:
     assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "sensors", "named", "parameter", "size"),
     [

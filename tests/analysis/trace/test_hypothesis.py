@@ -64,6 +64,7 @@ def test_an_offset_of_a_pressure_is_tried_for_a_spring(rig: Rig) -> None:
     assert found["sensor_offset", "joint 2 rod"][0] == pytest.approx(6e4, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_extension_that_ended_in_a_local_minimum_is_fitted_again(rig: Rig) -> None:
     """Another start had led the dead band's edges astray; a spring beside it cannot do that."""
     names = ("valve_deadband", "joint_spring")

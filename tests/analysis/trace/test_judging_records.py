@@ -91,6 +91,7 @@ def test_what_only_the_choosing_rows_show_is_in_no_reported_error(
     assert result.noise_floor == pytest.approx(found.noise_floor, rel=BORDER)
 
 
+@pytest.mark.slow
 def test_records_given_to_judge_are_read_once(
     rig: Rig, leaky: tuple[Run, Run], found: Trace
 ) -> None:

@@ -65,6 +65,7 @@ def test_a_breakaway_is_added_only_where_records_determine_all_its_numbers(
     assert ("stribeck_friction" in {u.term.name for u in settled.effects}) is determined
 
 
+@pytest.mark.slow
 def test_one_level_with_an_offset_torque_is_said_to_fit_as_well_as_levels_by_direction(
     rig: Rig,
 ) -> None:

@@ -203,6 +203,7 @@ def test_a_detail_at_its_bound_or_one_that_leaves_the_shape_open_is_no_form(rig:
     assert shaped(2e-6, 30.0, before=2e-6)
 
 
+@pytest.mark.slow
 def test_shapes_are_searched_again_from_those_of_a_larger_set(rig: Rig) -> None:
     """A search that began far away leaves more; an effect that mends this is not needed."""
     s = searched(rig, *pair_of_runs(rig, Fc=60.0), "coulomb_friction", "torque_offset")

@@ -100,6 +100,7 @@ def test_edges_come_with_intervals_that_hold(rig: Rig, overlapped: Run) -> None:
     assert wider.values == model.values
 
 
+@pytest.mark.slow
 def test_intervals_include_the_errors_of_the_shapes_that_the_records_gave(rig: Rig) -> None:
     """Friction slides at 20 N; its transition and presliding distance decide how much that is."""
     run = experiment(rig, repeats=2, Fc=20.0, Fs=60.0)
