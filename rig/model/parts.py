@@ -285,7 +285,8 @@ class Sensors(Part):
 class Supply(Part):
     """The pump: set pressure and flow limit."""
 
-    pressure: Pressure = Field(gt=0)
+    # Outside these bounds the unit is wrong: 160 Pa for 160 bar.
+    pressure: Pressure = Field(ge=1e5, le=1e8)
     flow: Flow = Field(gt=0)
 
 
@@ -293,8 +294,9 @@ class Oil(Part):
     """The working fluid."""
 
     name: str
-    density: Density = Field(gt=0)
-    temperature: Temperature
+    # Outside these bounds the unit is wrong: 860 g/m^3, or 45 K for 45 degC.
+    density: Density = Field(ge=500, le=2000)
+    temperature: Temperature = Field(ge=-60, le=200)
     temperature_band: TemperatureDifference = Field(default=2.0, ge=0)
 
 

@@ -41,6 +41,7 @@ from rig.model.tolerances import (
 )
 
 MAX_SAMPLE_RATE: Final = 100e3  # [Hz], far above hydraulics; the twin's memory grows with it
+MAX_GRAVITY: Final = 30.0  # [m/s^2], above every planet with a surface: more is a wrong unit
 
 
 class Rig(Part):
@@ -48,7 +49,7 @@ class Rig(Part):
 
     name: Name
     description: str = ""
-    gravity: Acceleration = Field(default=9.8, ge=0)
+    gravity: Acceleration = Field(default=9.8, ge=0, le=MAX_GRAVITY)
     sample_rate: Frequency = Field(gt=0, le=MAX_SAMPLE_RATE)
     supply: Supply
     oil: Oil
@@ -74,6 +75,19 @@ class Rig(Part):
             raise ValueError("joints of both types, hydraulic and electric, in one rig: not yet")
         chosen = _CLASSES[types.pop()] if types else cls
         return handler(data) if chosen is cls else chosen.model_validate(data, context=info.context)
+
+    @field_validator("joints")
+    @classmethod
+    def _one_name_each(cls, value: tuple[Joint, ...]) -> tuple[Joint, ...]:
+        """Reject a name that two joints share: messages and tables name joints by it."""
+        names = [joint.name for joint in value]
+        for at, name in enumerate(names):
+            if name in names[:at]:
+                raise ValueError(
+                    f"joints {names.index(name) + 1} and {at + 1} are both named {name!r}; "
+                    "give each a name of its own"
+                )
+        return value
 
     @field_validator("tolerances")
     @classmethod
@@ -102,6 +116,8 @@ class Rig(Part):
         for name, number in values.items():
             if number <= 0.0 and is_positive(name):
                 raise ValueError(f"{name!r} is {value[name]}; expected greater than 0")
+            if number < 0.0 and name.startswith("Fv"):
+                raise ValueError(f"{name!r} is {value[name]}; expected 0 or more")
         return values
 
     @model_validator(mode="after")
@@ -268,7 +284,7 @@ class ElectricRig(Rig):
     """
 
     # The narrower types of these fields are the purpose of this class.
-    gravity: Acceleration = Field(default=9.8, ge=0)
+    gravity: Acceleration = Field(default=9.8, ge=0, le=MAX_GRAVITY)
     inclination: Angle | Literal["unknown"] = 0.0
     supply: Supply | None = Field(default=None, exclude=True)  # type: ignore[assignment]
     oil: Oil | None = Field(default=None, exclude=True)  # type: ignore[assignment]
