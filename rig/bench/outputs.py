@@ -62,11 +62,11 @@ class Outputs:
         self._armed_from = None
         if not self._connected:
             return False
-        problem: Exception | None = None
+        problem: BaseException | None = None
         for _ in range(1 if self._silent else BENCH.zero_attempts):
             try:
                 self.driver.zero_outputs()
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 problem = error
             else:
                 self._silent = self._told = False
@@ -110,6 +110,8 @@ class Outputs:
         self.zero()  # stated first in the message: whether the outputs are at zero
         if isinstance(error, DeviceLost):
             log.error("%s", error)
+        if isinstance(error, SystemExit):  # its code may be 0, which would state that all is done
+            raise DeviceError("the driver or a library ended the program: sys.exit()") from error
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool) -> int:
         """Set the laws of all joints at one tick and return it; zero the outputs on failure."""

@@ -223,7 +223,11 @@ class Bench:
             self._display.show(block, 0.0, self.lost_samples, self._guard.roles)
 
         seconds = self.recorded_after
-        after_zero = record_zero(self.rig, self._driver.read_block, keep, self._clock, seconds)
+
+        def read() -> SampleBlock:
+            return self._outputs.safely(self._driver.read_block)
+
+        after_zero = record_zero(self.rig, read, keep, self._clock, seconds)
         self._display.last()
         return after_zero is not False
 

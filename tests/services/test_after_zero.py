@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from drivers.base import DeviceLost, OutputLaw, SampleBlock
+from drivers.base import DeviceError, DeviceLost, OutputLaw, SampleBlock
 from rig.bench.session import Bench
 from rig.model.trips import OperatorStop, SafetyTrip
 from rig.runs.recorder import Recorder
@@ -64,6 +65,29 @@ def test_two_seconds_at_zero_are_recorded_after_the_last_command(
     assert put_out[:160].min() == 1.0
     assert len(put_out) == 160 + 2000
     assert not put_out[160:].any()
+
+
+def test_a_driver_that_ends_the_program_has_not_done_the_run(tmp_path: Path) -> None:
+    """A user's driver calls sys.exit(): its code 0 would count as a night without faults."""
+
+    def leave(number: int) -> None:
+        if number >= 15:
+            sys.exit(0)
+
+    driver = FakeDriver(RIG, before_block=leave)
+    run = tmp_path / "run"
+    with (  # noqa: PT012
+        pytest.raises(DeviceError, match=r"ended the program: sys\.exit\(\)"),
+        Bench(RIG, driver, Recorder(run, RIG)) as bench,
+    ):
+        bench.apply(MOVE)
+        with bench.record(step="s", start_tick=0):
+            bench.run_for(1.0)
+    with h5py.File(run / "records.h5") as file:
+        (record,) = file.values()
+        assert len(record["command_1"]) >= 100  # what was recorded before is there
+    assert driver.laws == [OutputLaw()] * 2
+    assert driver.calls[-1] == "close"
 
 
 def test_the_last_picture_of_a_run_that_tripped_has_its_commands_at_zero(tmp_path: Path) -> None:
