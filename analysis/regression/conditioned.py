@@ -61,6 +61,6 @@ def condition_runs(
             filters = filtering(record)
             signals = condition(rig, record, filters.channels, bands[record.step])
             if filters.in_motion:
-                signals = without_rests(signals, filters.in_motion)
+                signals = without_rests(signals, filters.in_motion, filters.full_weight)
             out.append(ConditionedRecord(number, record, signals, filters, families))
     return out

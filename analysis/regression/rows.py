@@ -41,7 +41,8 @@ WAVES = (np.sin, np.cos)
 class Filtering:
     """The filters of one record: `channels` before, `rows` (or none) after the rows are built.
 
-    Torque balances of joints `in_motion` (0-based) give no weight to samples at rest. From those of
+    Torque balances of joints `in_motion` (0-based) give no weight to samples at rest and the whole
+    to those above `full_weight` times the record's rms speed. From those of
     the joints in `lines` (0-based, with a frequency [Hz]) the part at that frequency is removed:
     one sine of free amplitude and phase is fitted to every record and subtracted.
     """
@@ -50,6 +51,7 @@ class Filtering:
     rows: FirSmoother | None
     step: int = 1
     in_motion: tuple[int, ...] = ()
+    full_weight: float = 1.0
     lines: tuple[tuple[int, float], ...] = ()
 
 

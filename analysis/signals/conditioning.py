@@ -81,19 +81,20 @@ class Signals:
         return np.flatnonzero(self.excited).tolist()
 
 
-def without_rests(signals: Signals, joints: Sequence[int]) -> Signals:
+def without_rests(signals: Signals, joints: Sequence[int], full_weight: float = 1.0) -> Signals:
     """Return signals that weight the torque balances of `joints` by 0 while they are at rest.
 
     At rest, dry friction balances whatever holds the joint, up to its breakaway value, so that no
     law of the speed applies. A balance that holds at every sample also holds when weighted, so both
-    of its sides are weighted before filtering: by 0 at rest, by 1 from the record's rms speed on,
-    smoothly between. A steeper weight would shift high-frequency noise of the acceleration into the
-    filter's band.
+    of its sides are weighted before filtering: by 0 at rest, by 1 from `full_weight` times the
+    record's rms speed on, smoothly between. A steeper weight shifts high-frequency noise of the
+    acceleration into the filter's band.
     """
     weight = np.ones_like(signals.sd)
     for i in joints:
         speed = np.abs(signals.sd[:, i])
-        x = np.minimum(speed / max(float(np.sqrt(np.mean(speed**2))), 1e-300), 1.0)
+        full = full_weight * float(np.sqrt(np.mean(speed**2)))
+        x = np.minimum(speed / max(full, 1e-300), 1.0)
         weight[:, i] = x * x * (3.0 - 2.0 * x)
     return replace(signals, weight=weight)
 

@@ -47,7 +47,7 @@ from analysis.trace.judge.curves import (
 from analysis.trace.judge.rivals import alternatives_of, with_alternatives
 from analysis.trace.judge.scatter import form_shift, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
-from analysis.trace.judge.unlocked import Line, phase_notes, unlocked_lines
+from analysis.trace.judge.unlocked import phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import (
     AbsorbedEffects,
     absorbed_effects,
@@ -512,7 +512,7 @@ def _identified_with_effects(
     if not winner.effects:
         return before, {}
     train_data = rows.train
-    found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion, rows.lines)
+    found = _identified(runs, (*train_data.terms, *winner.effects), rows.filters_like)
     shift = form_shift(train_data, winner.fit)
     model = with_form_errors(train_data, winner.fit, found.model, shift)
     return at_nominal_temperature(model), by_geometry(found)
@@ -521,19 +521,18 @@ def _identified_with_effects(
 def _identified(
     runs: Sequence[Run],
     terms: Sequence[Used],
-    in_motion: tuple[int, ...] = (),
-    lines: tuple[Line, ...] = (),
+    changed: Callable[[Filtering], Filtering] = lambda filtering: filtering,
 ) -> Identification:
     """Return a model's identified parameters.
 
-    Temperature and spool path are left out of `terms`: the estimator fits them itself. Torque rows
-    of the joints `in_motion` (0-based) are weighted by speed; sines at `lines` are taken out.
+    Temperature and spool path are left out of `terms`: the estimator fits them itself. `changed`
+    returns the filters of a record in place of the default ones.
     """
     nuisances = (BulkTemperature, DrivePath, SpoolPath)
     kept = ordered([u for u in terms if not isinstance(u.term, nuisances)])
 
     def filtering(record: Record) -> Filtering:
-        return replace(default_filtering(record), in_motion=in_motion, lines=lines)
+        return changed(default_filtering(record))
 
     return coupled(runs, kept, filtering, estimator=ESTIMATOR)
 

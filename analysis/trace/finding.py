@@ -88,6 +88,13 @@ class TraceRows:
         """The sines that are taken out of torque rows: joint (0-based) and frequency [Hz]."""
         return self.train.records[0].filtering.lines
 
+    def filters_like(self, filtering: Filtering) -> Filtering:
+        """Return filters with the weights of these torque rows and the sines taken out of them."""
+        own = self.train.records[0].filtering
+        return replace(
+            filtering, in_motion=own.in_motion, full_weight=own.full_weight, lines=own.lines
+        )
+
 
 @dataclass(frozen=True)
 class Finding:

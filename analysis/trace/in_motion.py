@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from analysis.effects.base import Effect
+from analysis.effects.friction import force_unit
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.terms.base import Used, equation
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.finding import (
     Finding,
     TraceRows,
@@ -27,6 +29,7 @@ from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.refinement import design_matrix
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 
@@ -85,7 +88,8 @@ def searched_in_motion(
     While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
     these rows, and they hide the law in motion, and effects of other balances with it. The result
     is used if friction acts in each joint whose rows are weighted and it is better (`_is_better`),
-    and the balances of other joints are looked at next.
+    and the balances of other joints are looked at next. Where it lacks a breakaway that all rows
+    show, slow samples get more weight.
     """
     above_noise, joints = _joints_to_weight(
         finding, [e for e in candidates if e.family == "friction"]
@@ -94,21 +98,27 @@ def searched_in_motion(
     if joints <= weighted:
         return finding
 
-    def searched(joints: Collection[int]) -> Finding:
+    def searched(joints: Collection[int], full_weight: float) -> Finding:
         unweighted = finding.rows.train.cache.without_family("mechanical")
-        moving = moving_filtering({*weighted, *joints})
+        moving = moving_filtering({*weighted, *joints}, full_weight)
         rows = trace_rows(rig, terms, records, moving, unweighted)
         found = search_and_judge(rows, candidates, free, seed, lambda _: None)
         resting = rest_phase_notes(rows.in_motion, included=False)
         return replace(found, notes=(*resting, *found.notes))
 
-    found = searched(joints)
-    acting = joints_with_friction(found.winner, above_noise)
-    if acting and acting != joints:  # an effect of several balances had spread friction to others
-        found = searched(acting)
-    unmet = joints_with_friction(found.winner, above_noise) != acting
-    if acting <= weighted or unmet or not _is_better(found, finding, acting):
+    for full_weight in (1.0, TRACE.breakaway_speed):
+        found = searched(joints, full_weight)
+        acting = joints_with_friction(found.winner, above_noise)
+        if acting and acting != joints:  # an effect of several balances had spread friction
+            found = searched(acting, full_weight)
+        unmet = joints_with_friction(found.winner, above_noise) != acting
+        if acting <= weighted or unmet or not _is_better(found, finding, acting):
+            return finding
+        if not any(_hides_breakaway(found, finding, joint) for joint in acting):
+            break
+    else:
         return finding
+    found = replace(found, notes=(*_breakaway_notes(found, finding, acting), *found.notes))
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
     found = replace(found, effects=(*found.effects, *failed))
     return searched_in_motion(rig, terms, records, candidates, free, seed, found)
@@ -157,6 +167,69 @@ def _is_better(found: Finding, finding: Finding, joints: Collection[int]) -> boo
         return True
     fewer = sum(r.veto for r in found.remainders) < sum(r.veto for r in finding.remainders)
     return (explains or fewer) and _meets_noise(found, joints)
+
+
+def _hides_breakaway(found: Finding, finding: Finding, joint: int) -> bool:
+    """Return whether `found` lacks a part of a joint's friction in `finding`, and rests show it.
+
+    At rest friction is any force up to its breakaway: forces near standstill that exceed the level
+    in motion are a breakaway above it, whatever law it follows. `joint` is 0-based.
+    """
+    lost = {(e.name, e.at) for e in finding.named} - found.winner.keys
+    if not any((e.name, e.where) in lost for e in _friction_of(finding.winner, joint)):
+        return False
+    return force_at_standstill(finding.rows.train, found.winner, joint) > TRACE.breakaway_ratio
+
+
+def _breakaway_notes(found: Finding, finding: Finding, joints: Collection[int]) -> list[str]:
+    """Return a note on each of `joints` (0-based) with a breakaway that the set lacks."""
+    out = []
+    for joint in sorted(joints):
+        has_breakaway = any(e.beside for e in _friction_of(found.winner, joint))
+        ratio = force_at_standstill(finding.rows.train, found.winner, joint)
+        if not has_breakaway and ratio > TRACE.breakaway_ratio:
+            out.append(
+                f"{equation('torque', joint)}: near standstill friction reaches {ratio:.2g} times "
+                "the level in motion: a breakaway above it, whose law these records do not show"
+            )
+    return out
+
+
+def force_at_standstill(data: RegressionData, winner: Hypothesis, joint: int) -> float:
+    """Return how large friction near standstill is over the level that a set has in motion.
+
+    In rows `data` of all samples at which `joint` (0-based) is slower than `TRACE.breakaway_speed`
+    times its rms speed, friction is what the set's other terms leave. The result is the value that
+    all but `TRACE.breakaway_rows` of them stay below, by three times the noise. It is 0 where the
+    set's friction has no level: its size goes with a pressure or the speed.
+    """
+    of_friction = [c for e in _friction_of(winner, joint) for c in e.coefficients(data.rig)]
+    if any(c.unit != force_unit(data.rig, joint) for c in of_friction):
+        return 0.0
+    rows = design_matrix(data, winner.fit.terms)
+    own = [c.parameter for c in of_friction]
+    levels = np.array([winner.fit.beta[name] for name in own])
+    in_set = rows.matrix[:, [rows.names.index(name) for name in own]] @ levels
+    force = np.abs(rows.residual(winner.fit.beta) + in_set)
+    ratios = []
+    for s in data.segments:
+        if s.equation != equation("torque", joint):
+            continue
+        conditioned, raw = data.source(s)
+        signals = conditioned.signals
+        at = np.clip(np.rint(raw.time * signals.rate).astype(int), 0, len(signals.t) - 1)
+        speed = np.abs(signals.sd[at, joint])
+        slow = speed < TRACE.breakaway_speed * float(np.sqrt(np.mean(speed**2)))
+        lever = np.abs(signals.G[at, joint]) * np.sqrt(s.repeats) / s.noise
+        ratios.append(((force[s.where] - 3.0) / (float(np.sum(np.abs(levels))) * lever))[slow])
+    together = np.concatenate(ratios)
+    return float(np.quantile(together, 1.0 - TRACE.breakaway_rows)) if len(together) else 0.0
+
+
+def _friction_of(winner: Hypothesis, joint: int) -> list[Effect]:
+    """Return the friction effects of a set at a joint (0-based)."""
+    effects = [used.term for used in winner.effects if isinstance(used.term, Effect)]
+    return [e for e in effects if e.family == "friction" and e.joint == joint]
 
 
 def _meets_noise(found: Finding, joints: Collection[int]) -> bool:

@@ -69,6 +69,14 @@ class TraceSettings:
     states what remains (contract)."""
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
+    breakaway_speed: float = 0.3
+    """Speed of a joint over its rms speed, below which a breakaway is looked for, and from which
+    samples in motion have their whole weight where one is found."""
+    breakaway_rows: float = 0.02
+    """Share of the rows near standstill that may have larger friction."""
+    breakaway_ratio: float = 1.25
+    """Friction near standstill over the level in motion, from which there is a breakaway (tuned: at
+    most 1.2 for one level, 1.27 to 2.3 with a breakaway of twice the level and more above it)."""
     rest_share: float = 0.02
     """Share of a record's samples at rest, above which a joint rests beyond reversals: a Gaussian
     speed has 0.016 (tuned: joints that stick had 0.023 to 0.12, without friction at most 0.016)."""

@@ -56,9 +56,17 @@ def trace_filtering(record: Record) -> Filtering:
     return replace(chosen, step=max(step, (chosen.step + 1) // 2))
 
 
-def moving_filtering(joints: Iterable[int]) -> Callable[[Record], Filtering]:
-    """Return the trace's filters, with torque rows of `joints` (0-based) weighted by speed."""
-    return lambda record: replace(trace_filtering(record), in_motion=tuple(sorted(joints)))
+def moving_filtering(
+    joints: Iterable[int], full_weight: float = 1.0
+) -> Callable[[Record], Filtering]:
+    """Return the trace's filters, with torque rows of `joints` (0-based) weighted by speed.
+
+    The weight is 1 from `full_weight` times a record's rms speed on.
+    """
+    weighted = tuple(sorted(joints))
+    return lambda record: replace(
+        trace_filtering(record), in_motion=weighted, full_weight=full_weight
+    )
 
 
 def conditioned_records(

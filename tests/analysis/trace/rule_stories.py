@@ -280,6 +280,18 @@ def what_stays_while_a_joint_sticks_speaks_against_no_friction(b: Benches) -> No
     assert any("at which the joint rests" in n for n in result.notes)
 
 
+def a_breakaway_that_motion_hides_is_named_as_all_rows_show_it(b: Benches) -> None:
+    """In motion alone the level of 60 N meets the noise, and a breakaway removes nothing."""
+    hidden = foreign_bench.Hidden(60.0, 60.0, 1e-3, breakaway=100.0, stribeck=0.003)
+    runs = b.kept("hidden breakaway", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    result = b.traced(runs, "coulomb_friction", "stribeck_friction")
+    sizes = {name: p for e in result.effects for name, p in e.parameters.items()}
+    assert {e.name for e in result.effects} == {"coulomb_friction", "stribeck_friction"}
+    assert sizes["Fc2"].value == pytest.approx(60.0, rel=0.1)
+    low, high = sizes["Fs2"].ci95
+    assert low < 100.0 < high
+
+
 def a_drop_without_a_name_is_drawn_as_a_curve(b: Benches) -> None:
     hidden = foreign_bench.Hidden(sag=2e6)
     runs = b.kept("drop", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
@@ -603,6 +615,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_above_the_stated_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
     (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),
+    (a_breakaway_that_motion_hides_is_named_as_all_rows_show_it, ("force at standstill",)),
     (a_drop_without_a_name_is_drawn_as_a_curve, ("free forms",)),
     (the_floor_is_the_noise_that_is_there, ("floor x 0.3", "floor x 3")),
     (repeats_that_do_not_differ_make_no_floor_of_nothing, ("least floor",)),

@@ -7,6 +7,7 @@ import pytest
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from tests.analysis.small_bench import TRUTH, shinshu
+from tests.analysis.trace.foreign_bench import KARNOPP, Hidden, pair_of_runs
 from tests.studies.foreign import plant
 from tests.studies.foreign.bench import Bench, runs_of
 from tests.studies.foreign.cases import case_of
@@ -53,3 +54,16 @@ def test_a_tilt_is_found_beside_friction_whose_rests_hid_it() -> None:
     assert set(sizes) == {"coulomb_friction", "base_inclination"}
     assert sizes["coulomb_friction"].value == pytest.approx(80.0, rel=0.02)
     assert sizes["base_inclination"].value == pytest.approx(0.05, rel=0.02)
+
+
+def test_a_breakaway_that_motion_hides_is_noted_beside_the_level() -> None:
+    """Friction falls from 160 N to 60 N within a fiftieth of the rms speed; the joint sticks."""
+    hidden = Hidden(60.0, 60.0, 1e-3, KARNOPP, breakaway=100.0, stribeck=0.003)
+    rig = shinshu()
+    train, held_out = pair_of_runs(rig, hidden)
+    found = trace(
+        [train], [held_out], effects=catalogue(rig, ("coulomb_friction",)), look_ahead=False,
+        free_forms=False, families=("mechanical",),
+    )  # fmt: skip
+    assert [e.name for e in found.effects] == ["coulomb_friction"]
+    assert any("torque_2: near standstill friction reaches 1." in note for note in found.notes)

@@ -185,6 +185,8 @@ RULES: Final = (
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
          ((in_motion, "searched_in_motion", lambda *given: given[-1]),
           (engine, "joints_with_friction", lambda *_: set()))),
+    Rule("force at standstill", "rows in motion alone decide whether a breakaway acts",
+         ((in_motion, "_hides_breakaway", lambda *_: False),)),
     Rule("free forms", "no mechanism without a named form",
          ((finding, "_try_free_forms", lambda *_: None),)),
 )  # fmt: skip
