@@ -17,7 +17,7 @@ from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.remaining import remainders
 from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
 from analysis.trace.search.confounders import act_at_one_joint
-from analysis.trace.search.hypothesis import Hypothesis, law_of, may_grow
+from analysis.trace.search.hypothesis import Hypothesis, law_of, may_grow, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 
@@ -40,7 +40,8 @@ def explained_by_free_form(
         return None
     extended = hypotheses.with_candidates(free)
     named = {kind.name for kind in extended.effects if not kind.free}
-    for hypothesis in _simplest_first(_sets_with_free_form(extended, winner, explained)):
+    sets = _sets_with_free_form(extended, winner, explained)
+    for hypothesis in _simplest_first(extended, sets):
         compared = rows_within_curves(holdout_data, hypothesis.fit)
         effects = gates.judge_effects(extended, hypothesis, compared, rng)
         left = remainders(extended, hypothesis, compared)
@@ -102,11 +103,20 @@ def _explains_what_it_alters(wide: HypothesisSet, start: Hypothesis, other: Hypo
     )
 
 
-def _simplest_first(sets: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the sets to judge: those near the least energy first, the simplest of them first."""
+def _simplest_first(wide: HypothesisSet, sets: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the sets to judge: those near the least energy first, the simplest of them first.
+
+    Sets of more mechanisms than one that leaves no more than form error come last, unless they
+    leave only noise: two lines in series with an edge fit nearly any curve of that edge.
+    """
     least = min((hypothesis.total for hypothesis in sets), default=0.0)
     near = SEARCH.free_form_near * least
-    ordered = sorted(sets, key=lambda o: (o.total > near, o.size[1], o.total))
+    fewest = min((len(o.laws) for o in sets if wide.within_form_tolerance(o)), default=len(sets))
+
+    def needless(o: Hypothesis) -> bool:
+        return len(o.laws) > fewest and not within_band(o.excess_energy, wide.noise_band)
+
+    ordered = sorted(sets, key=lambda o: (needless(o), o.total > near, o.size[1], o.total))
     return list({o.keys: o for o in ordered}.values())[: SEARCH.free_forms_judged]
 
 
@@ -139,10 +149,10 @@ def _curves_share_a_balance(wide: HypothesisSet, hypothesis: Hypothesis) -> bool
 def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, explained: bool) -> list[Hypothesis]:
     """Return the sets that a free form may join: the winner, and it without one mechanism.
 
-    Where the winner has `explained` the records, the free form is tried in place of a mechanism or
-    of all.
+    A free form is tried in place of a mechanism or of all, and beside all where the winner does not
+    explain the records.
     """
-    out = [wide.empty] if explained else [winner]
+    out = [wide.empty] if explained else [wide.empty, winner]
     for law in dict.fromkeys(map(law_of, winner.effects)):
         kept = [u for u in winner.effects if law_of(u) != law]
         out.append(wide.refined(kept) if kept else wide.empty)
