@@ -635,11 +635,8 @@ SLOW: Final = (
     of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first,
     noise_above_the_stated_one_is_noise_where_nothing_repeats,
     what_stays_while_a_joint_sticks_speaks_against_no_friction,
+    a_breakaway_that_motion_hides_is_named_as_all_rows_show_it,
 )
-# Stories that `test_foreign_bench` asserts with all rules.
-ELSEWHERE: Final = (
-    friction_without_a_memory_is_coulomb_friction_too, a_drop_without_a_name_is_drawn_as_a_curve,
-)  # fmt: skip
 # No small bench is known whose answer they change: pairs find effects that hide each other, as a
 # spring and dry friction of a light arm, of which none reduces the residual alone.
 NO_BENCH: Final = {"pairs"}

@@ -21,7 +21,7 @@ from tests.analysis.trace import foreign_bench, gate_cases
 from tests.analysis.trace.foreign_bench import Hidden
 from tests.analysis.trace.gate_cases import LEAK
 from tests.analysis.trace.hidden import pair_of_runs
-from tests.analysis.trace.rule_stories import ELSEWHERE, NO_BENCH, SLOW, STORIES, Benches, Story
+from tests.analysis.trace.rule_stories import NO_BENCH, SLOW, STORIES, Benches, Story
 from tests.studies.trace.rules import FAULTS, RULES, by_name, switched_off
 from tests.variants import kept
 
@@ -39,8 +39,7 @@ def benches(rig: Rig) -> Benches:
 def test_what_a_gate_is_for_holds_and_is_lost_without_it(
     benches: Benches, story: Story, broken: tuple[str, ...]
 ) -> None:
-    if story not in ELSEWHERE:
-        story(benches)
+    story(benches)
     known = by_name(RULES + FAULTS)
     for name in broken:
         with switched_off(known[name]):
