@@ -135,7 +135,8 @@ def test_a_breakaway_of_ten_times_the_sliding_level_is_named_in_motion(rig: Rig)
     assert {e.name for e in result.effects} == {"coulomb_friction", "stribeck_friction"}
     assert any("without the samples at which the joint rests" in note for note in result.notes)
     found = {name: p for e in result.effects for name, p in e.parameters.items()}
-    assert found["Fc2"].value == pytest.approx(20.0, rel=0.2)
+    low, high = found["Fc2"].ci95
+    assert low < 20.0 < high
     assert found["Fs2"].value > 2.0 * found["Fc2"].value
 
 
