@@ -185,9 +185,10 @@ def _breakaway_notes(found: Finding, finding: Finding, joints: Collection[int]) 
     """Return a note on each of `joints` (0-based) with a breakaway that the set lacks."""
     out = []
     for joint in sorted(joints):
-        has_breakaway = any(e.beside for e in _friction_of(found.winner, joint))
+        if any(e.beside for e in _friction_of(found.winner, joint)):
+            continue
         ratio = force_at_standstill(finding.rows.train, found.winner, joint)
-        if not has_breakaway and ratio > TRACE.breakaway_ratio:
+        if ratio > TRACE.breakaway_ratio:
             out.append(
                 f"{equation('torque', joint)}: near standstill friction reaches {ratio:.2g} times "
                 "the level in motion: a breakaway above it, whose law these records do not show"
@@ -216,8 +217,7 @@ def force_at_standstill(data: RegressionData, winner: Hypothesis, joint: int) ->
         if s.equation != equation("torque", joint):
             continue
         conditioned, raw = data.source(s)
-        signals = conditioned.signals
-        at = np.clip(np.rint(raw.time * signals.rate).astype(int), 0, len(signals.t) - 1)
+        signals, at = conditioned.signals, conditioned.samples_at(raw.time)
         speed = np.abs(signals.sd[at, joint])
         slow = speed < TRACE.breakaway_speed * float(np.sqrt(np.mean(speed**2)))
         lever = np.abs(signals.G[at, joint]) * np.sqrt(s.repeats) / s.noise
@@ -226,10 +226,15 @@ def force_at_standstill(data: RegressionData, winner: Hypothesis, joint: int) ->
     return float(np.quantile(together, 1.0 - TRACE.breakaway_rows)) if len(together) else 0.0
 
 
+def _friction_in(winner: Hypothesis) -> list[Effect]:
+    """Return the friction effects of a set."""
+    effects = [used.term for used in winner.effects if isinstance(used.term, Effect)]
+    return [e for e in effects if e.family == "friction"]
+
+
 def _friction_of(winner: Hypothesis, joint: int) -> list[Effect]:
     """Return the friction effects of a set at a joint (0-based)."""
-    effects = [used.term for used in winner.effects if isinstance(used.term, Effect)]
-    return [e for e in effects if e.family == "friction" and e.joint == joint]
+    return [e for e in _friction_in(winner) if e.joint == joint]
 
 
 def _meets_noise(found: Finding, joints: Collection[int]) -> bool:
@@ -246,13 +251,7 @@ def _held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
 
 def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:
     """Return the joints (0-based) in whose torque balance, one of `equations`, friction acts."""
-    return {
-        used.term.joint
-        for used in winner.effects
-        if isinstance(used.term, Effect)
-        and used.term.family == "friction"
-        and equation("torque", used.term.joint) in equations
-    }
+    return {e.joint for e in _friction_in(winner) if equation("torque", e.joint) in equations}
 
 
 def fitted_in_motion(
