@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import EntryPoints, entry_points
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -14,14 +15,20 @@ from rig.model.rig import Rig
 GROUP: Final = "bramah.drivers"
 
 
+@cache
+def _installed() -> EntryPoints:
+    """Return the installed drivers; a look-up reads the list of every installed package."""
+    return entry_points(group=GROUP)
+
+
 def wire_kinds() -> tuple[str, ...]:
     """Return the kinds of wire for which a driver is installed."""
-    return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
+    return tuple(sorted({entry.name for entry in _installed()}))
 
 
 def driver_class(kind: str) -> type[Driver]:
     """Return the driver of a kind of wire; raises InputError for an unknown kind."""
-    entries: list[EntryPoint] = list(entry_points(group=GROUP, name=kind))
+    entries = list(_installed().select(name=kind))
     if not entries:
         raise InputError(f"wire: kind: {kind!r} has no driver; installed: {' '.join(wire_kinds())}")
     loaded: type[Driver] = entries[0].load()

@@ -10,13 +10,11 @@ import signal
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from collections.abc import Generator
-from functools import cache
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from drivers import registry
 from rig.bench.latch import STATE_VARIABLE
 from rig.runs.files import CACHE_VARIABLE
 from tests import forked
@@ -78,8 +76,6 @@ def _state_folder(tmp_path_factory: pytest.TempPathFactory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(STATE_VARIABLE, str(tmp_path_factory.mktemp("state")))
         patch.setenv(CACHE_VARIABLE, str(CACHE))
-        # A look-up reads every installed package's list, and none is installed meanwhile.
-        patch.setattr(registry, "entry_points", cache(registry.entry_points))
         yield
 
 

@@ -26,7 +26,6 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
 from importlib import import_module
 from pathlib import Path
 from runpy import run_module
@@ -190,7 +189,6 @@ def imported() -> None:
     from hil_sim.scenario.file import Scenario
     from rig.runs.rigs import load_rig
 
-    registry.entry_points = cache(registry.entry_points)  # type: ignore[assignment, attr-defined]
     rig = load_rig("shinshu-2dof")
     registry.driver_class(rig.wire.kind)
     Plant(rig, Scenario(), 0)

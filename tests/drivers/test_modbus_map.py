@@ -448,9 +448,7 @@ def test_a_key_that_stands_twice_is_refused_with_its_line() -> None:
 
 def test_it_is_found_by_its_name_and_has_no_endpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = EntryPoint("modbus-map", "drivers.modbus_map:ModbusMapDriver", registry.GROUP)
-    monkeypatch.setattr(
-        registry, "entry_points", lambda **selected: EntryPoints([entry]).select(**selected)
-    )
+    monkeypatch.setattr(registry, "_installed", lambda: EntryPoints([entry]))
     rig = rig_of()
     assert isinstance(make_driver(rig.wire, rig), ModbusMapDriver)
     with pytest.raises(InputError, match="a register map fits into a rig file only"):

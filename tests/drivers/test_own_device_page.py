@@ -123,7 +123,8 @@ def test_the_pages_driver_passes_the_checks_that_move_nothing(
     names: dict[str, Any] = {"open_line": lambda _: Line(), "__name__": "my_bench.gauge"}
     exec(compile(listing(OWN_PAGE, "python"), "own-device.md", "exec"), names)
     installed = SimpleNamespace(load=lambda: names["GaugeDriver"])
-    monkeypatch.setattr("drivers.registry.entry_points", lambda **_: [installed])
+    found = SimpleNamespace(select=lambda **_: [installed])
+    monkeypatch.setattr("drivers.registry._installed", lambda: found)
     wire = Wire(kind="gauge-box", timeout=0.2, watchdog=0.5, address="COM3")  # type: ignore[call-arg]
     rig = seed_rig().model_copy(update={"sample_rate": 100.0, "wire": wire})
     report = run(live_subject(rig), outputs=False)
