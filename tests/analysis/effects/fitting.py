@@ -75,7 +75,7 @@ def residual(rows: Sequence[Rows], values: dict[str, float]) -> dict[str, float]
 def fitted(data: Data, effect: Effect, floor: dict[str, float], tries: int = 60) -> Fit:
     """Search the effect's shape from its grid and solve; residuals are weighed by `floor`.
 
-    The effect's other forms are taken as they are.
+    A form with further fixed numbers is searched as well, the other forms are taken as they are.
     """
 
     def solved(shape: Sequence[float]) -> Fit:
@@ -85,7 +85,13 @@ def fitted(data: Data, effect: Effect, floor: dict[str, float], tries: int = 60)
         fit = solved(shape)
         return sum((fit.rms[name] / floor[name]) ** 2 for name in floor)
 
-    forms = (searched(effect.shapes(data.rig), cost, tries), *effect.further_points(data.rig))
+    shapes = effect.shapes(data.rig)
+    found = searched(shapes, cost, tries)
+    forms = [found, *effect.further_points(data.rig)]
+    for form in effect.other_forms(data.rig, found):
+        n, fixed = len(found), form[len(found) :]
+        own = searched(shapes[:n], lambda s, fixed=fixed: cost((*s, *fixed)), tries)
+        forms.append((*own, *fixed))
     return solved(min(forms, key=cost))
 
 
