@@ -34,7 +34,7 @@ def rounding(name: str, stroke: float) -> Shape:
 
 def corner(name: str) -> Shape:
     """Return the shape of an edge's corner, a detail of its form: 0 where not given."""
-    return Shape(name, "", *CORNER_BOUNDS, (CORNER,), resolution=True, detail=True)
+    return Shape(name, "", *CORNER_BOUNDS, (CORNER,), saturates=True, detail=True)
 
 
 def opened(x: Array, r: float, c: float) -> Array:

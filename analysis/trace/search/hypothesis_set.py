@@ -349,14 +349,15 @@ class HypothesisSet:
         """Return the best sets with one more effect, found on data with the set in their model.
 
         `equations` restricts the search to their rows, `free` to free mechanisms. A free mechanism
-        is not added to a set that names it at the same place: its curve would be that name's form
-        error.
+        and a name of it are not combined at one place: one would be the other's form error.
         """
         data, taken, laws = rebased(self.train_data, now.fit), now.keys, now.laws
+        curves = {law_of(u) for u in now.effects if isinstance(u.term, Effect) and u.term.free}
         tried = [
             v
             for v in self.variants_of(data, now.fit.residual)
-            if v.key not in taken and (law_of(v.used) not in laws if v.effect.free else not free)
+            if v.key not in taken and (not free or v.effect.free)
+            and law_of(v.used) not in (laws if v.effect.free else curves)
             and self.may_act(v, now, equations)
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
