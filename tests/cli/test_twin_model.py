@@ -67,7 +67,7 @@ def test_a_protocol_that_nominal_values_pass_is_refused_once_the_machine_is_iden
     model = tmp_path / "model.json"
     identified = bramah("identify", fast_machine, "--model", model)
     assert identified.returncode == 0, identified.stderr
-    assert "model.json from now on" in identified.stderr
+    assert f"check and run of rig shinshu-2dof now use {model}" in identified.stderr
 
     refused = bramah(*checked, "--json", tmp_path / "check.json")
     assert refused.returncode == 2
