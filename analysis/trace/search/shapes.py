@@ -16,7 +16,7 @@ from analysis.trace.data.regression_data import RegressionData, evidence, regres
 from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.search.refinement import ExactFit, fit_coefficients, refine
 from analysis.trace.settings import SEARCH
-from rig.model.records import Run
+from rig.model.records import Run, with_common_bandwidth
 from rig.model.rig import Rig
 
 
@@ -37,6 +37,7 @@ def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
     without its lag, the flow of one joint would spoil b for the lag of another. Given shapes are
     kept. Raises InputError for unusable records.
     """
+    runs = with_common_bandwidth(runs)
     rig = ck.common_rig(runs)
     wanted = [u for u in terms if open_shapes(rig, u)]
     if not wanted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
@@ -16,7 +17,7 @@ from analysis.trace.search import shapes
 from analysis.trace.search.refinement import ExactFit, fit_coefficients
 from analysis.trace.search.shapes import ShapeFit, fit_shapes, shapes_in
 from analysis.trace.settings import SEARCH
-from rig.model.records import Run
+from rig.model.records import BANDWIDTH, Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace.hidden import experiment
@@ -49,6 +50,22 @@ def test_a_dead_band_is_found_with_both_edges_and_the_gains_come_back(
     off = [abs(e["C_pp_2"].value / TRUTH["C_pp_2"] - 1) for e in (found, plain)]
     assert off[0] < 0.01
     assert off[1] > 0.05
+
+
+def test_records_of_unlike_bandwidths_pass_alike_filters(rig: Rig, overlapped: Run) -> None:
+    """Imported motions: as `identify` fits them."""
+    slow, quick = (of_bandwidth(overlapped, width) for width in (3.0, 10.0))
+    found = fit_shapes([slow, quick], used(rig, "valve_deadband@joint 2"))
+    assert found is not None
+    assert {c.record.bandwidth for c in found.data.records} == {10.0}
+
+
+def of_bandwidth(run: Run, width: float) -> Run:
+    """Return the run with motion below `width` [Hz] and no list of excited lines."""
+    stated = [
+        replace(r, lines=(), attributes={**r.attributes, BANDWIDTH: width}) for r in run.records
+    ]
+    return replace(run, records=tuple(stated))
 
 
 def test_what_the_records_do_not_have_comes_out_as_next_to_nothing(rig: Rig) -> None:

@@ -32,7 +32,7 @@ from analysis.trace.search.shapes import fit_shapes, shapes_in
 from rig.cli.text.output import table
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
-from rig.model.records import Run
+from rig.model.records import Run, with_common_bandwidth
 from rig.model.rig import Rig
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.importer import import_records
@@ -78,7 +78,8 @@ def load(folder: Path) -> Crane:
         )
     with tempfile.TemporaryDirectory() as scratch:
         named = zip(("first", "second", "full"), (*ramps[:2], full[0]), strict=True)
-        return Crane(**{name: _imported(path, name, Path(scratch)) for name, path in named})
+        runs = with_common_bandwidth([_imported(path, n, Path(scratch)) for n, path in named])
+        return Crane(*runs)
 
 
 def _imported(path: Path, step: str, scratch: Path) -> Run:
