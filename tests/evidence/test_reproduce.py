@@ -118,7 +118,7 @@ def test_the_page_sets_every_number_beside_the_papers(done: Reproduction) -> Non
         "coupled", "sequential E1", "simultaneous", "simultaneous, paper's filter", "PSO", "GA",
     ]  # fmt: skip
     assert numbers(methods, "PSO")[1:3] == ["8 of 16", "0"]
-    lost = found["Candidates whose state ceased to exist"]
+    lost = found["Candidates without a valid state"]
     counts = [int(row[1]) for row in lost.rows if row[0].startswith("lost: ")]
     search = done.searches["pso"].found.extra["search"]
     assert sum(counts) == sum(search["lost"].values()) > 0
