@@ -23,7 +23,7 @@ from analysis.identify.result import Identification, by_geometry
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline_of
-from analysis.terms.base import FAMILIES, Used
+from analysis.terms.base import FAMILIES, Used, family_of
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.repeats import with_other_motions_apart
@@ -34,6 +34,7 @@ from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows, un
 from analysis.trace.in_motion import (
     find,
     fitted_in_motion,
+    held_out_ratios,
     joints_with_friction,
     rest_phase_notes,
 )
@@ -81,6 +82,7 @@ from analysis.trace.result import (
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
+from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError
 from rig.model.records import (
@@ -263,6 +265,8 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     alternatives = [
         (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
     ]
+    if finding.verdict == UNEXPLAINED and (other := _by_held_out(finding, winner)):
+        alternatives.append((other, ""))
     after = with_alternatives(after, alternatives)
     effects = tuple(
         with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
@@ -272,6 +276,29 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     after = replace(after, parameters={**after.parameters, **shared})
     notes = small_effect_notes(finding.winner, larger)
     return _Fitted(winner, after, effects, tuple(notes), absorbed)
+
+
+def _by_held_out(finding: Finding, winner: Hypothesis) -> Model | None:
+    """Return the model by held-out records of what unexplained residuals may move.
+
+    It has the parameters of the families of rows that keep more than noise: by other motions or on
+    another day an unknown cause moves them otherwise. None where these records are too few to
+    identify a model by themselves.
+    """
+    terms, runs = (*finding.rows.train.terms, *winner.effects), finding.rows.unseen.choosing_runs
+    try:
+        model = _identified(runs, terms, finding.rows.filters_like).model
+    except InputError:
+        return None
+    ratios = held_out_ratios(finding.rows, winner)
+    families = {family_of(e) for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
+    moved = {
+        c.parameter
+        for used in model.terms
+        for c in used.term.coefficients(model.rig)
+        if c.family in families
+    }
+    return replace(model, parameters={n: e for n, e in model.parameters.items() if n in moved})
 
 
 def _without_interval(estimate: Estimate) -> Estimate:

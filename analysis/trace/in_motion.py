@@ -131,7 +131,7 @@ def _joints_to_weight(finding: Finding, friction: Sequence[Effect]) -> tuple[set
     """
     if finding.verdict == CLEAN:
         return set(), set()
-    ratios = _held_out_ratios(finding.rows, finding.winner)
+    ratios = held_out_ratios(finding.rows, finding.winner)
     above_noise = {e for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
     joints = joints_with_friction(finding.winner, above_noise)
     if finding.verdict == UNEXPLAINED:
@@ -239,11 +239,11 @@ def _friction_of(winner: Hypothesis, joint: int) -> list[Effect]:
 
 def _meets_noise(found: Finding, joints: Collection[int]) -> bool:
     """Return whether a finding leaves little over the noise in the torque balances of `joints`."""
-    ratios = _held_out_ratios(found.rows, found.winner)
+    ratios = held_out_ratios(found.rows, found.winner)
     return all(ratios[equation("torque", joint)] <= TRACE.noted_ratio for joint in joints)
 
 
-def _held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
+def held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     """Return the error of a set in the choosing rows over the noise floor, by equation."""
     choosing = rows.unseen.choosing
     return removal.error_over_floor(choosing, held_out_residual(choosing, winner.fit))

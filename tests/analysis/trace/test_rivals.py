@@ -7,15 +7,19 @@ from dataclasses import replace
 
 import pytest
 
+from analysis.identify.identify import identify
 from analysis.simulation.model import Model
+from analysis.trace.engine import trace
 from analysis.trace.judge import rivals
 from analysis.trace.judge.rivals import with_alternatives
 from analysis.trace.result import Rival
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig
+from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
-from tests.analysis.trace.gate_cases import searched, traced
+from tests.analysis.trace.gate_cases import at_joint_2, searched, traced
+from tests.analysis.trace.hidden import RMS, experiment
 from tests.variants import kept
 
 
@@ -97,3 +101,18 @@ def test_alternatives_widen_what_they_share_with_the_model(
     assert wide["W2"].value == own["W2"].value
     assert wide["Fv2"] == own["Fv2"]  # of the law in which the two differ
     assert with_alternatives(model, [(shifted(Fv2=0.1), "")]).parameters["Fv2"] != own["Fv2"]
+
+
+def test_an_unknown_cause_that_differs_between_days_widens_what_it_moves(rig: Rig) -> None:
+    """Dry friction, not among the candidates, of 40 N in the training runs and of 60 N later."""
+    train = experiment(rig, Fc=40.0, repeats=2)
+    held_out = experiment(rig, Fc=60.0, repeats=2, seed=2, rms=0.7 * RMS)
+    candidates = at_joint_2(rig, "base_inclination")
+    result = trace([train], [held_out], candidates, look_ahead=False, free_forms=False)
+    assert (result.verdict, result.effects) == ("unexplained", ())
+    alone, intervals = identify([train]).estimates, result.model_after.parameters
+    low, high = intervals["Fv2"].ci95
+    assert low < TRUTH["Fv2"] < high
+    assert alone["Fv2"].ci95[0] > TRUTH["Fv2"]
+    for name in ("b", "C_pp_2"):  # the flows keep no more than noise
+        assert intervals[name].ci95 == pytest.approx(alone[name].ci95)
