@@ -86,9 +86,13 @@ class RowCache:
         self.families: dict[Term, frozenset[str]] = {}
 
     def without_family(self, family: str) -> RowCache:
-        """Return a cache that begins with the rows of all other families."""
+        """Return a cache that begins with the rows and fits of all other families.
+
+        They are valid for records whose rows of `family` alone are filtered otherwise.
+        """
         out = RowCache()
         out.rows = self.rows.selected(lambda key: key[1] != family)
+        out.fits = self.fits.selected(lambda key: key[0] != family)
         return out
 
 
