@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -27,6 +26,7 @@ from analysis.terms.base import FAMILIES, Used, family_of
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.repeats import with_other_motions_apart
+from analysis.trace.data.set_aside import refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
@@ -138,7 +138,7 @@ def trace(
     for given in (runs, holdout, judge):
         refuse_malformed(given)
     rig = ck.common_rig([*runs, *holdout, *judge])
-    _refuse_same(runs, holdout, judge)
+    refuse_repeated_records(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
     options = _Options(
         catalogue(rig) if effects is None else effects, known, seed, look_ahead, free_forms
@@ -437,37 +437,6 @@ def _without_unlocked_lines(
 
 def _no_progress(_: float) -> None:
     """Ignore progress."""
-
-
-def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run]) -> None:
-    if not holdout or not any(run.records for run in holdout):
-        raise InputError(
-            "no held-out records: give --holdout a run that is not used for the fit, with another "
-            "excitation (other wave or amplitude)"
-        )
-    if judge and not any(run.records for run in judge):
-        raise InputError("no judging records: the runs of --judge are empty")
-    seen: dict[str, str] = {}
-    for kind, option, checked in (
-        ("training", "", runs), ("held-out", "--holdout", holdout), ("judging", "--judge", judge),
-    ):  # fmt: skip
-        digests = [(_digest(record), record.name) for run in checked for record in run.records]
-        for digest, name in digests if option else ():
-            if digest in seen:
-                raise InputError(
-                    f"{kind} record {name!r} is {seen[digest]}, sample for sample; it must not be "
-                    f"used twice: give {option} other records"
-                )
-        seen |= {digest: f"{kind} record {name!r}" for digest, name in digests}
-
-
-def _digest(record: Record) -> str:
-    """Return a digest of a record's samples, the same whatever its name."""
-    digest = hashlib.sha256()
-    for name in sorted(record.channels):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
-    return digest.hexdigest()
 
 
 def _final_verdict(

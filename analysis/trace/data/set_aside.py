@@ -9,6 +9,7 @@ neighbouring states cannot be found within blocks.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +21,7 @@ from analysis.regression.rows import Rows
 from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.settings import DATA, TRACE
+from rig.model.parse import InputError
 from rig.model.records import Record, Run
 
 Array = NDArray[np.float64]
@@ -108,3 +110,37 @@ def _division_note(divided: Collection[Group], short: Sequence[str]) -> str:
         f"a third of the held-out rows (every third block of {DATA.judging_block:g} s) judges and "
         f"the rest chooses; `bramah trace --judge RUN` gives both in full{rest}"
     )
+
+
+def refuse_repeated_records(
+    runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run]
+) -> None:
+    """Raise InputError where no held-out records are given or one record serves two purposes."""
+    if not holdout or not any(run.records for run in holdout):
+        raise InputError(
+            "no held-out records: give --holdout a run that is not used for the fit, with another "
+            "excitation (other wave or amplitude)"
+        )
+    if judge and not any(run.records for run in judge):
+        raise InputError("no judging records: the runs of --judge are empty")
+    seen: dict[str, str] = {}
+    for kind, option, checked in (
+        ("training", "", runs), ("held-out", "--holdout", holdout), ("judging", "--judge", judge),
+    ):  # fmt: skip
+        digests = [(_digest(record), record.name) for run in checked for record in run.records]
+        for digest, name in digests if option else ():
+            if digest in seen:
+                raise InputError(
+                    f"{kind} record {name!r} is {seen[digest]}, sample for sample; it must not be "
+                    f"used twice: give {option} other records"
+                )
+        seen |= {digest: f"{kind} record {name!r}" for digest, name in digests}
+
+
+def _digest(record: Record) -> str:
+    """Return a digest of a record's samples, the same whatever its name."""
+    digest = hashlib.sha256()
+    for name in sorted(record.channels):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
+    return digest.hexdigest()

@@ -214,7 +214,7 @@ FAULTS: Final = (
     Rule("fit records judge", "the records that were fitted are those that judge",
          ((finding, "regression_data", _same_records()),), True),
     Rule("same records pass", "a held-out record may be a training record",
-         ((engine, "_refuse_same", lambda *_: None),)),
+         ((engine, "refuse_repeated_records", lambda *_: None),)),
     Rule("first repeat alone", "the average is the first repeat",
          ((regression_data.RegressionData, "mean_residual", property(_first_repeat)),), True),
     Rule("intervals x 0.5", "intervals are half as wide",
