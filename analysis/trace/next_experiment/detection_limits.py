@@ -68,9 +68,11 @@ def absorbed_effects(
 
     Another name of a law that acts in the set has the shape with which it was fitted in place of
     that name. A special case of an effect of the set is no further effect. Beside a free form there
-    is none, since its curve absorbs any similar effect.
+    is none, since its curve absorbs any similar effect. Rows of a joint in motion limit no
+    breakaway.
     """
     train_data = hypotheses.train_data
+    in_motion = train_data.records[0].filtering.in_motion
     named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
     if any(effect.free for effect in named):
         return None
@@ -78,6 +80,7 @@ def absorbed_effects(
     asked = [
         effect for effect in effects
         if (effect.name, effect.where) not in winner.keys
+        and not (effect.beside and effect.joint in in_motion)
         and not any(is_special_case(effect, other) for other in named)
     ]  # fmt: skip
     fitted = _fitted_instead(hypotheses, winner)

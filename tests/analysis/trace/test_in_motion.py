@@ -67,3 +67,16 @@ def test_a_breakaway_that_motion_hides_is_noted_beside_the_level() -> None:
     )  # fmt: skip
     assert [e.name for e in found.effects] == ["coulomb_friction"]
     assert any("torque_2: near standstill friction reaches 1." in note for note in found.notes)
+
+
+def test_rows_in_motion_limit_no_breakaway() -> None:
+    """Of a joint that sticks they state no largest force by which it might break away."""
+    rig = shinshu()
+    train, held_out = pair_of_runs(rig, Hidden(30.0, 30.0, 1e-3, KARNOPP))
+    found = trace(
+        [train], [held_out], effects=catalogue(rig, ("coulomb_friction", "stribeck_friction")),
+        free_forms=False, look_ahead=False, families=("mechanical",),
+    )  # fmt: skip
+    assert any("without the samples at which the joint rests" in note for note in found.notes)
+    limits = {(d.name, d.at) for d in found.detection_limits}
+    assert ("stribeck_friction", "joint 2") not in limits
