@@ -36,7 +36,9 @@ from rig.model.rig import Rig
 from rig.model.units import plain
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
-LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in the line
+# [s] The longest lag of a line that loses all of the pressure at the pump's flow: as soft as an
+# accumulator.
+LONGEST: Final = 2.0
 # Of the pump's flow: the steepest line searched loses all of the pressure at this flow.
 LEAST_FLOW: Final = 0.05
 BULK: Final = "b"  # the parameter's name
@@ -228,11 +230,11 @@ class SupplySag(LineDrop):
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the drop at the pump's whole flow [Pa], r_t and the volume [m^3]."""
-        most = LONGEST * rig.supply.flow
+        most = LONGEST * rig.supply.flow * BULK_MODULUS / rig.supply.pressure
         return (
             line_drop("dp_supply", rig, (0.05, 0.2)),
             turning("laminar_share", (0.2, 1.2)),
-            Shape("V_supply", "m^3", 0.0, most, (0.005 * most, 0.1 * most), resolution=True),
+            Shape("V_supply", "m^3", 0.0, most, (0.002 * most, 0.04 * most), resolution=True),
         )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:

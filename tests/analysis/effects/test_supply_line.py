@@ -153,3 +153,21 @@ def test_a_drop_that_no_record_reaches_may_be_that_of_any_line_beyond(
         assert high >= (1.0 - 1e-3) * shape[0]
     (line,) = ReturnLine("bench").extrapolated(rated, [lifting], (DROP,)).values()
     assert line[0] < DROP == pytest.approx(line[1])
+
+
+def test_an_accumulator_may_be_as_slow_at_a_small_pump_of_low_pressure(
+    rig: Rig, lifting: Signals
+) -> None:
+    """A laminar line and a capacity C = V / b are a lag of R C: 0.3 s at 1.5 MPa and 0.3 l/min."""
+    supply = rig.supply.model_copy(update={"pressure": 1.5e6, "flow": 5e-6})
+    small = rig.model_copy(update={"supply": supply})
+    resistance, lag = 0.3 * supply.pressure / supply.flow, 0.3
+    shape = (0.3 * supply.pressure, 3.0, lag / resistance * rig.nominal["b"])
+    assert SupplySag("bench").outside(small, shape) == ""
+    flow = np.where(lifting.t < 0.1, 0.0, 0.5 * supply.flow)
+    speed = np.column_stack((flow / rig.joints[0].cylinder.cap_area, np.zeros(len(flow))))
+    begun = replace(lifting, sd=speed, p_s=np.full(len(flow), supply.pressure))
+    drop = supply.pressure - SupplySag("bench").prepare(small, begun, shape).p_s
+    after = lifting.t - 0.1
+    slow = np.where(after < 0.0, 0.0, 0.5 * shape[0] * -np.expm1(-after / lag))
+    assert drop == pytest.approx(slow, abs=0.02 * slow.max())
