@@ -19,7 +19,7 @@ from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.identify.geometry import wider
 from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import Identification, by_geometry
-from analysis.regression.rows import Filtering, default_filtering
+from analysis.regression.rows import Filtering, default_filtering, parameters_of
 from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, family_of
@@ -32,9 +32,9 @@ from analysis.trace.data.temperature_nuisance import at_nominal_temperature, tem
 from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows, unstated_noise
 from analysis.trace.in_motion import (
+    equations_above_noise,
     find,
     fitted_in_motion,
-    held_out_ratios,
     joints_with_friction,
     rest_phase_notes,
 )
@@ -82,7 +82,6 @@ from analysis.trace.result import (
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
-from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.parse import InputError
 from rig.model.records import (
@@ -290,14 +289,8 @@ def _by_held_out(finding: Finding, winner: Hypothesis) -> Model | None:
         model = _identified(runs, terms, finding.rows.filters_like).model
     except InputError:
         return None
-    ratios = held_out_ratios(finding.rows, winner)
-    families = {family_of(e) for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
-    moved = {
-        c.parameter
-        for used in model.terms
-        for c in used.term.coefficients(model.rig)
-        if c.family in families
-    }
+    families = set(map(family_of, equations_above_noise(finding.rows, winner)))
+    moved = {n for family in families for n in parameters_of(model.rig, model.terms, family)}
     return replace(model, parameters={n: e for n, e in model.parameters.items() if n in moved})
 
 
