@@ -106,7 +106,7 @@ class Branch:
 class Evidence:
     """Records for an effect that chooses its starting points by the data.
 
-    `signals` are those of each averaged record, as the model sees them;
+    `signals` are those of each averaged record, as the model sees them, `valid` within its rows;
     `residuals` holds its residual by equation: instants (m,) [s] and whitened residual (m,).
     """
 
@@ -114,8 +114,17 @@ class Evidence:
     residuals: Sequence[Mapping[str, tuple[Array, Array]]]
 
     def of_joint(self, joint: int, values: Callable[[Signals], Array]) -> Array:
-        """Return values (n,) of all records in which a joint is excited: others have no rows."""
-        parts = [values(s) for s in self.signals if s.excited[joint]]
+        """Return values (n,) where rows of a joint may lie, of all records in which it is excited.
+
+        Motion at a record's ends, where the filters give no rows, would place knots where nothing
+        determines the curve.
+        """
+        parts = [values(s)[s.valid[:, joint]] for s in self.signals if s.excited[joint]]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def of_bench(self, values: Callable[[Signals], Array]) -> Array:
+        """Return values (n,) where rows of any joint may lie, of all records."""
+        parts = [values(s)[s.valid.any(axis=1)] for s in self.signals]
         return np.concatenate(parts) if parts else np.zeros(0)
 
 

@@ -66,7 +66,7 @@ class SupplyCurve(PortEffect):
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the drawn flow, with drops in proportion to it."""
-        flow = np.concatenate([port_flow(rig, s, drawn=True) for s in evidence.signals])
+        flow = evidence.of_bench(lambda x: port_flow(rig, x, drawn=True))
         knots = spread_knots(flow, (0.0, 0.6, LAST), low=0.0)
         if not len(knots):
             return ()

@@ -252,13 +252,19 @@ class VariantColumns:
 def evidence(data: RegressionData, residual: Array) -> Evidence:
     """Return signals and residuals for effects whose shape grid depends on the data.
 
-    `residual` (M,) is the whitened residual of a model.
+    `residual` (M,) is the whitened residual of a model. Samples before the first and after the last
+    row of a record are marked as not valid.
     """
+    signals: list[Signals] = []
     left: list[dict[str, tuple[Array, Array]]] = []
-    for conditioned, rows in zip(data.records, data.rows, strict=True):
+    for conditioned, rows, prepared in zip(data.records, data.rows, signals_of(data), strict=True):
         own = [s for s in data.segments if s.group == conditioned.group]
         left.append({s.equation: (rows[s.equation].time, residual[s.where]) for s in own})
-    return Evidence(signals_of(data), left)
+        times = np.concatenate([time for time, _ in left[-1].values()] or [prepared.t[:0]])
+        first, last = (times.min(), times.max()) if len(times) else (np.inf, -np.inf)
+        inside = (prepared.t >= first) & (prepared.t <= last)
+        signals.append(replace(prepared, valid=prepared.valid & inside[:, None]))
+    return Evidence(signals, left)
 
 
 def signals_of(data: RegressionData) -> list[Signals]:

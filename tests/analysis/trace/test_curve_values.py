@@ -12,8 +12,9 @@ from analysis.simulation.model import Estimate, nominal_model
 from analysis.simulation.simulate import compiled
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import free_mechanisms
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
 from analysis.trace.engine import judging_rows_above_band, with_effect_values
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
 from analysis.trace.judge.gates import held_out_above_band
@@ -89,3 +90,25 @@ def test_an_extrapolated_curve_does_not_change_the_verdict(rig: Rig, reach: floa
     against, words = judging_rows_above_band(data, empty, after)
     assert against == ({"torque_2"} if reach > 0.1 else set())
     assert any("beyond the range of the fitted curve" in said for said in words)
+
+
+def test_knots_of_a_curve_lie_where_rows_can_determine_it(rig: Rig) -> None:
+    """Motion at a record's ends, which the filters reach beyond, has no rows: it places no knot."""
+    data, _, _ = sprung(rig, 0.9)
+    record = data.records[0]
+    times = np.concatenate([rows.time for rows in data.rows[0].values()])
+    first, last = record.samples_at(np.array([times.min(), times.max()]))
+    at = np.arange(len(record.signals.t))[:, None]
+    ends = (at < first) | (at > last)
+    x = record.signals
+    larger = replace(
+        x,
+        **{k: np.where(ends, 3.0 * v, v) for k, v in vars(x).items() if k in ("u", "s", "sd", "G")},
+        **{k: np.where(ends, 0.3 * v, v) for k, v in vars(x).items() if k in ("p_cap", "p_rod")},
+    )
+    unlike = replace(data, records=(replace(record, signals=larger), *data.records[1:]))
+    curves = [e for e in free_mechanisms(rig) if e.where != "joint 1"]
+    for curve in curves:
+        known = curve.points(rig, evidence(data, data.mean_residual))
+        assert known == curve.points(rig, evidence(unlike, data.mean_residual)), curve.name
+    assert {"leakage_along_stroke", "supply_curve"} <= {curve.name for curve in curves}
