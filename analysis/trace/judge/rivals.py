@@ -214,10 +214,11 @@ def alternatives_of(
 ) -> list[tuple[Hypothesis, str]]:
     """Return the sets that could hold in place of the winner, and the law that each leaves out.
 
-    They are those with a tied rival, which leave out none (''), and those with a richer form of a
-    named effect, such as two levels of friction for one, that move parameters too little to be
-    rivals. A richer form leaves out its law's term of the baseline, viscous friction: forms of
-    friction differ by a slope too.
+    They are those with a tied rival; those with a richer form of a named effect, such as two levels
+    of friction for one, that move parameters too little to be rivals; and those with another part
+    of its law beside it, such as a level beside a breakaway. Most leave out none (''). A richer
+    form that is not possible (its levels are equal) leaves out its law's term of the baseline,
+    viscous friction: forms of friction differ by a slope too.
     """
     tied = tied_sets(hypotheses, winner, effects)
     out = [(hypothesis, "") for hypothesis in tied]
@@ -235,7 +236,11 @@ def alternatives_of(
             richer = hypotheses.refined([*others, start])
             rows, law = hypotheses.train_data, effect.family
             if richer not in tied and moved_parameter(rows, winner, richer, law) is None:
-                out.append((richer, law))
+                possible = not hypotheses.physical_problem(richer)
+                out.append((richer, "" if possible else law))
+    for parts in map(hypotheses.refined, hypotheses.with_parts_beside(winner)):
+        if not hypotheses.physical_problem(parts):
+            out.append((parts, ""))
     return out
 
 

@@ -382,12 +382,12 @@ class HypothesisSet:
             return larger
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
         for hypothesis in (now, *filter(self.physical_problem, larger)):
-            for effects in self._with_parts_beside(hypothesis, equations):
+            for effects in self.with_parts_beside(hypothesis, equations):
                 with_parts.setdefault(keys_of(effects), effects)
         return larger + [self._extended(now, effects) for effects in with_parts.values()]
 
-    def _with_parts_beside(
-        self, hypothesis: Hypothesis, equations: Collection[str]
+    def with_parts_beside(
+        self, hypothesis: Hypothesis, equations: Collection[str] = ()
     ) -> Iterator[tuple[Used, ...]]:
         """Yield the set with another part of an effect's law beside it, with both at their start.
 

@@ -83,6 +83,17 @@ def test_an_interval_reaches_what_a_richer_form_of_the_named_effect_gives(
     assert beside.std > 1.5 * alone.std
 
 
+def test_viscous_friction_is_as_uncertain_as_a_breakaway_that_noise_hides(rig: Rig) -> None:
+    """The level takes up most of the breakaway, and viscous friction the fall behind it."""
+    runs = pair_of_runs(rig, Hidden(24.0, 24.0, breakaway=8.0, stribeck=0.05), repeats=1, noise=4.0)
+    alone, beside = (
+        traced(rig, runs, *names).model_after.parameters["Fv2"]
+        for names in (("coulomb_friction",), ("coulomb_friction", "stribeck_friction"))
+    )
+    assert alone.value == beside.value
+    assert alone.ci95[1] < TRUTH["Fv2"] < beside.ci95[1]
+
+
 @pytest.mark.slow
 def test_alternatives_widen_what_they_share_with_the_model(
     rig: Rig, noisy: tuple[Run, Run]

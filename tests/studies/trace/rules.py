@@ -169,7 +169,7 @@ RULES: Final = (
     Rule("fewer effects", "an effect is added where another set of fewer leaves as little",
          ((HypothesisSet, "_smaller_sets", lambda *_: []),)),
     Rule("parts of a law", "a breakaway and the level below it are tried one by one",
-         ((HypothesisSet, "_with_parts_beside", lambda *_: iter(())),)),
+         ((HypothesisSet, "with_parts_beside", lambda *_: iter(())),)),
     Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
          ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),)),
     Rule("nearer start", "a further effect begins at its size by first-order columns",
