@@ -303,12 +303,14 @@ def _with_free_runs(
 ) -> tuple[Finding, _Fitted, tuple[held_out.FreeRunErrors, held_out.FreeRunErrors]]:
     """Return the finding, its model and the free runs of unseen records before and after.
 
-    Effects with which the free run fails or is far worse than without them are not named.
+    Effects with which the free run fails or is far worse than without them are not named. A free
+    run with parameters of the model without them (`held_out.completed`) is no evidence against it.
     """
     unseen, before = [*records.holdout, *records.judge], prepared.baseline
     fitted = _fitted(prepared, finding)
-    first, last = held_out.free_runs(unseen, before, fitted.model)
-    if worse := held_out.worse_free_run(first, last):
+    simulated = held_out.completed(fitted.model, before)
+    first, last = held_out.free_runs(unseen, before, simulated)
+    if simulated is fitted.model and (worse := held_out.worse_free_run(first, last)):
         finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
         fitted, last = _fitted(prepared, finding), first
     return finding, fitted, (first, last)
@@ -379,7 +381,6 @@ def _traced(
         if winner is not finding.winner:
             absorbed = absorbed_effects(hypotheses, prepared.candidates, winner)
         hidden = detection_limits(absorbed, winner, after)
-    undetermined = [n for n, e in before.parameters.items() if not e.identified]
     notes = [
         *unseen_load_notes(records.train, [*records.holdout, *records.judge]),
         *prepared.rows.unseen.notes,
@@ -392,7 +393,7 @@ def _traced(
         *refitted_notes(winner.fit, last, after),
         *shared_parameters(winner, after).values(),
         *record_condition_notes(train_data, winner),
-        *undetermined_notes(after, undetermined, finding.rows.in_motion),
+        *undetermined_notes(after, before, finding.rows.in_motion),
         *kept,
         *fitted.notes,
         *detection_limit_notes(hidden),

@@ -100,19 +100,25 @@ def masked_row_notes(kind: str, data: RegressionData) -> list[str]:
 
 
 def undetermined_notes(
-    model: Model, known: Collection[str] = (), in_motion: Collection[int] = ()
+    model: Model, before: Model | None = None, in_motion: Collection[int] = ()
 ) -> list[str]:
-    """Name the parameters that the records do not determine, except those `known` already.
+    """Name the parameters that the records do not determine.
 
-    `in_motion` are the joints (0-based) whose torque rows are weighted by speed.
+    Where effects were added to a model `before`, those that it lacks too are left out; the free run
+    takes the others from it (`held_out.completed`). `in_motion` are the joints (0-based) whose
+    torque rows are weighted by speed.
     """
-    missing = [n for n, e in model.parameters.items() if not e.identified and n not in known]
+    lost = [n for n, e in model.parameters.items() if not e.identified]
+    known = {} if before is None else before.parameters
+    missing = [n for n in lost if n not in known or known[n].identified]
     if not missing:
         return []
     where = f", with {', '.join(equation('torque', i) for i in in_motion)} judged in motion alone,"
+    taken = [n for n in missing if n in known]
     return [
         f"the records{where if in_motion else ''} do not determine {', '.join(missing)} (see "
         "`bramah identify`): the share of the motion that belongs to it may show as a residual"
+        + (f"; the free run takes {', '.join(taken)} from the model before" if taken else "")
     ]
 
 

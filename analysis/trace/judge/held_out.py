@@ -234,6 +234,17 @@ def free_runs(
     return first, first if after is before else _free_runs(holdout, after)
 
 
+def completed(after: Model, before: Model) -> Model:
+    """Return the model with the values of `before` for parameters that only it determines.
+
+    Without a value of an inertia there would be no free run. Returns `after` itself where it lacks
+    none.
+    """
+    known = {n: e for n, e in before.parameters.items() if e.identified}
+    lacking = {n: known[n] for n, e in after.parameters.items() if not e.identified and n in known}
+    return replace(after, parameters={**after.parameters, **lacking}) if lacking else after
+
+
 def worse_free_run(before: FreeRunErrors, after: FreeRunErrors) -> str:
     """Say in which channel effects make the free run far worse ('' if in none).
 

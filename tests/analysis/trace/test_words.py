@@ -12,6 +12,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.in_motion import rest_phase_notes
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates
+from analysis.trace.judge.held_out import completed
 from analysis.trace.judge.unknown_cause import tied_in_held_out
 from analysis.trace.notes import undetermined_notes
 from analysis.trace.remaining import tolerance_words
@@ -148,13 +149,16 @@ def test_a_remainder_is_that_of_a_form_up_to_the_tolerance_of_the_held_out_recor
 
 
 def test_a_parameter_that_only_motion_alone_leaves_open_says_so(rig: Rig) -> None:
-    model = nominal_model(rig, tuple(map(Used, baseline_of(rig))))
+    before = nominal_model(rig, tuple(map(Used, baseline_of(rig))))
     lost = Estimate(np.nan, "kg m^2", np.nan, (np.nan, np.nan))
-    model = replace(model, parameters=dict(model.parameters) | {"M2": lost})
-    assert undetermined_notes(model, ["M2"]) == []
-    (always,), (moving,) = undetermined_notes(model), undetermined_notes(model, (), (1,))
+    model = replace(before, parameters=dict(before.parameters) | {"M2": lost})
+    assert undetermined_notes(model, model) == []
+    (always,), (moving,) = undetermined_notes(model), undetermined_notes(model, before, (1,))
     assert always.startswith("the records do not determine M2 ")
     assert moving.startswith("the records, with torque_2 judged in motion alone, do not determine")
+    assert moving.endswith("the free run takes M2 from the model before")
+    assert completed(model, before).parameters == before.parameters
+    assert completed(before, model) is before
 
 
 def test_beside_something_unknown_training_records_do_not_separate_a_rival() -> None:
