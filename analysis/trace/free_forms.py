@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -63,12 +64,16 @@ def _sets_with_free_form(
     wide: HypothesisSet, winner: Hypothesis, explained: bool
 ) -> list[Hypothesis]:
     """Return the physical sets with a free form that leave little enough (see the caller)."""
+    most = _most_mechanisms(wide, winner) if explained else math.inf
     out: list[Hypothesis] = []
     for start in _sets_to_extend(wide, winner, explained):
+        if len(start.laws) >= most:
+            continue
         for single in wide.extensions(start, free=True):
             if wide.removes_too_little(start, single):  # a further effect would make it needless
                 continue
-            for hypothesis in (single, _with_further_effect(wide, single)):
+            larger = [_with_further_effect(wide, single)] if len(single.laws) < most else []
+            for hypothesis in (single, *larger):
                 explains = _explains_what_it_alters(wide, start, hypothesis)
                 better = not explained or _is_better(wide, winner, hypothesis)
                 if explains and better and not wide.physical_problem(hypothesis):
@@ -76,19 +81,25 @@ def _sets_with_free_form(
     return out
 
 
+def _most_mechanisms(wide: HypothesisSet, winner: Hypothesis) -> int:
+    """Return how many mechanisms a set may have that replaces one that explains by names alone.
+
+    As many only where the names leave more than the tolerance for their forms: a level of friction
+    that changes along the stroke misses what a curve follows.
+    """
+    return len(winner.laws) - wide.within_form_tolerance(winner)
+
+
 def _is_better(wide: HypothesisSet, winner: Hypothesis, hypothesis: Hypothesis) -> bool:
     """Return whether a set with a free form may replace one that explains by names alone.
 
-    With fewer mechanisms it must leave at most `SEARCH.free_form_ratio` of the energy. With as many
-    it must leave `SEARCH.free_form_ratio_alike`, and the names more than the tolerance for their
-    forms: a level of friction that changes along the stroke misses what the curve follows.
+    With fewer mechanisms it must leave at most `SEARCH.free_form_ratio` of the energy, with as many
+    `SEARCH.free_form_ratio_alike`, and it may have no more than `_most_mechanisms`.
     """
-    ratio = SEARCH.free_form_ratio
-    if len(hypothesis.laws) >= len(winner.laws):
-        if len(hypothesis.laws) > len(winner.laws) or wide.within_form_tolerance(winner):
-            return False
-        ratio = SEARCH.free_form_ratio_alike
-    return hypothesis.total < ratio * winner.total
+    fewer = len(hypothesis.laws) < len(winner.laws)
+    ratio = SEARCH.free_form_ratio if fewer else SEARCH.free_form_ratio_alike
+    possible = len(hypothesis.laws) <= _most_mechanisms(wide, winner)
+    return possible and hypothesis.total < ratio * winner.total
 
 
 def _explains_what_it_alters(wide: HypothesisSet, start: Hypothesis, other: Hypothesis) -> bool:
