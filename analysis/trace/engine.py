@@ -16,7 +16,6 @@ from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
 from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
 from analysis.identify.geometry import NAME as GEOMETRY
-from analysis.identify.geometry import wider
 from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import Identification, by_geometry
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
@@ -45,8 +44,9 @@ from analysis.trace.judge.curves import (
     equations_beyond_curves,
     rows_within_curves,
 )
-from analysis.trace.judge.rivals import alternatives_of, with_alternatives
-from analysis.trace.judge.scatter import form_shift, with_form_errors
+from analysis.trace.judge.inference import with_form_error
+from analysis.trace.judge.rivals import alternatives_of, errors_by_alternatives
+from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import (
@@ -266,9 +266,11 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     ]
     if finding.verdict == UNEXPLAINED and (other := _by_held_out(finding, winner)):
         alternatives.append((other, ""))
-    after = with_alternatives(after, alternatives)
+    by_alternatives = errors_by_alternatives(after, alternatives)
+    after = with_errors(after, by_alternatives)
     effects = tuple(
-        with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in finding.named
+        with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shooting.shots)
+        for f in finding.named
     )
     after = with_effect_values(after, effects)
     shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
@@ -527,10 +529,10 @@ def _identified(
     return coupled(runs, kept, filtering, estimator=ESTIMATOR)
 
 
-def _with_tolerances(effect: JudgedEffect, from_tolerances: Mapping[str, float]) -> JudgedEffect:
-    """Return an effect whose intervals include errors `from_tolerances`, by parameter name."""
+def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> JudgedEffect:
+    """Return an effect whose intervals include further standard errors, by parameter name."""
     parameters = {
-        name: wider(estimate, from_tolerances[name]) if name in from_tolerances else estimate
+        name: with_form_error(estimate, math.hypot(*(e.get(name, 0.0) for e in errors)))
         for name, estimate in effect.parameters.items()
     }
     return replace(effect, parameters=parameters)

@@ -143,7 +143,7 @@ def estimates(
     units |= {s.parameter: s.unit for s in shapes_of(rig, used)}
     half = half_width(errors.std, errors.dof)
     out = {
-        name: _with_form_error(
+        name: with_form_error(
             Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h))),
             shift.get(name, 0.0),
         )
@@ -158,7 +158,7 @@ def estimates(
     return out
 
 
-def _with_form_error(estimate: Estimate, shift: float) -> Estimate:
+def with_form_error(estimate: Estimate, shift: float) -> Estimate:
     """Return an estimate whose interval includes the standard error `shift` by unknown forms.
 
     Another form changes a size by a factor but not its sign: an interval that excludes 0 still

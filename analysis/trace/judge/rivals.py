@@ -19,7 +19,6 @@ from analysis.trace.judge import removal
 from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
-from analysis.trace.judge.scatter import with_errors
 from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search import confounders
 from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
@@ -244,13 +243,15 @@ def alternatives_of(
     return out
 
 
-def with_alternatives(model: Model, alternatives: Sequence[tuple[Model, str]]) -> Model:
-    """Return the model with intervals that include what other models of the records give.
+def errors_by_alternatives(
+    model: Model, alternatives: Sequence[tuple[Model, str]]
+) -> dict[str, float]:
+    """Return the further standard error of parameters by other models of the records, by name.
 
     Each alternative, identified as the model is, counts with the same weight: the square of the
-    standard error added is the mean, over the model and them, of the squared shift and of the
-    variance beyond the model's (Buckland, Burnham and Augustin, Biometrics 53, 1997). Parameters
-    of the baseline's term of the law that an alternative leaves out are not compared with it.
+    error is the mean, over the model and them, of the squared shift and of the variance beyond the
+    model's (Buckland, Burnham and Augustin, Biometrics 53, 1997). Parameters of the baseline's term
+    of the law that an alternative leaves out are not compared with it.
     """
     compared = [(other.parameters, _of_law(model.rig, law)) for other, law in alternatives]
     errors = {}
@@ -262,7 +263,7 @@ def with_alternatives(model: Model, alternatives: Sequence[tuple[Model, str]]) -
         )  # fmt: skip
         if own.identified and more > 0.0:
             errors[name] = math.sqrt(more / (len(alternatives) + 1))
-    return with_errors(model, errors)
+    return errors
 
 
 def _of_law(rig: Rig, law: str) -> set[str]:
