@@ -23,6 +23,7 @@ from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
+from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
@@ -94,8 +95,29 @@ def absorbed_effects(
         return None
     names, X = tangent(train_data, winner.fit)
     added = np.column_stack([rows.prediction(explanation) for explanation in small])
+    pairs = _pairs_of_chambers(small)
+    both = [_together(small[cap], small[rod]) for cap, rod in pairs]
+    added = np.column_stack((added, *(added[:, [cap, rod]].sum(axis=1) for cap, rod in pairs)))
     taken = shortest(X, added, TRACE.rank_limit)
-    return AbsorbedEffects(rows, small, names, taken, added - X @ taken)
+    return AbsorbedEffects(rows, [*small, *both], names, taken, added - X @ taken)
+
+
+def _pairs_of_chambers(single: Sequence[Explanation]) -> list[tuple[int, int]]:
+    """Return the places in `single` of one effect at the cap and at the rod side of one joint.
+
+    Both chambers' pressures read against vacuum, or both pipes longer than stated, are as likely as
+    one alone, and the parameters may absorb more of the two.
+    """
+    at = {(e.effects[0].term.name, e.effects[0].term.where): k for k, e in enumerate(single)}
+    return [
+        (k, at[name, where.removesuffix("cap") + "rod"])
+        for (name, where), k in at.items()
+        if where.endswith(" cap") and (name, where.removesuffix("cap") + "rod") in at
+    ]
+
+
+def _together(cap: Explanation, rod: Explanation) -> Explanation:
+    return Explanation((*cap.effects, *rod.effects), {**cap.beta, **rod.beta})
 
 
 def detection_limits(
@@ -120,17 +142,27 @@ def detection_limits(
         if most and shifts[most] > 1.0:  # the parameter would be 0 or of the other sign
             times, shifts = times / shifts[most], {most: 1.0}
         if most and shifts[most] >= TRACE.noted_shift:
-            key, size = explanation.keys[0], _effect_size(data, explanation, times)
+            size = _effect_size(data, explanation, times)
             possible = is_possible(data.rig, model, explanation, times)
+            place = _places(explanation)
             found.append(
                 DetectionLimit(
-                    key["name"], key["where"], key["at"], *size, most, shifts[most], possible
+                    explanation.keys[0]["name"], *place, *size, most, shifts[most], possible
                 )
             )  # fmt: skip
     once: dict[str, DetectionLimit] = {}
     for limit in sorted(found, key=lambda f: -f.shift):
         once.setdefault(limit.name, limit)
     return list(once.values())
+
+
+def _places(explanation: Explanation) -> tuple[str, str]:
+    """Return the place of an effect as reported, and as the catalogue has it."""
+    first, *others = explanation.keys
+    if not others:
+        return first["where"], first["at"]
+    both = f"{first['at'].removesuffix('cap')}both chambers"
+    return both, both
 
 
 def _fitted_instead(
@@ -187,7 +219,7 @@ def _effect_size(
 
     The size is the difference from the neutral value, 1 of a gain.
     """
-    (used,) = explanation.effects
+    used = explanation.effects[0]
     for c in used.term.coefficients(data.rig):
         if explanation.beta.get(c.parameter):
             return c.parameter, abs(explanation.beta[c.parameter]) * times, c.unit, 0.0
@@ -198,21 +230,19 @@ def _effect_size(
 
 
 def is_possible(rig: Rig, model: Model, explanation: Explanation, times: float) -> bool:
-    """Return whether an effect of `times` its smallest size is physical, as the smallest one is."""
-    (used,) = explanation.effects
-    effect = used.term
-    assert isinstance(effect, Effect)
+    """Return whether effects of `times` their smallest size are physical, as the smallest are."""
     known = {name: e.value for name, e in model.parameters.items() if e.identified}
 
-    def problem(times: float) -> str:
-        shape = list(used.shape)
+    def problem(used: Used, times: float) -> str:
+        effect, shape = used.term, list(used.shape)
+        assert isinstance(effect, Effect)
         for k, s in enumerate(shapes_of(rig, used)[: len(effect.least_shapes())]):
             neutral = s.neutral or 0.0
             shape[k] = neutral + times * (shape[k] - neutral)
         values = known | {name: times * value for name, value in explanation.beta.items()}
         return effect.problem(rig, values, shape)
 
-    return not problem(times) or bool(problem(1.0))
+    return all(not problem(u, times) or bool(problem(u, 1.0)) for u in explanation.effects)
 
 
 def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:

@@ -41,8 +41,8 @@ def sets_with_small_effect(
     if absorbed is None:
         return []
     left, found = held_out_residual(holdout_data, winner.fit), []
-    for used in _clearest(absorbed, winner):
-        larger = hypotheses.refined([*winner.effects, used])
+    for effects in _clearest(absorbed, winner):
+        larger = hypotheses.refined([*winner.effects, *effects])
         price = SEARCH.number_price * (larger.size[1] - winner.size[1])
         if (
             winner.fit.energy - larger.fit.energy > price
@@ -55,23 +55,29 @@ def sets_with_small_effect(
     return [(o, moved) for o, moved in found if o.fit.energy <= least + SEARCH.number_price]
 
 
-def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[Used]:
-    """Return the effects that exceed their noise most, in units of its standard deviation."""
+def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[tuple[Used, ...]]:
+    """Return what exceeds its noise most, in units of its standard deviation.
+
+    Effects at both chambers come after single ones, so that none of these is left out for them.
+    """
     size = np.linalg.norm(absorbed.shown, axis=0)
     along = np.abs(absorbed.shown.T @ winner.fit.residual)
     deviations = np.divide(along, size, out=np.zeros_like(along), where=size > 0)
     order = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.visible_deviations]
-    return [absorbed.explanations[k].effects[0] for k in order[: TRACE.most_rivals]]
+    effects = [absorbed.explanations[k].effects for k in order]
+    single, both = ([e for e in effects if len(e) == count] for count in (1, 2))
+    return [*single[: TRACE.most_rivals], *both[: TRACE.most_rivals]]
 
 
 def small_effect_notes(winner: Hypothesis, larger: Sequence[tuple[Hypothesis, Moved]]) -> list[str]:
     """Name the further effects of larger sets, and the parameters that they change most."""
     out = []
     for hypothesis, (parameter, change) in larger:
-        fresh = (u.term for u in hypothesis.effects)
-        (effect,) = (t for t in fresh if (t.name, t.where) not in winner.keys)
+        terms = (u.term for u in hypothesis.effects)
+        fresh = [term for term in terms if (term.name, term.where) not in winner.keys]
+        places = " and ".join(place_in_words(term.where) for term in fresh)
         out.append(
-            f"{effect.name} at {place_in_words(effect.where)} leaves too little to be named, but "
+            f"{fresh[0].name} at {places} leaves too little to be named, but "
             f"the records suggest it or one like it: with it {parameter} would be "
             f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}, and its "
             "interval is wider for it"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from analysis.terms import make
@@ -10,6 +12,7 @@ from analysis.trace.next_experiment.detection_limits import detection_limit_note
 from analysis.trace.next_experiment.discrimination import smallest_effect
 from analysis.trace.result import DetectionLimit, Trace, to_json
 from rig.model.rig import Rig
+from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace import gate_cases
 from tests.analysis.trace.hidden import experiment, pair_of_runs
 from tests.variants import kept
@@ -81,6 +84,27 @@ def test_a_special_case_of_a_named_effect_is_none_that_could_hide_beside_it(rig:
     result = gate_cases.traced(rig, pair_of_runs(rig, F_ext=70.0, F_ret=40.0), *names)
     assert [e.name for e in result.effects] == ["asymmetric_friction"]
     assert [d.name for d in result.detection_limits] == ["stribeck_friction"]
+
+
+def test_a_limit_is_that_of_both_chambers_where_they_hide_more_than_one(rig: Rig) -> None:
+    """Both pipes hold twice the oil that the rig file states: the bulk modulus takes it up."""
+    cylinder = rig.joints[1].cylinder
+    half = {name: 0.5 * getattr(cylinder, name) for name in ("cap_pipe_volume", "rod_pipe_volume")}
+    second = rig.joints[1].model_copy(update={"cylinder": cylinder.model_copy(update=half)})
+    stated = rig.model_copy(update={"joints": (rig.joints[0], second)})
+    train, held_out = (
+        replace(experiment(rig, repeats=n, seed=n, rms=rms), rig=stated)
+        for n, rms in ((4, SMALL), (2, 0.7 * SMALL))
+    )
+    candidates = gate_cases.at_joint_2(stated, "dead_volume")
+    result = trace([train], [held_out], candidates, look_ahead=False, free_forms=False)
+    hidden = limit(result, "dead_volume")
+    assert (result.verdict, hidden.at, hidden.parameter) == ("clean", "joint 2 both chambers", "b")
+    assert hidden.size == pytest.approx(half["cap_pipe_volume"], rel=0.3)
+    wrong = abs(result.model_after.parameters["b"].value / TRUTH["b"] - 1.0)
+    assert hidden.shift == pytest.approx(wrong, rel=0.3)
+    (note,) = (n for n in result.notes if "dead_volume" in n)
+    assert "dead_volume at joint 2, both chambers up to" in note
 
 
 def test_a_limit_is_stated_as_the_number_that_a_reader_knows(rig: Rig) -> None:
