@@ -45,7 +45,7 @@ from analysis.trace.judge.curves import (
     rows_within_curves,
 )
 from analysis.trace.judge.inference import with_form_error
-from analysis.trace.judge.rivals import alternatives_of, errors_by_alternatives
+from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives
 from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import phase_notes, unlocked_lines
@@ -79,11 +79,11 @@ from analysis.trace.result import (
     JudgedEffect,
     Trace,
 )
-from analysis.trace.search.hypothesis import Hypothesis, effect_of
+from analysis.trace.search.hypothesis import Hypothesis, effect_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.words import sentence, tolerated_error_notes
-from rig.model.parse import InputError
 from rig.model.records import (
     Record,
     Run,
@@ -264,8 +264,8 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     alternatives = [
         (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
     ]
-    if finding.verdict == UNEXPLAINED and (other := _by_held_out(finding, winner)):
-        alternatives.append((other, ""))
+    if finding.verdict == UNEXPLAINED:
+        alternatives.append((_by_held_out(finding, winner, after), ""))
     by_alternatives = errors_by_alternatives(after, alternatives)
     after = with_errors(after, by_alternatives)
     effects = tuple(
@@ -279,21 +279,25 @@ def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
     return _Fitted(winner, after, effects, tuple(notes), absorbed)
 
 
-def _by_held_out(finding: Finding, winner: Hypothesis) -> Model | None:
-    """Return the model by held-out records of what unexplained residuals may move.
+def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
+    """Return the model with what choosing rows give for parameters that a residual may move.
 
     It has the parameters of the families of rows that keep more than noise: by other motions or on
-    another day an unknown cause moves them otherwise. None where these records are too few to
-    identify a model by themselves.
+    another day an unknown cause moves them otherwise. The rows are fitted, not the records: those
+    would lack the judging blocks, which long filters reach from everywhere.
     """
-    terms, runs = (*finding.rows.train.terms, *winner.effects), finding.rows.unseen.choosing_runs
-    try:
-        model = _identified(runs, terms, finding.rows.filters_like).model
-    except InputError:
-        return None
+    rows = finding.rows.unseen.choosing
+    fit = fit_coefficients(rows, winner.fit.terms)
+    values = parameter_values(rows.rig, fit.terms, dict(fit.beta))
+    relative = {n: d / abs(fit.beta[n]) for n, d in deviations(rows, fit).items() if fit.beta[n]}
     families = set(map(family_of, equations_above_noise(finding.rows, winner)))
     moved = {n for family in families for n in parameters_of(model.rig, model.terms, family)}
-    return replace(model, parameters={n: e for n, e in model.parameters.items() if n in moved})
+    parameters = {
+        n: replace(e, value=values[n], std=relative[n] * abs(values[n]))
+        for n, e in model.parameters.items()
+        if n in moved and n in relative and e.identified
+    }
+    return replace(model, parameters=parameters)
 
 
 def _without_interval(estimate: Estimate) -> Estimate:

@@ -23,6 +23,7 @@ from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search import confounders
 from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 
@@ -125,7 +126,7 @@ def moved_parameter(
     is wider than `TRACE.open_share`: its end farther from the named set's value gives the change.
     '' leaves out none.
     """
-    deviations = _deviations(train_data, rival)
+    known = deviations(train_data, rival.fit)
     most: tuple[str, float] | None = None
     rig = train_data.rig
     left_out = _of_law(rig, law)
@@ -133,9 +134,9 @@ def moved_parameter(
         if c.parameter in left_out:
             continue
         value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
-        if not value or not other or c.parameter not in deviations:
+        if not value or not other or c.parameter not in known:
             continue
-        half_width = IDENTIFY.normal_quantile * deviations[c.parameter]
+        half_width = IDENTIFY.normal_quantile * known[c.parameter]
         if law and half_width > TRACE.open_share * abs(value):
             other += math.copysign(half_width, other - value)
         elif abs(other - value) <= half_width:
@@ -146,14 +147,13 @@ def moved_parameter(
     return most
 
 
-def _deviations(train_data: RegressionData, hypothesis: Hypothesis) -> dict[str, float]:
-    """Return the standard deviations from noise of a set's coefficients, by name.
+def deviations(data: RegressionData, fit: ExactFit) -> dict[str, float]:
+    """Return the standard deviations from noise of a fit's coefficients, by name.
 
     Those that the rows do not determine are left out: the pseudo-inverse gives them less variance
     than 1 / I, with their information I.
     """
-    fit = hypothesis.fit
-    names, covariance = noise_covariance(train_data, fit)
+    names, covariance = noise_covariance(data, fit)
     variance = dict(zip(names, np.diag(covariance).tolist(), strict=True))
     information = zip(fit.beta, np.diag(fit.information).tolist(), strict=True)
     return {n: math.sqrt(variance[n]) for n, known in information if variance[n] * known > 0.5}
