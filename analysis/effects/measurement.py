@@ -34,6 +34,7 @@ from analysis.signals.filters import align
 from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
 from rig.model import channels as ch
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 HYDRAULIC: Final = {"cap": ch.CAP, "rod": ch.ROD, "piston": ch.PISTON, "spool": ch.SPOOL}
 ELECTRIC: Final = {"position": ch.POSITION, "drive": ch.DRIVE}
@@ -329,6 +330,13 @@ class SensorCrosstalk(Sensor):
         places = super().all_places(rig)
         return tuple(place for place in places if place.endswith(("cap", "rod")))
 
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the wrong area of the other chamber that has the same force."""
+        areas = _areas(rig, self.joint)
+        other = "rod" if self.side == "cap" else "cap"
+        ratio = 1.0 + self.shape_of(rig, shape)[0] * areas[self.side] / areas[other]
+        return _same_force(other, ratio)
+
     def shape_names(self) -> tuple[str, ...]:
         """Name the share."""
         return (f"crosstalk_{self.channel}",)
@@ -386,6 +394,12 @@ class SensorGain(Sensor):
         """Return that the flow gains absorb a spool's gain."""
         return "the flow gains absorb a spool's gain completely" if self.side == "spool" else ""
 
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the wrong area of a chamber that has the same force."""
+        if self.side not in ("cap", "rod"):
+            return ""
+        return _same_force(self.side, 1.0 / self.shape_of(rig, shape)[0])
+
     @property
     def _bends(self) -> bool:
         return ch.unit_of(self.channel) == "Pa"
@@ -426,6 +440,21 @@ class SensorGain(Sensor):
         if _bend(shape) and self.channel in out:
             out[self.channel] = _straight(out[self.channel], _bend(shape), rig.supply.pressure)
         return out
+
+
+def _areas(rig: Rig, joint: int) -> dict[str, float]:
+    """Return the areas [m^2] of a joint's cylinder by side."""
+    cylinder = rig.joints[joint].cylinder
+    return {"cap": cylinder.cap_area, "rod": cylinder.rod_area}
+
+
+def _same_force(side: str, ratio: float) -> str:
+    """Say that an area `ratio` times that of the rig file has the force of a sensor's error."""
+    change = f"{plain(100.0 * abs(ratio - 1.0), 2)} % {'larger' if ratio > 1.0 else 'smaller'}"
+    return (
+        f"a {side} area {change} than the rig file's has the same force, and flow gains take up "
+        "most of the rest: measure the cylinder too before the sensor is changed"
+    )
 
 
 @dataclass(frozen=True)
