@@ -183,9 +183,10 @@ class LeakageAlongStroke(_FreeLeakage):
         return knot_shapes(self.shape_names(), "m", *rig.joints[self.joint].position_range)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return knots at quantiles of the piston's position."""
+        """Return knots evenly spread over the piston's travel: wear may be where it is seldom."""
         place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
-        return knot_points(place, np.linspace(1.0 - LAST, LAST, PLACES).tolist())
+        ends = np.quantile(place, (1.0 - LAST, LAST)) if len(place) else place
+        return knot_points(ends, np.linspace(0.0, 1.0, PLACES).tolist())
 
     def _names(self) -> tuple[str, ...]:
         return tuple(f"c_internal_{self.joint + 1}_at_{k}" for k in range(1, PLACES + 1))

@@ -79,11 +79,14 @@ def test_the_largest_changes_are_noted_and_all_are_in_the_result(small: Trace) -
 
 @pytest.mark.slow
 def test_a_special_case_of_a_named_effect_is_none_that_could_hide_beside_it(rig: Rig) -> None:
-    """Friction of one level is part of that of two, and would change both without limit."""
+    """Friction of one level is part of that of two, and would change both without limit.
+
+    What a breakaway beside them would change lies within the intervals.
+    """
     names = ("asymmetric_friction", "coulomb_friction", "stribeck_friction")
     result = gate_cases.traced(rig, pair_of_runs(rig, F_ext=70.0, F_ret=40.0), *names)
     assert [e.name for e in result.effects] == ["asymmetric_friction"]
-    assert [d.name for d in result.detection_limits] == ["stribeck_friction"]
+    assert result.detection_limits == ()
 
 
 def test_a_limit_is_that_of_both_chambers_where_they_hide_more_than_one(rig: Rig) -> None:
