@@ -56,7 +56,7 @@ def streamed(path: str) -> dict[str, Any]:
     R = whole.triangle
     solution = np.linalg.solve(R[:-1, :-1], R[:-1, -1])
     seconds = time.perf_counter() - started
-    return {"seconds": seconds, "peak": _peak_memory(), "rows": whole.rows, "solution": solution}
+    return {"seconds": seconds, "peak": peak_memory(), "rows": whole.rows, "solution": solution}
 
 
 def in_memory(path: str) -> dict[str, Any]:
@@ -67,10 +67,10 @@ def in_memory(path: str) -> dict[str, Any]:
     started = time.perf_counter()
     solution = np.linalg.lstsq(X, y)[0]
     seconds = time.perf_counter() - started
-    return {"seconds": seconds, "peak": _peak_memory(), "rows": len(y), "solution": solution}
+    return {"seconds": seconds, "peak": peak_memory(), "rows": len(y), "solution": solution}
 
 
-def _peak_memory() -> float:
+def peak_memory() -> float:
     """Return the peak memory [B] of this process.
 
     Linux counts the memory of the process that started this one in `ru_maxrss`, but not in the

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import random
-import resource
 import time
 import warnings
 from collections import Counter
@@ -13,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
+from rig.cli.bench.stream import peak_memory
 from tests.studies.fuzz.mutation import damaged
 from tests.studies.fuzz.targets import MAKERS, Target
 
@@ -38,7 +38,7 @@ def cases(
     target: Target, count: int, seed: int, found: FuzzResult, report: Callable[[], None]
 ) -> None:
     """Read `count` damaged examples of a target; notes what may not happen in `found`."""
-    before, said = _size(), time.perf_counter()
+    before, said = peak_memory(), time.perf_counter()
     for number in range(count):
         rng = random.Random(f"{seed} {target.name} {number}")
         data = damaged(rng, rng.choice(target.examples), target.examples)
@@ -54,9 +54,9 @@ def cases(
             found.slowest, found.slowest_case = now - began, number
         found.cases += 1
         if now > said + REPORTED:
-            found.grown, said = max(0.0, _size() - before), now
+            found.grown, said = max(0.0, peak_memory() - before), now
             report()
-    found.grown = max(0.0, _size() - before)
+    found.grown = max(0.0, peak_memory() - before)
     if found.grown > _MEMORY:
         found.wrong[f"grew by {found.grown / 1e6:.0f} MB"] += 1
 
@@ -93,7 +93,3 @@ def _work(key: str, count: int, seed: int, pipe: Connection) -> None:
     found = FuzzResult(target.name)
     cases(target, count, seed, found, lambda: pipe.send((found, False)))
     pipe.send((found, True))
-
-
-def _size() -> float:
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
