@@ -332,10 +332,14 @@ class SensorCrosstalk(Sensor):
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the wrong area of the other chamber that has the same force."""
-        areas = _areas(rig, self.joint)
-        other = "rod" if self.side == "cap" else "cap"
-        ratio = 1.0 + self.shape_of(rig, shape)[0] * areas[self.side] / areas[other]
-        return _same_force(other, ratio)
+        cylinder, other = rig.joints[self.joint].cylinder, self._other
+        areas = getattr(cylinder, f"{self.side}_area") / getattr(cylinder, f"{other}_area")
+        return _same_force(other, 1.0 + self.shape_of(rig, shape)[0] * areas)
+
+    @property
+    def _other(self) -> str:
+        """The other chamber of the cylinder."""
+        return "rod" if self.side == "cap" else "cap"
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the share."""
@@ -347,8 +351,7 @@ class SensorCrosstalk(Sensor):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the other chamber's share from the pressure and its rate."""
-        share, i = self.shape_of(rig, shape)[0], self.joint
-        other = "rod" if self.side == "cap" else "cap"
+        share, i, other = self.shape_of(rig, shape)[0], self.joint, self._other
         new = {}
         for field in ("p", "pd"):
             x = getattr(signals, f"{field}_{self.side}").copy()
@@ -361,7 +364,7 @@ class SensorCrosstalk(Sensor):
     ) -> dict[str, Array]:
         """Return the channels as a correct sensor would have sampled them, each (n,)."""
         out = dict(channels)
-        other = ch.channel(KINDS["rod" if self.side == "cap" else "cap"], self.joint + 1)
+        other = ch.channel(KINDS[self._other], self.joint + 1)
         if self.channel in out and other in out:
             out[self.channel] = out[self.channel] - self.shape_of(rig, shape)[0] * out[other]
         return out
@@ -440,12 +443,6 @@ class SensorGain(Sensor):
         if _bend(shape) and self.channel in out:
             out[self.channel] = _straight(out[self.channel], _bend(shape), rig.supply.pressure)
         return out
-
-
-def _areas(rig: Rig, joint: int) -> dict[str, float]:
-    """Return the areas [m^2] of a joint's cylinder by side."""
-    cylinder = rig.joints[joint].cylinder
-    return {"cap": cylinder.cap_area, "rod": cylinder.rod_area}
 
 
 def _same_force(side: str, ratio: float) -> str:
