@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.effects.measurement import ChannelDelay, SensorLag
+from analysis.effects.measurement_delay import ChannelDelay, SensorLag
 from analysis.effects.valve import SpoolLag
 from analysis.trace import engine, finding
 from analysis.trace.data.candidates import catalogue

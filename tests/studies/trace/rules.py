@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.friction import Friction
-from analysis.effects.measurement import SensorOffset
+from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, in_motion, remaining

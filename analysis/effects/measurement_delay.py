@@ -1,0 +1,118 @@
+"""Errors of measurement in time: a channel's delay and a sensor's lag.
+
+Source: tau y' + y = x(t - delay), the first-order model of a sensor with a delay.
+
+`where` is one channel, as `joint I cap|rod|piston|spool`, of an electric joint `joint I
+position|drive`, and `bench` for the supply pressure; or all channels of a kind, as `bench
+pressure|piston|spool|position|drive` (reported as `bench`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Shape, between_samples, longest_lag
+from analysis.effects.measurement import ELECTRIC, Sensor
+from analysis.signals.conditioning import Signals
+from analysis.signals.filters import align
+from rig.model.rig import Rig
+
+MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
+
+
+@dataclass(frozen=True)
+class Late(Sensor):
+    """Common parts of delays and lags, which may act on all channels of a kind."""
+
+    hydraulic: ClassVar[bool] = False
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return every channel, then all of a kind, where these are several."""
+        kinds: tuple[str, ...] = () if rig.electric else ("pressure",)
+        if len(rig.joints) > 1:
+            kinds = (*kinds, *(ELECTRIC if rig.electric else ("piston", "spool")))
+        return (*super().all_places(rig), *(f"bench {kind}" for kind in kinds))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the delay or time constant [s]."""
+        grid = (5e-4, 2e-3, 8e-3, 3e-2)
+        return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Reject a shape at its bounds, and a delay of an input within its path between samples."""
+        held = not {"spool", "drive"}.isdisjoint((self.side, self.shared))
+        bent = between_samples(rig, self.shape_of(rig, shape)[0]) if held else ""
+        return super().problem(rig, values, shape) or bent
+
+    def plotted(self) -> str:
+        """Name the rate of the channel's quantity."""
+        quantity = super().plotted()
+        return "acceleration" if quantity == "velocity" else f"{quantity} rate"
+
+    def _shown(self, x: Array, rate: float) -> Array:
+        return np.gradient(x[:, self.joint]) * rate
+
+
+@dataclass(frozen=True)
+class ChannelDelay(Late):
+    """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
+
+    name: ClassVar[str] = "channel_delay"
+    exact: ClassVar[bool] = True
+    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
+    variable: ClassVar[str] = "the channel's rate"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "sensor_lag",
+        "spool_lag",
+        "entrained_air",
+        "dead_volume",
+    )
+    separated_by: ClassVar[str] = (
+        "a wide band: a delay turns the phase in proportion to frequency and leaves the amplitude"
+    )
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the delay."""
+        return (f"delay_{self.channel}",)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return x(t + delay)."""
+        return align(x, value * rate)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Advance the channel; the samples that come from beyond the record's end are invalid."""
+        lost = math.ceil(self.shape_of(rig, shape)[0] * signals.rate) + MARGIN
+        valid = signals.valid.copy()
+        valid[len(valid) - lost :] = False
+        return super().prepare(rig, replace(signals, valid=valid), shape)
+
+
+@dataclass(frozen=True)
+class SensorLag(Late):
+    """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter."""
+
+    name: ClassVar[str] = "sensor_lag"
+    amplifies: ClassVar[bool] = True
+    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
+    variable: ClassVar[str] = "the channel's rate"
+    confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "spool_lag", "dead_volume")
+    separated_by: ClassVar[str] = (
+        "a wide band: a lag loses amplitude at high frequencies, a delay only phase"
+    )
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the time constant."""
+        return (f"lag_{self.channel}",)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return x + tau dx/dt."""
+        return np.asarray(x + value * rate * np.gradient(x))
+
+
+TERMS = (ChannelDelay, SensorLag)
