@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,25 +12,21 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, ordered
 from analysis.effects.payload import Payload
 from analysis.identify import checks as ck
-from analysis.identify.coupled import coupled
-from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
 from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.identify.port_flows import with_identified_bulk_modulus
-from analysis.identify.result import Identification, by_geometry
-from analysis.regression.rows import Filtering, default_filtering, parameters_of
-from analysis.simulation.model import Estimate, Model
+from analysis.simulation.model import Model
 from analysis.terms import baseline_of
-from analysis.terms.base import FAMILIES, Used, family_of
+from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.set_aside import refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
-from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
+from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows, unstated_noise
+from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
-    equations_above_noise,
     find,
     fitted_in_motion,
     joints_with_friction,
@@ -44,22 +39,13 @@ from analysis.trace.judge.curves import (
     equations_beyond_curves,
     rows_within_curves,
 )
-from analysis.trace.judge.inference import with_form_error
-from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives
-from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
-from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.judge.unlocked import phase_notes, unlocked_lines
 from analysis.trace.next_experiment.detection_limits import (
-    AbsorbedEffects,
     absorbed_effects,
     detection_limit_notes,
     detection_limits,
 )
 from analysis.trace.next_experiment.proposal import propose
-from analysis.trace.next_experiment.small_effects import (
-    sets_with_small_effect,
-    small_effect_notes,
-)
 from analysis.trace.notes import (
     evidence_notes,
     record_condition_notes,
@@ -76,16 +62,13 @@ from analysis.trace.result import (
     EXPLAINED,
     UNEXPLAINED,
     Gate,
-    JudgedEffect,
     Trace,
 )
-from analysis.trace.search.hypothesis import Hypothesis, effect_of, parameter_values
+from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.records import (
-    Record,
     Run,
     refuse_malformed,
     with_common_bandwidth,
@@ -95,9 +78,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-# Other estimators replace columns where noise in them matters; the trace compares residuals of
-# least squares only, before and after alike.
-ESTIMATOR = "ls"
 # Share of the work done after each stage, as measured on six records: reported as progress.
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
 
@@ -213,7 +193,7 @@ def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
     as_recorded = trace_rows(rig, terms, records)
     records, rows = _without_unlocked_lines(rig, terms, records, as_recorded)
     moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
-    baseline = _identified(records.train, rows.train.terms)
+    baseline = identified(records.train, rows.train.terms)
     notes = (
         *undetermined_notes(baseline.model),
         *(check.detail for check in baseline.checks if check.name == GEOMETRY),
@@ -226,112 +206,27 @@ def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Fitted:
-    """The set of effects with the shapes that are used, and the model with them.
-
-    `effects` are those named, with intervals that hold every error; `notes` state what widens
-    intervals. `absorbed` are further effects beside the set that was found, unless it explains
-    nothing.
-    """
-
-    winner: Hypothesis
-    model: Model
-    effects: tuple[JudgedEffect, ...]
-    notes: tuple[str, ...]
-    absorbed: AbsorbedEffects | None
-
-
-def _fitted(prepared: _Prepared, finding: Finding) -> _Fitted:
-    """Identify the model with the effects found, hidden states by multiple shooting."""
-    runs, before, rows = prepared.records.train, prepared.baseline, finding.rows
-    winner = finding.winner
-    after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
-    shooting = shoot_hidden_states(
-        runs, prepared.rows.unseen.choosing_runs, after, rows.train, rows.unseen.choosing, winner
-    )
-    if shooting.winner is not winner:
-        winner = shooting.winner
-        after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
-    others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
-    absorbed = None
-    if finding.verdict != UNEXPLAINED:
-        absorbed = absorbed_effects(finding.hypotheses, prepared.candidates, finding.winner)
-    larger = sets_with_small_effect(
-        finding.hypotheses, absorbed, finding.winner, rows.unseen.choosing
-    )
-    others += [(hypothesis, "") for hypothesis, _ in larger]
-    alternatives = [
-        (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
-    ]
-    if finding.verdict == UNEXPLAINED:
-        alternatives.append((_by_held_out(finding, winner, after), ""))
-    by_alternatives = errors_by_alternatives(after, alternatives)
-    after = with_errors(after, by_alternatives)
-    effects = tuple(
-        with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shooting.shots)
-        for f in finding.named
-    )
-    after = with_effect_values(after, effects)
-    shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
-    after = replace(after, parameters={**after.parameters, **shared})
-    notes = small_effect_notes(finding.winner, larger)
-    return _Fitted(winner, after, effects, tuple(notes), absorbed)
-
-
-def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
-    """Return the model with what choosing rows give for parameters that a residual may move.
-
-    It has the parameters of the families of rows that keep more than noise: by other motions or on
-    another day an unknown cause moves them otherwise. The rows are fitted, not the records: those
-    would lack the judging blocks, which long filters reach from everywhere.
-    """
-    rows = finding.rows.unseen.choosing
-    fit = fit_coefficients(rows, winner.fit.terms)
-    values = parameter_values(rows.rig, fit.terms, dict(fit.beta))
-    relative = {n: d / abs(fit.beta[n]) for n, d in deviations(rows, fit).items() if fit.beta[n]}
-    families = set(map(family_of, equations_above_noise(finding.rows, winner)))
-    moved = {n for family in families for n in parameters_of(model.rig, model.terms, family)}
-    parameters = {
-        n: replace(e, value=values[n], std=relative[n] * abs(values[n]))
-        for n, e in model.parameters.items()
-        if n in moved and n in relative and e.identified
-    }
-    return replace(model, parameters=parameters)
-
-
-def _without_interval(estimate: Estimate) -> Estimate:
-    return replace(estimate, std=math.nan, ci95=(math.nan, math.nan))
-
-
 def _with_free_runs(
     prepared: _Prepared, records: TraceRuns, finding: Finding
-) -> tuple[Finding, _Fitted, tuple[held_out.FreeRunErrors, held_out.FreeRunErrors]]:
+) -> tuple[Finding, FittedModel, tuple[held_out.FreeRunErrors, held_out.FreeRunErrors]]:
     """Return the finding, its model and the free runs of unseen records before and after.
 
     Effects with which the free run fails or is far worse than without them are not named. A free
     run with parameters of the model without them (`held_out.completed`) is no evidence against it.
     """
     unseen, before = [*records.holdout, *records.judge], prepared.baseline
-    fitted = _fitted(prepared, finding)
+
+    def fit(finding: Finding) -> FittedModel:
+        choosing = prepared.rows.unseen.choosing_runs
+        return model_with_effects(prepared.records, choosing, before, prepared.candidates, finding)
+
+    fitted = fit(finding)
     simulated = held_out.completed(fitted.model, before)
     first, last = held_out.free_runs(unseen, before, simulated)
     if simulated is fitted.model and (worse := held_out.worse_free_run(first, last)):
         finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
-        fitted, last = _fitted(prepared, finding), first
+        fitted, last = fit(finding), first
     return finding, fitted, (first, last)
-
-
-def with_effect_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:
-    """Return the model with a value for each number of the effects that it lacks.
-
-    The records determine a curve as a whole, even where one of its values is mostly noise, and a
-    level beside others; without that value the model could not be simulated. It is the effect's,
-    with its interval.
-    """
-    known = {n: e for f in effects for n, e in f.parameters.items()}
-    parameters = {n: e if e.identified else known.get(n, e) for n, e in model.parameters.items()}
-    return replace(model, parameters=parameters)
 
 
 def _traced(
@@ -495,48 +390,3 @@ def _not_in_model(
     in_model = {(u.term.name, u.term.where) for u in known}
     fresh = [c for c in candidates if (c.name, c.where) not in in_model]
     return [c for c in fresh if c.least_joints <= moving]
-
-
-def _identified_with_effects(
-    runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows
-) -> tuple[Model, dict[str, float]]:
-    """Return the model identified together with the effects of a set, and errors by tolerance.
-
-    Its intervals include the uncertainty of shapes and forms. The second value is the part of each
-    standard error that the tolerances of the rig's geometry make, by parameter name.
-    """
-    if not winner.effects:
-        return before, {}
-    train_data = rows.train
-    found = _identified(runs, (*train_data.terms, *winner.effects), rows.filters_like)
-    shift = form_shift(train_data, winner.fit)
-    model = with_form_errors(train_data, winner.fit, found.model, shift)
-    return at_nominal_temperature(model), by_geometry(found)
-
-
-def _identified(
-    runs: Sequence[Run],
-    terms: Sequence[Used],
-    changed: Callable[[Filtering], Filtering] = lambda filtering: filtering,
-) -> Identification:
-    """Return a model's identified parameters.
-
-    Temperature and spool path are left out of `terms`: the estimator fits them itself. `changed`
-    returns the filters of a record in place of the default ones.
-    """
-    nuisances = (BulkTemperature, DrivePath, SpoolPath)
-    kept = ordered([u for u in terms if not isinstance(u.term, nuisances)])
-
-    def filtering(record: Record) -> Filtering:
-        return changed(default_filtering(record))
-
-    return coupled(runs, kept, filtering, estimator=ESTIMATOR)
-
-
-def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> JudgedEffect:
-    """Return an effect whose intervals include further standard errors, by parameter name."""
-    parameters = {
-        name: with_form_error(estimate, math.hypot(*(e.get(name, 0.0) for e in errors)))
-        for name, estimate in effect.parameters.items()
-    }
-    return replace(effect, parameters=parameters)

@@ -15,7 +15,8 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import free_mechanisms
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
-from analysis.trace.engine import judging_rows_above_band, with_effect_values
+from analysis.trace.engine import judging_rows_above_band
+from analysis.trace.fitted_model import with_effect_values
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
 from analysis.trace.judge.gates import held_out_above_band
 from analysis.trace.result import JudgedEffect

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from typing import Any, Final
 
-from analysis.trace import engine, finding
+from analysis.trace import engine, finding, fitted_model
 from analysis.trace.judge import held_out
 from analysis.trace.judge.shooting import ShootingResult
 from analysis.trace.result import Trace
@@ -92,16 +92,16 @@ def decisions_only(kept: Kept) -> Iterator[None]:
         ),
         (finding, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
         (engine, "with_identified_bulk_modulus", lambda runs, *_: tuple(map(id, runs))),
-        (engine, "coupled", lambda runs, *_, **k: tuple(map(id, runs))),
+        (fitted_model, "coupled", lambda runs, *_, **k: tuple(map(id, runs))),
         (hypothesis_set, "refine", lambda data, terms, *_: (id(data), terms)),
         (hypothesis_set, "rebased", lambda data, model: (id(data), id(model))),
         (hypothesis_set, "variant_columns", lambda data, chosen, *_: (id(data), tuple(chosen))),
     )
     changes = (
         *((module, name, kept(getattr(module, name), key)) for module, name, key in remembered),
-        (engine, "_identified_with_effects", lambda runs, winner, before, *_: (before, {})),
+        (fitted_model, "_identified_with_effects", lambda runs, winner, before, *_: (before, {})),
         (
-            engine,
+            fitted_model,
             "shoot_hidden_states",
             lambda runs, holdout, after, train, judged, one: ShootingResult(one, ()),
         ),

@@ -19,7 +19,7 @@ from analysis.effects.friction import Friction
 from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
-from analysis.trace import engine, finding, in_motion, remaining
+from analysis.trace import engine, finding, fitted_model, in_motion, remaining
 from analysis.trace.data import noise_floor, regression_data
 from analysis.trace.judge import gates, held_out, inference, removal, rivals
 from analysis.trace.search import confounders, hypothesis_set, linear_fit
@@ -138,7 +138,7 @@ RULES: Final = (
     Rule("two in place of one", "two effects are no rival of one",
          ((rivals, "_tied_composites", lambda *_: iter(())),)),
     Rule("small effects", "an effect too small to be named widens no interval",
-         ((engine, "sets_with_small_effect", lambda *_: []),)),
+         ((fitted_model, "sets_with_small_effect", lambda *_: []),)),
     Rule("open parameters", "a richer name that leaves another parameter open is no rival",
          (setting("open_share", math.inf),)),
     Rule("free run", "the held-out free run may fail with the effects or be far worse",

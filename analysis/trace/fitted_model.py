@@ -1,0 +1,177 @@
+"""The model with the effects that a trace found, and the intervals of its parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from analysis.effects.base import Effect, ordered
+from analysis.identify.coupled import coupled
+from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
+from analysis.identify.result import Identification, by_geometry
+from analysis.regression.rows import Filtering, default_filtering, parameters_of
+from analysis.simulation.model import Estimate, Model
+from analysis.terms.base import Used, family_of
+from analysis.trace.data.temperature_nuisance import at_nominal_temperature
+from analysis.trace.finding import Finding, TraceRows, TraceRuns
+from analysis.trace.in_motion import equations_above_noise
+from analysis.trace.judge.inference import with_form_error
+from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives
+from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
+from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
+from analysis.trace.next_experiment.detection_limits import AbsorbedEffects, absorbed_effects
+from analysis.trace.next_experiment.small_effects import sets_with_small_effect, small_effect_notes
+from analysis.trace.notes import shared_parameters
+from analysis.trace.result import UNEXPLAINED, JudgedEffect
+from analysis.trace.search.hypothesis import Hypothesis, parameter_values
+from analysis.trace.search.refinement import fit_coefficients
+from rig.model.records import Record, Run
+
+# Other estimators replace columns where noise in them matters; the trace compares residuals of
+# least squares only, before and after alike.
+ESTIMATOR = "ls"
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """The set of effects with the shapes that are used, and the model with them.
+
+    `effects` are those named, with intervals that hold every error; `notes` state what widens
+    intervals. `absorbed` are further effects beside the set that was found, unless it explains
+    nothing.
+    """
+
+    winner: Hypothesis
+    model: Model
+    effects: tuple[JudgedEffect, ...]
+    notes: tuple[str, ...]
+    absorbed: AbsorbedEffects | None
+
+
+def model_with_effects(
+    records: TraceRuns,
+    choosing_runs: Sequence[Run],
+    before: Model,
+    candidates: Sequence[Effect],
+    finding: Finding,
+) -> FittedModel:
+    """Identify the model with the effects found, hidden states by multiple shooting.
+
+    `before` is the baseline's model, `choosing_runs` and `candidates` are those of the search.
+    """
+    runs, rows = records.train, finding.rows
+    winner = finding.winner
+    after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    shooting = shoot_hidden_states(
+        runs, choosing_runs, after, rows.train, rows.unseen.choosing, winner
+    )
+    if shooting.winner is not winner:
+        winner = shooting.winner
+        after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
+    absorbed = None
+    if finding.verdict != UNEXPLAINED:
+        absorbed = absorbed_effects(finding.hypotheses, candidates, finding.winner)
+    larger = sets_with_small_effect(
+        finding.hypotheses, absorbed, finding.winner, rows.unseen.choosing
+    )
+    others += [(hypothesis, "") for hypothesis, _ in larger]
+    alternatives = [
+        (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
+    ]
+    if finding.verdict == UNEXPLAINED:
+        alternatives.append((_by_held_out(finding, winner, after), ""))
+    by_alternatives = errors_by_alternatives(after, alternatives)
+    after = with_errors(after, by_alternatives)
+    effects = tuple(
+        with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shooting.shots)
+        for f in finding.named
+    )
+    after = with_effect_values(after, effects)
+    shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
+    after = replace(after, parameters={**after.parameters, **shared})
+    notes = small_effect_notes(finding.winner, larger)
+    return FittedModel(winner, after, effects, tuple(notes), absorbed)
+
+
+def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
+    """Return the model with what choosing rows give for parameters that a residual may move.
+
+    It has the parameters of the families of rows that keep more than noise: by other motions or on
+    another day an unknown cause moves them otherwise. The rows are fitted, not the records: those
+    would lack the judging blocks, which long filters reach from everywhere.
+    """
+    rows = finding.rows.unseen.choosing
+    fit = fit_coefficients(rows, winner.fit.terms)
+    values = parameter_values(rows.rig, fit.terms, dict(fit.beta))
+    relative = {n: d / abs(fit.beta[n]) for n, d in deviations(rows, fit).items() if fit.beta[n]}
+    families = set(map(family_of, equations_above_noise(finding.rows, winner)))
+    moved = {n for family in families for n in parameters_of(model.rig, model.terms, family)}
+    parameters = {
+        n: replace(e, value=values[n], std=relative[n] * abs(values[n]))
+        for n, e in model.parameters.items()
+        if n in moved and n in relative and e.identified
+    }
+    return replace(model, parameters=parameters)
+
+
+def _without_interval(estimate: Estimate) -> Estimate:
+    return replace(estimate, std=math.nan, ci95=(math.nan, math.nan))
+
+
+def with_effect_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:
+    """Return the model with a value for each number of the effects that it lacks.
+
+    The records determine a curve as a whole, even where one of its values is mostly noise, and a
+    level beside others; without that value the model could not be simulated. It is the effect's,
+    with its interval.
+    """
+    known = {n: e for f in effects for n, e in f.parameters.items()}
+    parameters = {n: e if e.identified else known.get(n, e) for n, e in model.parameters.items()}
+    return replace(model, parameters=parameters)
+
+
+def _identified_with_effects(
+    runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows
+) -> tuple[Model, dict[str, float]]:
+    """Return the model identified together with the effects of a set, and errors by tolerance.
+
+    Its intervals include the uncertainty of shapes and forms. The second value is the part of each
+    standard error that the tolerances of the rig's geometry make, by parameter name.
+    """
+    if not winner.effects:
+        return before, {}
+    train_data = rows.train
+    found = identified(runs, (*train_data.terms, *winner.effects), rows.filters_like)
+    shift = form_shift(train_data, winner.fit)
+    model = with_form_errors(train_data, winner.fit, found.model, shift)
+    return at_nominal_temperature(model), by_geometry(found)
+
+
+def identified(
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    changed: Callable[[Filtering], Filtering] = lambda filtering: filtering,
+) -> Identification:
+    """Return a model's identified parameters.
+
+    Temperature and spool path are left out of `terms`: the estimator fits them itself. `changed`
+    returns the filters of a record in place of the default ones.
+    """
+    nuisances = (BulkTemperature, DrivePath, SpoolPath)
+    kept = ordered([u for u in terms if not isinstance(u.term, nuisances)])
+
+    def filtering(record: Record) -> Filtering:
+        return changed(default_filtering(record))
+
+    return coupled(runs, kept, filtering, estimator=ESTIMATOR)
+
+
+def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> JudgedEffect:
+    """Return an effect whose intervals include further standard errors, by parameter name."""
+    parameters = {
+        name: with_form_error(estimate, math.hypot(*(e.get(name, 0.0) for e in errors)))
+        for name, estimate in effect.parameters.items()
+    }
+    return replace(effect, parameters=parameters)
