@@ -1,9 +1,10 @@
 """Stored state of a bench: its latched trip, cleared trips, and the process that runs it.
 
 A bench is identified by its endpoint, not by the rig's name. Each has a folder in `state_folder`:
-`trip.json` while a trip is latched, `resets.jsonl` with every cleared trip, `session.json` while
-a process of this computer uses the bench, and `lock`, which that process has locked. A bench with
-two addresses has two folders; the trip latched in the device itself covers that case.
+`trip.json` while a trip is latched and `rig.yaml` with the description of the rig that tripped,
+`resets.jsonl` with every cleared trip, `session.json` while a process of this computer uses the
+bench, and `lock`, which that process has locked. A bench with two addresses has two folders; the
+trip latched in the device itself covers that case.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ from rig.model.rig import Rig
 from rig.model.trips import Latched, RecordingFailed
 from rig.runs import runstate
 from rig.runs.files import replace_text, sync_to_disk
+from rig.runs.store import description_of
 
 log = logging.getLogger(__name__)
 
 STATE_VARIABLE: Final = "BRAMAH_STATE"
 _TRIP, _RESETS, _SESSION, _LOCK = "trip.json", "resets.jsonl", "session.json", "lock"
+_RIG: Final = "rig.yaml"
 _THIS_COMPUTER = frozenset({"localhost", "[::1]"})
 _UNREADABLE: Final = "unknown"
 
@@ -80,13 +83,13 @@ def _load_trip(path: Path) -> LatchedTrip:
     return LatchedTrip(**{key: str(stored[key]) for key in LatchedTrip.__annotations__})
 
 
-def tripped_run(rig: str) -> Path | None:
-    """Return the folder of the run in which a bench of the named rig tripped, not reset since."""
+def tripped_rig(rig: str) -> Path | None:
+    """Return the description of a bench that tripped and is not reset, by the name in its file."""
     for path in sorted(state_folder().glob(f"*/{_TRIP}")):
         with suppress(OSError, ValueError, KeyError, TypeError):
-            trip = _load_trip(path)
-            if trip.rig == rig and trip.run:
-                return Path(trip.run)
+            described = path.with_name(_RIG)
+            if _load_trip(path).rig == rig and described.is_file():
+                return described
     return None
 
 
@@ -144,6 +147,8 @@ class BenchState:
         except OSError as error:
             log.error("%s: the trip could not be latched here: %s", self.folder, error)
             return False
+        with suppress(OSError):  # only a convenience: a reset without the rig's file
+            replace_text(self.folder / _RIG, description_of(rig))
         return True
 
     def refuse_if_tripped(self, rig: Rig) -> None:
@@ -177,7 +182,8 @@ class BenchState:
             os.fsync(stream.fileno())
         if trip is not None:
             _note_in_run(trip, entry)
-        (self.folder / _TRIP).unlink(missing_ok=True)
+        for name in (_TRIP, _RIG):
+            (self.folder / name).unlink(missing_ok=True)
         sync_to_disk(self.folder)
         return trip
 

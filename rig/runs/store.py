@@ -64,6 +64,12 @@ class Header(BaseModel):
     protocol: dict[str, Any] | None = None
 
 
+def description_of(rig: Rig) -> str:
+    """Return the head of a run, as text, with a rig alone: `rig.runs.rigs.load_rig` reads it."""
+    head = Header(format=_FORMAT, created=utc_now(), rig=rig)
+    return yaml.safe_dump(head.model_dump(mode="json"), sort_keys=False)
+
+
 def refuse_occupied(folder: Path) -> None:
     """Raise InputError unless `folder` is new or an empty folder."""
     try:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from drivers.base import DeviceBusy, DeviceInfo, DeviceLost, SampleBlock
-from rig.bench.latch import BenchState, Holder, reset_bench, state_folder
+from rig.bench.latch import BenchState, Holder, reset_bench, state_folder, tripped_rig
 from rig.bench.session import Bench
 from rig.model.parse import InputError
 from rig.model.trips import Latched, SafetyTrip
@@ -64,6 +64,19 @@ def test_a_reset_keeps_who_when_why_and_which_trip(tripped: Path, state: Path) -
     assert (last["event"], last["reason"]) == ("trip cleared", "sensor 1 replaced")
     with Bench(RIG, FakeDriver(RIG)) as bench:
         bench.exchange()
+
+
+def test_a_rig_that_tripped_without_a_run_folder_is_known_by_the_name_in_its_file() -> None:
+    """A manual session records nothing; a message states the name, not the path, of a rig file."""
+    own = RIG.model_copy(update={"name": "my-bench"})
+    with pytest.raises(SafetyTrip), Bench(own, FakeDriver(own, spoil=too_much)) as bench:
+        bench.exchange()
+    described = tripped_rig("my-bench")
+    assert described is not None
+    assert load_rig(described) == own
+    assert tripped_rig("another-bench") is None
+    reset_bench(own, FakeDriver(own), "sensor 1 replaced")
+    assert tripped_rig("my-bench") is None
 
 
 @pytest.mark.parametrize("reason", ["", "  "])

@@ -199,7 +199,7 @@ async def test_after_a_trip_the_first_cause_is_acknowledged_and_then_reset_with_
         await shown.said("reset: cleared")
         asked = json.loads(bramah.read_text())
         assert asked[:2] == ["reset", "--rig"]
-        assert asked[3:] == ["--reason", "hose off"]
+        assert asked[3:] == ["--endpoint", "modbus-tcp://127.0.0.1:5020", "--reason", "hose off"]
         assert "LATCHED" not in shown.text
         assert "▲ ACTIVE UNACK  spool" in shown.text, "what followed still stands"
 

@@ -15,7 +15,7 @@ from protocols.engine.run_inputs import RunInputs
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
-from rig.bench.latch import reset_bench, tripped_run
+from rig.bench.latch import reset_bench, tripped_rig
 from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
@@ -29,7 +29,6 @@ from rig.cli.text.output import Countdown, clock_text
 from rig.cli.text.sheets import plan_text
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.runs import runstate
 from rig.runs.recorder import Recorder
 from rig.runs.store import refuse_occupied
 
@@ -166,14 +165,14 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
 def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
     """Clear a bench's latched trip for a person's `reason`; return the cause of the trip.
 
-    `rig` may be the name in a rig file too, as messages on a trip state it: the rig is then that of
-    the run that tripped.
+    `rig` may be the name in a rig file too, as messages on a trip state it: the rig is then that
+    with which the bench tripped.
     """
     try:
         described, driver = device_of(rig, endpoint)
     except InputError:
-        run = tripped_run(rig)
-        if run is None:
+        tripped = tripped_rig(rig)
+        if tripped is None:
             raise
-        described, driver = device_of(str(run / runstate.HEADER), endpoint)
+        described, driver = device_of(str(tripped), endpoint)
     return reset_bench(described, driver, reason)

@@ -212,7 +212,8 @@ class Commands:
                 self.remark = f"reset: {job.ended}"
             self.redraw()
 
-        self.start(("reset", "--rig", rig, "--reason", reason.strip()), changed)
+        wire = ("--endpoint", snapshot.wire) if snapshot.wire else ()
+        self.start(("reset", "--rig", rig, *wire, "--reason", reason.strip()), changed)
 
     def start(self, words: tuple[str, ...], changed: Callable[[VerbJob], None]) -> None:
         """Start a verb in a separate process."""
