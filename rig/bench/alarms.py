@@ -16,6 +16,8 @@ from rig.model.trips import Violation, describe
 
 log = logging.getLogger(__name__)
 
+_OF_EVENTS = frozenset({"tick", "time"})  # of an alarm: every event has its own, `t` and the date
+
 OnEvent = Callable[[str, int | None, Mapping[str, Any]], None]
 
 
@@ -78,7 +80,7 @@ class AlarmLog:
         )
         if not alarm.trips:
             log.warning("warning: %s", alarm.sentence)
-        about = {k: v for k, v in asdict(now).items() if k != "tick"}
+        about = {k: v for k, v in asdict(now).items() if k not in _OF_EVENTS}
         self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **about})
         return alarm.key
 

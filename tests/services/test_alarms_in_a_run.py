@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -147,8 +148,10 @@ def test_a_warning_that_comes_again_is_written_down_with_its_present_value(tmp_p
     first, again = [
         e for e in read_events(run) if e["event"] == "alarm" and e["check"] == "pressure"
     ]
-    assert (first["value"], first["time"], first["count"]) == (8.5e6, 0.35, 1)
-    assert (again["value"], again["time"], again["count"]) == (8.7e6, 2.35, 2)
+    assert (first["value"], first["t"], first["count"]) == (8.5e6, 0.35, 1)
+    assert (again["value"], again["t"], again["count"]) == (8.7e6, 2.35, 2)
+    for event in read_events(run):
+        assert datetime.fromisoformat(event["time"]).tzinfo is not None
     assert "8.7 MPa at 2.3500 s" in again["sentence"]
     assert (again["tick"], again["state"]) == (2350, "active")
 
