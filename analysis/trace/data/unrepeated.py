@@ -8,6 +8,7 @@ frequency, `judge.unlocked` names it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from analysis.trace.settings import DATA
 from rig.model.units import plain
 
 Array = NDArray[np.float64]
+# Determinant of sine and cosine over that of orthogonal ones, times 4, below which they are one.
+SAME_COLUMN: Final = 1e-6
 
 
 def unrepeated_notes(data: RegressionData) -> list[str]:
@@ -106,4 +109,8 @@ def _sine_energy(time: Array, series: Array, frequency: Array) -> Array:
     cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
     a, b = series @ c, series @ s
     fitted = (ss * a * a - 2 * cs * a * b + cc * b * b).sum(axis=0)
-    return np.asarray(fitted / (cc * ss - cs * cs))
+    both = cc * ss - cs * cs
+    # Of instants at half the sampling rate or a multiple, sine and cosine are one column.
+    one = both < SAME_COLUMN * (cc + ss) ** 2
+    single = (a * a + b * b).sum(axis=0) / (cc + ss)
+    return np.asarray(np.where(one, single, fitted / np.where(one, 1.0, both)))

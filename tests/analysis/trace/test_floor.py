@@ -325,3 +325,13 @@ def test_the_frequency_of_a_scatter_is_where_another_library_finds_its_energy() 
     power = sum(lombscargle(time, r, 2 * np.pi * near, normalize=True) * (r @ r) for r in series)
     assert found == pytest.approx(near[np.argmax(power)], abs=1e-3)
     assert share == pytest.approx(np.max(power) / np.sum(series**2), rel=1e-6)
+
+
+def test_half_the_rate_of_the_instants_is_no_frequency_of_a_scatter() -> None:
+    """There a sine and a cosine are one column, and whatever they fit is rounding."""
+    rng = np.random.default_rng(4)
+    time = 0.369 + 0.021 * np.arange(442)
+    series = np.sin(2 * np.pi * 5.35 * time + rng.uniform(0, 6, (3, 1))) + rng.normal(size=(3, 442))
+    found, share = dominant_frequency([(time, series)])
+    assert found == pytest.approx(5.35, abs=0.01)
+    assert 0.2 < share < 0.5  # a sine of amplitude 1 in noise of deviation 1: a third
