@@ -331,13 +331,13 @@ def judge_winner(
     """Judge the set that the search has found, and try free forms where it does not explain.
 
     Its effects are judged under the simplest names that fit, and where these do not explain, under
-    the names found: of a breakaway the level alone is not the same at all speeds.
+    other names of their laws (`_under_other_names`).
     """
     simplest = readings.best_readings(hypotheses, winner, holdout_data)
     found = _apply_gates(hypotheses, simplest, holdout_data, rng)
-    if found.verdict == UNEXPLAINED and simplest.keys != winner.keys:
-        as_found = _apply_gates(hypotheses, winner, holdout_data, rng)
-        found = as_found if as_found.verdict != UNEXPLAINED else found
+    if found.verdict == UNEXPLAINED:
+        other = _under_other_names(hypotheses, winner, simplest, holdout_data, rng)
+        found = found if other is None else other
     if found.verdict == CONFOUNDED:
         found = _with_best_tied_set(found, holdout_data, rng)
     by_free_form = _try_free_forms(found, free, holdout_data, rng)
@@ -347,6 +347,25 @@ def judge_winner(
         unphysical = _refused_as_unphysical(hypotheses, holdout_data, rng)
         return replace(found, effects=(*found.effects, *unphysical))
     return found
+
+
+def _under_other_names(
+    hypotheses: HypothesisSet, winner: Hypothesis, simplest: Hypothesis,
+    holdout_data: RegressionData, rng: np.random.Generator,
+) -> Judgement | None:  # fmt: skip
+    """Return an explanation by other names of the laws of a set, None if there is none.
+
+    They are those that the search found, then both parts of a law of which one was refused: of a
+    breakaway the level alone is not the same at all speeds, nor is a breakaway that stands for a
+    level too.
+    """
+    parts = map(hypotheses.refined, hypotheses.with_parts_beside(simplest))
+    for other in (winner, *sorted(parts, key=lambda o: o.total)):
+        if other.keys != simplest.keys:
+            found = _apply_gates(hypotheses, other, holdout_data, rng)
+            if found.verdict != UNEXPLAINED:
+                return found
+    return None
 
 
 def _with_best_tied_set(

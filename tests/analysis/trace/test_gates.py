@@ -101,7 +101,7 @@ def test_a_further_effect_that_takes_all_that_is_left_is_named_although_it_ties(
         assert {e.name for e in effects} == names
 
 
-def test_names_as_found_are_judged_where_simpler_ones_do_not_explain(
+def test_both_parts_of_a_law_are_judged_where_one_does_not_explain(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Friction with a large breakaway: its level alone varies with speed."""
@@ -115,5 +115,7 @@ def test_names_as_found_are_judged_where_simpler_ones_do_not_explain(
         rng = np.random.default_rng(0)
         return finding.judge_winner(s.hypotheses, found, (), s.holdout_data, rng)
 
+    for found in (level, both):
+        assert {e.name for e in judged(found).effects} == set(names)
+    monkeypatch.setattr(finding, "_under_other_names", lambda *_: None)
     assert judged(level).verdict == "unexplained"
-    assert {e.name for e in judged(both).effects} == set(names)
