@@ -92,7 +92,7 @@ def judge_effects(
         changes = removal.removed_energy(winner, alternative)
         tie_test = rivals.TieTest(holdout_data, changes, after, without)
         others = rivals.rivals_of(hypotheses, winner, used, alternative, holdout_data, tie_test)
-        removed = removal.removed_share(holdout_data, changes, without, after)
+        removed = removal.removal_of(holdout_data, changes, without, after)
         disturbed = {
             *removal.disturbed_equations(hypotheses, winner, alternative),
             *removal.disturbed_in_held_out(holdout_data, before, without, after),
@@ -111,7 +111,7 @@ def judge_effects(
         gates = (
             Gate(
                 REMOVES,
-                removed >= TRACE.least_removed and not disturbed,
+                removed.share >= TRACE.least_removed and not disturbed,
                 removal.removal_in_words(removed, disturbed),
             ),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
@@ -134,7 +134,7 @@ def judge_effects(
                 rivals.place_of(used.term),
                 {n: e for n, e in estimates.items() if n not in train_data.beta},
                 p,
-                removed,
+                removed.share,
                 (*inseparable, *others),
                 gates,
                 used.term.variable_on(train_data.rig),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,32 +60,56 @@ def disturbed_in_held_out(
     ]
 
 
-def removal_in_words(removed: float, disturbed: Collection[str]) -> str:
+class Removal(NamedTuple):
+    """The share of held-out energy that an effect removes; `in_noise`: noise hides that energy."""
+
+    share: float
+    in_noise: bool
+
+
+def removal_in_words(removed: Removal, disturbed: Collection[str]) -> str:
     """Say which share of the energy an effect removes, and the equations that it disturbs."""
-    text = f"{100 * removed:.0f} % of the energy above noise"
+    text = f"{100 * removed.share:.0f} % of the energy above noise"
+    if removed.in_noise:
+        text = f"{100 * removed.share:.0f} % of what it would change, less than the noise"
     if not disturbed:
         return text
     equations = " ".join(sorted(disturbed))
     return f"{text}, but the residual of {equations} is larger than under the baseline"
 
 
-def removed_share(
+def removal_of(
     holdout_data: RegressionData, changes: Mapping[str, float], without: Array, after: Array
-) -> float:
-    """Return the share of held-out energy above noise that an effect removes.
+) -> Removal:
+    """Return what an effect removes of the held-out energy above noise.
 
     It is the mean over equations, weighted by the training energy that the effect removes in each
     (`changes`): an error of the baseline in another equation does not count against the effect.
+    Where the held-out rows of an equation (`without` and with the effect, `after`: (M,), whitened)
+    have no more energy than noise, the share is that of the effect's change which they show;
+    equations where that change would not show are left out.
     """
     before, now = energy_above_noise(holdout_data, without), energy_above_noise(holdout_data, after)
-    weights = {e: v for e, v in changes.items() if before.get(e, 0.0) > 0.0}
-    total = sum(weights.values())
-    if total <= 0.0:
-        return 0.0
-    return (
-        sum(weight * max(-1.0, 1.0 - max(0.0, now[e]) / before[e]) for e, weight in weights.items())
-        / total
-    )
+    shares, above = {}, set()
+    for equation in before.keys() & changes.keys():
+        rows = _rows_of(holdout_data, equation)
+        change = without[rows] - after[rows]
+        size = float(np.linalg.norm(change))
+        if before[equation] > TRACE.standard_errors * np.sqrt(2.0 * len(rows)):
+            above.add(equation)
+            shares[equation] = max(-1.0, 1.0 - max(0.0, now[equation]) / before[equation])
+        elif size > 2.0 * TRACE.standard_errors:
+            # 1 on average if the effect is right, 0 if there is none; the noise makes it 1 / size.
+            shares[equation] = float(np.clip(without[rows] @ change / size**2, -1.0, 1.0))
+    total = sum(changes[e] for e in shares)
+    share = sum(changes[e] * v for e, v in shares.items()) / total if total > 0.0 else 0.0
+    return Removal(share, bool(shares) and not above)
+
+
+def _rows_of(data: RegressionData, equation: str) -> NDArray[np.int64]:
+    """Return the numbers (m,) of an equation's rows."""
+    parts = [s.where for s in data.segments if s.equation == equation]
+    return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
 
 def rms_in(data: RegressionData, residual: Array, equations: Collection[str]) -> float:

@@ -79,6 +79,34 @@ def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect
     assert removal.disturbed_in_held_out(rows, good, good, good) == []
 
 
+@pytest.mark.parametrize(
+    ("size", "removed", "in_noise"),
+    [(3.0, 1.0, False), (0.8, 1.0, True), (0.02, 0.0, False)],
+    ids=["above the noise", "below it, seen along the change", "not seen at all"],
+)
+def test_an_effect_that_held_out_rows_hardly_show_is_judged_by_its_change_of_them(
+    rig: Rig, size: float, removed: float, in_noise: bool
+) -> None:
+    """A sine in noise, and noise alone, each with an effect that is that sine.
+
+    In each equation the noise has the energy of its rows and none along the sine.
+    """
+    s = gate_cases.searched(rig, *pair_of_runs(rig, c_internal=LEAK), "internal_leakage")
+    rows = s.holdout_data
+    noise = np.random.default_rng(8).normal(size=len(rows.mean_residual))
+    cause = size * np.sin(np.arange(len(noise)) / 7.0)
+    for where in (segment.where for segment in rows.segments):
+        sine = cause[where]
+        apart = noise[where] - sine * (noise[where] @ sine) / (sine @ sine)
+        noise[where] = apart * np.sqrt(len(apart) / (apart @ apart))
+    changes = {s.equation: 100.0 for s in rows.segments}
+    right = removal.removal_of(rows, changes, noise + cause, noise)
+    assert right.share == pytest.approx(removed)
+    assert right.in_noise is in_noise
+    nothing = removal.removal_of(rows, changes, noise, noise - cause)
+    assert nothing.share == pytest.approx(0.0)
+
+
 def test_a_further_effect_that_takes_all_that_is_left_is_named_although_it_ties(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
