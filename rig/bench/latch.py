@@ -1,10 +1,10 @@
 """Stored state of a bench: its latched trip, cleared trips, and the process that runs it.
 
 A bench is identified by its endpoint, not by the rig's name. Each has a folder in `state_folder`:
-`trip.json` while a trip is latched and `rig.yaml` with the description of the rig that tripped,
-`resets.jsonl` with every cleared trip, `session.json` while a process of this computer uses the
-bench, and `lock`, which that process has locked. A bench with two addresses has two folders; the
-trip latched in the device itself covers that case.
+`trip.json` while a trip is latched, `resets.jsonl` with every cleared trip, `session.json` while a
+process of this computer uses the bench, `lock`, which that process has locked, and `rig.yaml`, the
+rig of the last session. A bench with two addresses has two folders; the trip latched in the device
+itself covers that case.
 """
 
 from __future__ import annotations
@@ -83,14 +83,29 @@ def _load_trip(path: Path) -> LatchedTrip:
     return LatchedTrip(**{key: str(stored[key]) for key in LatchedTrip.__annotations__})
 
 
-def tripped_rig(rig: str) -> Path | None:
-    """Return the description of a bench that tripped and is not reset, by the name in its file."""
-    for path in sorted(state_folder().glob(f"*/{_TRIP}")):
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            described = path.with_name(_RIG)
-            if _load_trip(path).rig == rig and described.is_file():
-                return described
-    return None
+def known_rigs() -> list[Path]:
+    """Return the descriptions of the rigs that this computer has driven, one for each bench."""
+    return sorted(state_folder().glob(f"*/{_RIG}"))
+
+
+def tripped_rigs() -> list[Path]:
+    """Return the descriptions of the rigs that tripped and are not reset."""
+    return [path for path in known_rigs() if path.with_name(_TRIP).exists()]
+
+
+def rigs_in_use() -> list[Path]:
+    """Return the descriptions of the rigs whose benches other processes of this computer drive."""
+    holders = ((path, _holder(path.parent)) for path in known_rigs())
+    return [path for path, holder in holders if holder is not None and holder.pid != os.getpid()]
+
+
+def _holder(folder: Path) -> Holder | None:
+    """Return the running process of this computer that uses a bench, None if unknown."""
+    try:
+        owner = Holder(**json.loads((folder / _SESSION).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+    return owner if runstate.process_alive(owner.pid, owner.started) else None
 
 
 class BenchState:
@@ -147,8 +162,6 @@ class BenchState:
         except OSError as error:
             log.error("%s: the trip could not be latched here: %s", self.folder, error)
             return False
-        with suppress(OSError):  # only a convenience: a reset without the rig's file
-            replace_text(self.folder / _RIG, description_of(rig))
         return True
 
     def refuse_if_tripped(self, rig: Rig) -> None:
@@ -182,8 +195,7 @@ class BenchState:
             os.fsync(stream.fileno())
         if trip is not None:
             _note_in_run(trip, entry)
-        for name in (_TRIP, _RIG):
-            (self.folder / name).unlink(missing_ok=True)
+        (self.folder / _TRIP).unlink(missing_ok=True)
         sync_to_disk(self.folder)
         return trip
 
@@ -228,6 +240,13 @@ class BenchState:
         finally:
             self.release()
 
+    def describe(self, rig: Rig) -> None:
+        """Store the rig, so that `stop` and `reset` know the bench by themselves; never raises."""
+        try:
+            replace_text(self.folder / _RIG, description_of(rig))
+        except OSError as error:
+            log.warning("%s: cannot store the rig: %s", self.folder, error)
+
     def take(self, run: Path | None) -> None:
         """Store this process as the user of the bench; never raises."""
         started = runstate.process_started(os.getpid()) or ""
@@ -251,11 +270,7 @@ class BenchState:
 
     def holder(self) -> Holder | None:
         """Return the running process of this computer that uses the bench, None if unknown."""
-        try:
-            owner = Holder(**json.loads((self.folder / _SESSION).read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return None
-        return owner if runstate.process_alive(owner.pid, owner.started) else None
+        return _holder(self.folder)
 
     def in_use(self, error: DeviceBusy) -> DeviceBusy:
         """Return the error with the process of this computer that uses the bench, if known."""

@@ -119,6 +119,7 @@ class Bench:
             self.state.refuse_if_tripped(self.rig)
             self.state.prepare()
             self.state.occupy()
+            self.state.describe(self.rig)
             self.info = self._connect()
             self.state.take(None if self.recorder is None else self.recorder.folder)
             cause = self._outputs.safely(self._driver.trip_cause)

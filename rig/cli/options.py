@@ -73,6 +73,15 @@ RigOption = Annotated[
         "--rig", help="A shipped rig's name, or the path of a rig file.", autocompletion=_rigs
     ),
 ]
+KnownRigOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        help="A shipped rig's name, or the path of a rig file; by default the rig that a process "
+        "of this computer drives, for `reset` the one that tripped.",
+        autocompletion=_rigs,
+    ),
+]
 ProtocolArgument = Annotated[
     str,
     typer.Argument(

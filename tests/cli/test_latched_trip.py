@@ -89,7 +89,7 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     assert "--reason TEXT is missing" in unsaid.stderr
     assert bramah_here(*line("fourth")).returncode == 3
 
-    cleared = bramah_here(*reset, "--reason", "sensor looked at")
+    cleared = bramah_here("reset", "--reason", "sensor looked at")  # the one bench that tripped
     assert cleared.returncode == 0, cleared.stderr
     assert "cap_pressure_2" in cleared.stdout
     again = bramah(*line("fifth"))  # it drives the machine, and trips anew
@@ -98,12 +98,20 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     assert (tmp_path / "fifth" / "state").read_text() == "tripped\n"
 
 
+@pytest.mark.parametrize("words", [("stop",), ("depressurise",), ("reset", "--reason", "x")])
+def test_where_no_bench_is_known_the_rig_is_asked_for(words: tuple[str, ...]) -> None:
+    asked = bramah_here(*words)
+    assert asked.returncode == 2
+    assert asked.stderr.strip().endswith("name the bench: --rig RIG")
+
+
 def test_the_command_that_a_trip_names_works_for_a_rig_file_of_any_name(
     short: Path, scenario: Path, tmp_path: Path, state: Path
 ) -> None:
-    """Also where the stored trip of another bench is damaged."""
+    """Also where what is stored of another bench is damaged."""
     (state / "another").mkdir(parents=True)
     (state / "another" / "trip.json").write_text("[]")
+    (state / "another" / "rig.yaml").write_text("[")
     shipped = (resources.files("rig") / "shipped" / f"{RIG}.yaml").read_text("utf-8")
     mine = tmp_path / "arm in lab 2.yaml"
     mine.write_text(shipped.replace(f"name: {RIG}", "name: left-arm", 1), encoding="utf-8")
@@ -113,11 +121,13 @@ def test_the_command_that_a_trip_names_works_for_a_rig_file_of_any_name(
         assert tripped.returncode == 3, tripped.stderr
         (command,) = set(re.findall(r"`bramah (reset [^`]*) --reason TEXT`", tripped.stderr))
         assert command == f"reset --rig left-arm --endpoint {endpoint}"
+        # Also where only the device knows the trip: the host stood still, and lost its connection.
+        (state / re.sub(r"[^a-z0-9.-]", "_", endpoint.replace("://", "_")) / "trip.json").unlink()
         cleared = bramah_here(*command.split(), "--reason", "sensor looked at")
         assert cleared.returncode == 0, cleared.stderr
-        unknown = bramah_here(*command.split(), "--reason", "again")
+        unknown = bramah_here("reset", "--rig", "right-arm", "--reason", "again")
         assert unknown.returncode == 2
-        assert "left-arm" in unknown.stderr
+        assert "right-arm" in unknown.stderr
 
 
 def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path) -> None:

@@ -13,7 +13,14 @@ from pathlib import Path
 import pytest
 
 from drivers.base import DeviceBusy, DeviceInfo, DeviceLost, SampleBlock
-from rig.bench.latch import BenchState, Holder, reset_bench, state_folder, tripped_rig
+from rig.bench.latch import (
+    BenchState,
+    Holder,
+    known_rigs,
+    reset_bench,
+    state_folder,
+    tripped_rigs,
+)
 from rig.bench.session import Bench
 from rig.model.parse import InputError
 from rig.model.trips import Latched, SafetyTrip
@@ -66,17 +73,16 @@ def test_a_reset_keeps_who_when_why_and_which_trip(tripped: Path, state: Path) -
         bench.exchange()
 
 
-def test_a_rig_that_tripped_without_a_run_folder_is_known_by_the_name_in_its_file() -> None:
-    """A manual session records nothing; a message states the name, not the path, of a rig file."""
+def test_the_rig_of_a_trip_is_kept_also_where_no_run_is_recorded() -> None:
+    """A manual session has no run folder, and a message states the name in a rig file."""
     own = RIG.model_copy(update={"name": "my-bench"})
     with pytest.raises(SafetyTrip), Bench(own, FakeDriver(own, spoil=too_much)) as bench:
         bench.exchange()
-    described = tripped_rig("my-bench")
-    assert described is not None
+    (described,) = tripped_rigs()
     assert load_rig(described) == own
-    assert tripped_rig("another-bench") is None
     reset_bench(own, FakeDriver(own), "sensor 1 replaced")
-    assert tripped_rig("my-bench") is None
+    assert tripped_rigs() == []
+    assert known_rigs() == [described]
 
 
 @pytest.mark.parametrize("reason", ["", "  "])

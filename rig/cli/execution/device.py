@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from drivers.base import Driver
     from rig.model.rig import Rig
 
@@ -40,6 +42,23 @@ def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
 
     described = bench_at(rig, endpoint)
     return described, make_driver(described.wire, described)
+
+
+def the_only(rigs: list[Path], none: str, state: str) -> Path:
+    """Return the description of the only bench of this computer in a state (`tripped`, `in use`).
+
+    Raises InputError that asks for `--rig`, with the reason `none` where there is none.
+    """
+    from rig.model.parse import InputError
+    from rig.runs.rigs import load_rig
+
+    if len(rigs) == 1:
+        return rigs[0]
+    if not rigs:
+        raise InputError(f"{none}; name the bench: --rig RIG")
+    known = (load_rig(path) for path in rigs)
+    places = ", ".join(f"{rig.name} at {rig.wire.endpoint}" for rig in known)
+    raise InputError(f"{len(rigs)} benches are {state}: {places}; name one: --rig RIG")
 
 
 def _require_wire(name: str, rig: Rig) -> None:

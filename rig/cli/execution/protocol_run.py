@@ -15,12 +15,12 @@ from protocols.engine.run_inputs import RunInputs
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
-from rig.bench.latch import reset_bench, tripped_rig
+from rig.bench.latch import known_rigs, reset_bench, tripped_rigs
 from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.execution.attended import TrackedEstimates, terminal_lines
-from rig.cli.execution.device import bench_at, device_of
+from rig.cli.execution.device import bench_at, device_of, the_only
 from rig.cli.proof.proofs import proved
 from rig.cli.proof.space import require_space
 from rig.cli.proof.twin_choice import twin_source
@@ -30,6 +30,7 @@ from rig.cli.text.sheets import plan_text
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
 from rig.runs.store import refuse_occupied
 
 if TYPE_CHECKING:
@@ -162,17 +163,30 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     return job.out
 
 
-def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
+def reset_device(rig: str | None, endpoint: str | None, reason: str) -> str:
     """Clear a bench's latched trip for a person's `reason`; return the cause of the trip.
 
     `rig` may be the name in a rig file too, as messages on a trip state it: the rig is then that
-    with which the bench tripped.
+    which was driven last under this name. Without one it is the only bench with a stored trip.
     """
+    if rig is None and endpoint is not None:
+        raise InputError("reset: name the bench at --endpoint: --rig RIG")
+    if rig is None:
+        rig = str(the_only(tripped_rigs(), "no trip is stored on this computer", "tripped"))
     try:
         described, driver = device_of(rig, endpoint)
     except InputError:
-        tripped = tripped_rig(rig)
-        if tripped is None:
+        known = [path for path in known_rigs() if _is_named(path, rig)]
+        if not known:
             raise
-        described, driver = device_of(str(tripped), endpoint)
+        latest = max(known, key=lambda path: path.stat().st_mtime)
+        described, driver = device_of(str(latest), endpoint)
     return reset_bench(described, driver, reason)
+
+
+def _is_named(path: Path, name: str) -> bool:
+    """Return whether a rig that can be read has a name."""
+    try:
+        return load_rig(path).name == name
+    except InputError:
+        return False

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from rig.cli.execution.device import device_of
-from rig.cli.options import EndpointOption, RigOption
-from rig.cli.verbs.stop import stop
+from rig.cli.execution.device import device_of, the_only
+from rig.cli.options import EndpointOption, KnownRigOption
+from rig.cli.verbs.stop import NOT_IN_USE, stop
 
 
-def depressurise(rig: RigOption, endpoint: EndpointOption = None) -> None:
+def depressurise(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     """Zero the outputs, then release the pressures, if the rig file describes how.
 
     Example: bramah depressurise --rig shinshu-2dof
     """
     from rig.bench import probe as bench
+    from rig.bench.latch import rigs_in_use
     from rig.cli.errors import WorkError
 
+    driven = rigs_in_use()  # before their runs are ended
     stop(rig, endpoint)
+    if rig is None:
+        rig = str(the_only(driven, NOT_IN_USE, "in use"))
     described, driver = device_of(rig, endpoint)
     pressurised = bench.pressurised(bench.probe(driver, described))
     if pressurised:

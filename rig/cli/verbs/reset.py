@@ -6,14 +6,11 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import (
-    EndpointOption,
-    RigOption,
-)
+from rig.cli.options import EndpointOption, KnownRigOption
 
 
 def reset(
-    rig: RigOption,
+    rig: KnownRigOption = None,
     endpoint: EndpointOption = None,
     reason: Annotated[
         str, typer.Option(help="Cause found and action taken; stored with the trip.  [required]")
@@ -21,7 +18,7 @@ def reset(
 ) -> None:
     """Clear a latched trip in the device and on this computer, after inspecting the bench.
 
-    Example: bramah reset --rig shinshu-2dof --reason "pressure sensor 2 replaced"
+    Example: bramah reset --reason "pressure sensor 2 replaced"
     """
     from rig.cli.execution.protocol_run import reset_device
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 from rig.cli.execution.device import device_of, print_pressure
-from rig.cli.options import EndpointOption, RigOption
+from rig.cli.options import EndpointOption, KnownRigOption
 from rig.cli.text.output import progress
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rig.bench.latch import Holder
     from rig.model.parts import Wire
 
+NOT_IN_USE: Final = "no process of this computer drives a bench"
 # A stopped run records its outputs at zero, for at most 6 s and two answer times.
 RECORDS_ZERO: Final = 15.0  # [s]
 # The next law of another computer's run may overwrite a single zero command.
@@ -26,10 +27,36 @@ ZEROS: Final = 6
 BETWEEN_ZEROS: Final = 0.2  # [s]
 
 
-def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
+def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     """Set all outputs to zero now, whoever is in control, and end the run that drives them.
 
+    Without --rig it stops every bench that this computer drives.
+
     Example: bramah stop --rig shinshu-2dof
+    """
+    from drivers.base import DeviceError
+    from rig.bench.latch import rigs_in_use
+    from rig.model.parse import InputError
+
+    rigs = [rig] if rig is not None else [str(path) for path in rigs_in_use()]
+    if not rigs or (rig is None and endpoint is not None):
+        raise InputError(f"{'' if rigs else f'{NOT_IN_USE}; '}name the bench: --rig RIG")
+    errors: list[Exception] = []
+    for known in rigs:  # an error of one bench must not keep another from being stopped
+        try:
+            stop_bench(known, endpoint)
+        except (InputError, DeviceError) as error:
+            errors.append(error)
+    for further in errors[1:]:
+        progress(str(further))
+    if errors:
+        raise errors[0]
+
+
+def stop_bench(rig: str, endpoint: str | None) -> None:
+    """Set the outputs of one bench to zero, end the run that drives it, print what is pressurised.
+
+    Raises InputError and DeviceError.
     """
     from drivers.base import DeviceError
     from rig.bench import probe as bench
