@@ -19,16 +19,22 @@ _STATES: Final = {
     4: it.LOST,
     130: it.STOPPED,
 }
-_DEVICE: Final = ("device:", "device in use:")
+_BUSY: Final = "device in use:"
+_DEVICE: Final = ("device:", _BUSY)
 
 
 @dataclass(frozen=True)
 class ItemOutcome:
-    """The final state of an item and the reason; `latched`: an earlier trip prevented its start."""
+    """The final state of an item and the reason.
+
+    Of an item that did not start: `latched`, an earlier trip prevented it; `in_use`, another
+    process or computer has the bench.
+    """
 
     state: str
     reason: str
     latched: bool = False
+    in_use: bool = False
 
     def adding(self, more: str) -> ItemOutcome:
         """Return the outcome with a further reason."""
@@ -38,7 +44,7 @@ class ItemOutcome:
         """Return the outcome with `state` if the process ended on that request."""
         if not state or self.state not in (it.STOPPED, it.FAILED):
             return self
-        return replace(self, state=state, latched=False)
+        return replace(self, state=state, latched=False, in_use=False)
 
 
 def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
@@ -48,7 +54,8 @@ def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
     if code not in _STATES:
         return ItemOutcome(it.FAILED, f"ended with {code}: {reason or 'no message'}")
     latched = code == 3 and not began
-    return ItemOutcome(_STATES[code], reason if code else "", latched)
+    in_use = code == 4 and not began and reason.startswith(_BUSY)
+    return ItemOutcome(_STATES[code], reason if code else "", latched, in_use)
 
 
 def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:

@@ -33,6 +33,7 @@ class Readiness:
 Reading = Callable[
     [QueueJob], Mapping[str, float] | str
 ]  # channel means in SI, or the reason why they cannot be read
+InUse = Callable[[QueueJob], str]  # who has the bench, '' where it may be free
 
 
 def _shown(moment: datetime) -> str:
@@ -71,7 +72,9 @@ def _compared(wanted: str, other: Item) -> Readiness:
     return Readiness(False, f"{part} of item {other.id} is {value:.4g}; wanted: {wanted}", SKIPPED)
 
 
-def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Reading) -> Readiness:
+def judge(
+    item: Item, others: Mapping[int, Item], moment: datetime, read: Reading, in_use: InUse
+) -> Readiness:
     """Evaluate one queued item; `read` is called last, and only for a condition on a channel."""
     job = item.job
     if job.not_after and moment >= datetime.fromisoformat(job.not_after):
@@ -83,6 +86,8 @@ def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Readin
         return depends
     if job.not_before and moment < datetime.fromisoformat(job.not_before):
         return _wait(f"not before {_shown(datetime.fromisoformat(job.not_before))}")
+    if holder := in_use(job):
+        return _wait(f"waits for the bench: {holder}")
     return _channel(job, read) if job.when else Readiness(True)
 
 
@@ -100,7 +105,7 @@ def _channel(job: QueueJob, read: Reading) -> Readiness:
 
 
 def choose(
-    items: Sequence[Item], moment: datetime, read: Reading
+    items: Sequence[Item], moment: datetime, read: Reading, in_use: InUse
 ) -> tuple[Item | None, list[tuple[Item, Readiness]]]:
     """Return the first item that can start now, and the results for those before it."""
     others = {item.id: item for item in items}
@@ -108,7 +113,7 @@ def choose(
     for item in items:
         if item.state != QUEUED:
             continue
-        verdict = judge(item, others, moment, read)
+        verdict = judge(item, others, moment, read, in_use)
         if verdict.start:
             return item, passed
         passed.append((item, verdict))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import subprocess
@@ -48,6 +49,7 @@ class QueueSettings:
     poll: float = 0.2  # between two checks of the child and of the user's requests
     wait_poll: float = 2.0  # between two checks of a queue in which no item can start yet
     probe_every: float = 30.0  # between two readings of a bench for a condition on a channel
+    in_use_seconds: float = 20.0  # until an item tries again to start on a bench in use
     probe_seconds: float = 60.0  # a reading takes one connection and one block
     check_seconds: float = 1800.0  # the longest proof; the shipped ones take seconds
     recover_seconds: float = 3600.0  # an archive of hours is written and verified at disk speed
@@ -133,6 +135,7 @@ class Runner:
         self._lock: LockFile | None = None
         self._ended: list[Item] = []
         self._lost = 0  # consecutive losses of the device
+        self._in_use: dict[tuple[str, str], tuple[float, str]] = {}
         self._readings: dict[tuple[str, str], tuple[float, dict[str, float] | str]] = {}
         self._announced: dict[int, str] = {}
 
@@ -167,8 +170,9 @@ class Runner:
         try:
             self._resolve_leftovers()
             reason = self._loop()
-            bad = [item for item in self._ended if item.state != it.DONE]
-            report = QueueReport(1 if bad else 0, reason, tuple(self._ended))
+            states = {item.state for item in self._ended}
+            code = 4 if it.LOST in states else 1 if states - {it.DONE} else 0
+            report = QueueReport(code, reason, tuple(self._ended))
         except OperatorStop as stopped:
             report = QueueReport(130, str(stopped), tuple(self._ended))
         except _Ending as ending:
@@ -207,7 +211,8 @@ class Runner:
     # Which item
 
     def _choose(self) -> tuple[Item | None, list[tuple[Item, ready.Readiness]]]:
-        item, verdicts = ready.choose(self._queue.items(), datetime.now(UTC), self._read)
+        items, now = self._queue.items(), datetime.now(UTC)
+        item, verdicts = ready.choose(items, now, self._read, self._holder_of)
         for other, verdict in verdicts:
             if verdict.state:
                 self._finish(other, ItemOutcome(verdict.state, verdict.reason))
@@ -215,6 +220,11 @@ class Runner:
                 self._announced[other.id] = verdict.reason
                 self._say(f"item {other.id} {other.job.name}: {verdict.reason}")
         return item, verdicts
+
+    def _holder_of(self, job: QueueJob) -> str:
+        """Return who had a bench when an item was last refused for that, '' after a while."""
+        since, holder = self._in_use.get((job.rig, job.endpoint), (-math.inf, ""))
+        return holder if time.monotonic() - since < self._settings.in_use_seconds else ""
 
     def _read(self, job: QueueJob) -> dict[str, float] | str:
         """Return the means of a bench's channels, cached for a while; moves nothing."""
@@ -309,6 +319,11 @@ class Runner:
 
     def _after(self, item: Item, outcome: ItemOutcome) -> None:
         """Finish an item, recover its run if its process died, and stop the queue if necessary."""
+        if outcome.in_use:
+            key = (item.job.rig, item.job.endpoint)
+            self._in_use[key] = (time.monotonic(), outcome.reason)
+            self._queue.release(item.id, f"not started: {outcome.reason}")
+            return
         if outcome.latched:
             self._queue.release(item.id, f"not started: {outcome.reason}")
             self._notify("trip", item, outcome.reason)

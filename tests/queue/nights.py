@@ -28,7 +28,9 @@ from tests.forked import Forked
 ROOT = Path(__file__).parents[2]
 PROGRAM = (sys.executable, "-m", "tests.queue.program")
 Process = Forked | subprocess.Popen[bytes]
-QUICK = QueueSettings(poll=0.02, wait_poll=0.05, probe_every=0.05, probe_seconds=60.0)
+QUICK = QueueSettings(
+    poll=0.02, wait_poll=0.05, probe_every=0.05, in_use_seconds=0.05, probe_seconds=60.0
+)
 LONG = 120.0  # [s] a hang ends in an error that says so
 
 

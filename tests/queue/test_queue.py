@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -11,11 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.bench.latch import BenchState
 from rig.model.parameters import parameter_names
 from rig.model.parse import InputError
 from rig.queue.items import channel_condition, check_wanted, parse_time, result_condition
 from rig.queue.processes import reason_in
 from rig.queue.store import QueueStore
+from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 from tests.queue.nights import LONG, Night, reset, until
 from tests.variants import kept
@@ -163,6 +166,27 @@ def test_a_lost_device_is_one_item_s_bad_luck_twice_in_a_row_it_is_the_bench(
     assert night.states()[0] == "device lost"
     assert "outputs not confirmed at zero" in night.item(1).reason
     assert night.states()[1:] == ["queued"] * 4
+
+
+def test_an_item_waits_for_a_bench_that_another_process_uses(night: Night) -> None:
+    """A manual session that somebody forgot costs no item of the night."""
+    night.add("done")
+    night.add("done")
+    state = BenchState(load_rig("shinshu-2dof").wire)
+    state.prepare()
+    state.occupy()
+    state.take(None)
+
+    def say(line: str) -> None:
+        if "waits for the bench" in line:
+            state.release()
+        Night.say(night, line)
+
+    night.say = say  # type: ignore[method-assign]
+    assert night.run().code == 0
+    assert night.states() == ["done", "done"]
+    assert night.starts(1) == 1
+    assert any(f"is in use by process {os.getpid()} of" in line for line in night.said)
 
 
 def test_a_killed_item_is_made_safe_recovered_and_not_started_again(night: Night) -> None:
