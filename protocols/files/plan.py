@@ -25,6 +25,7 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 TRIAL_SECONDS = 3.0  # drift is judged over about this long, or one period if that is longer
+LOCK_SHARE = 0.25  # of the stroke: a joint that may stand anywhere in it is not locked
 LOCK_DEVIATIONS = 6.0  # of the noise of a position: one sample of 10^9 is farther off
 LONGEST_RECORD = 86400.0  # [s]
 
@@ -115,10 +116,17 @@ def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) ->
             f"rig {rig.name!r} has {len(rig.joints)}; write one whose steps name each joint"
         )
     for joint in rig.joints:
+        near, stroke = changed.place.tolerance, joint.cylinder.stroke
         if changed.place.limit > joint.limits.command:
             raise InputError(
                 f"protocol {changed.name!r}: place.limit {changed.place.limit:g} V is above "
                 f"the limit of joint {joint.name!r}, command {joint.limits.command:g} V"
+            )
+        if near > LOCK_SHARE * stroke:
+            raise InputError(
+                f"protocol {changed.name!r}: place.tolerance {1e3 * near:g} mm of a stroke of "
+                f"{1e3 * stroke:g} mm counts joint {joint.name!r} as in place nearly anywhere; "
+                f"expected at most {1e3 * LOCK_SHARE * stroke:g} mm"
             )
     sequence = _RigPlanner(rig).nested(changed.steps)
     return Plan(changed, rig.name, rig.sample_rate, sequence)
@@ -288,7 +296,8 @@ def _whole(step: str, duration: float, period: int, rate: float) -> int:
 
 
 def _lock(part: Lock, step: str, rig: Rig) -> LockPlan:
-    half = rig.joints[part.joint - 1].cylinder.stroke / 2
+    stroke = rig.joints[part.joint - 1].cylinder.stroke
+    half = stroke / 2
     if part.at == CLOSED:
         if abs(part.piston) > half:
             raise InputError(
@@ -305,6 +314,12 @@ def _lock(part: Lock, step: str, rig: Rig) -> LockPlan:
             f"{1e3 * part.tolerance:g} mm, and the noise of its sensor is {1e3 * noise:g} mm, so "
             "that noise alone would trip the bench; expected at least "
             f"{1e3 * LOCK_DEVIATIONS * noise:g} mm"
+        )
+    if part.tolerance > LOCK_SHARE * stroke:
+        raise InputError(
+            f"step {step!r}: the lock of joint {part.joint} has a tolerance of "
+            f"{1e3 * part.tolerance:g} mm of a stroke of {1e3 * stroke:g} mm, so that a joint that "
+            f"moves would count as locked; expected at most {1e3 * LOCK_SHARE * stroke:g} mm"
         )
     return LockPlan(part.joint - 1, part.at, piston, part.tolerance)
 

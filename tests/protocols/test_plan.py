@@ -110,6 +110,8 @@ REFUSED = [
     ("frequency: 2 Hz", "frequency: 2.00013 Hz", "joint 2: 2.00013 Hz never meets"),
     ("piston: 5 mm", "piston: 38 mm", r"joint 1 .* 38 mm, outside its stroke of \+-37.5 mm"),
     ("piston: 5 mm", "piston: 5 mm, tolerance: 1 um", "joint 1 .* 0.001 mm, .*at least 0.06 mm"),
+    ("piston: 5 mm", "piston: 5 mm, tolerance: 2 m", "tolerance of 2000 mm .* at most 18.75 mm"),
+    ("joints: 2\n", "joints: 2\nplace: {tolerance: 0.5 m}\n", "place.tolerance 500 mm .*'boom'"),
     ("centre: 3 mm", "centre: -37 mm", "centre -37 mm is outside limits.piston, -36 to 36 mm"),
     ("duration: 4 s", "duration: 4.2 s", "duration 4.2 s is 8.4 periods of 0.5 s"),
     ("duration: 4 s", "duration: 0.1 s", "expected a whole number"),
