@@ -85,8 +85,12 @@ def test_a_design_keeps_the_limits_of_the_machine_that_was_identified(tmp_path: 
     source.write_text(QUICK)
     save_model(identified(load_rig(RIG), 1.3), fast)
     line = ["design", source, "--rig", RIG, "--criterion", "b", "--budget", 4, "--out", out]
+    shown = bramah_here(*line[:-2], "--model", fast)
+    assert shown.returncode == 0, shown.stderr
+    assert "--out FILE writes it" in shown.stdout
     done = bramah_here(*line, "--model", fast)
     assert done.returncode == 0
+    assert done.stdout == shown.stdout.replace("--out FILE writes it", f"written to {out}")
     assert f"predicted on: model {fast}" in done.stdout
     assert bramah_here("check", out, "--rig", RIG, "--model", fast).returncode == 0
 

@@ -213,7 +213,7 @@ def design_protocol(
     )
 
 
-def design_text(designed: DesignedProtocol, out: Path) -> str:
+def design_text(designed: DesignedProtocol, out: Path | None) -> str:
     """Return the predicted errors before and after, and each step's share of its limits."""
     before, after = designed.before.prediction, designed.after.prediction
     assert before is not None  # the design needed the prediction, so it exists
@@ -227,8 +227,9 @@ def design_text(designed: DesignedProtocol, out: Path) -> str:
     for step, (share, limit) in designed.design.shares_after.items():
         was, which = designed.design.shares_before[step]
         lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
+    written = "--out FILE writes it" if out is None else f"written to {out}"
     lines.append(
-        f"trials: {designed.design.evaluated}, kept: {designed.design.accepted}; written to {out}"
+        f"trials: {designed.design.evaluated}, kept: {designed.design.accepted}; {written}"
     )
     return "\n".join(lines)
 

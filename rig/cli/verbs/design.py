@@ -20,7 +20,9 @@ from rig.cli.options import (
 def design(
     protocol: ProtocolArgument,
     rig: RigOption,
-    out: Annotated[Path, typer.Option(help="The protocol file to write.", callback=writable_file)],
+    out: Annotated[
+        Path | None, typer.Option(help="Write the protocol file here.", callback=writable_file)
+    ] = None,
     criterion: Annotated[
         str, typer.Option(help="D, E, or the name of the parameter to improve.")
     ] = "E",
@@ -49,7 +51,8 @@ def design(
     parameters = load_twin(source, bench)
     progress(twin_text(source, parameters.warning))
     designed = design_protocol(protocol, rig, criterion, budget, seed, parameters)
-    write_text(out, designed.text)
+    if out is not None:
+        write_text(out, designed.text)
     write_json(json, design_json(designed))
     if json != Path("-"):
         typer.echo(
