@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from rig.runs.exchange.fixtures import write_run
 from rig.runs.exchange.importer import import_records
 from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig
+from rig.runs.runstate import STREAM, EventLog, read_events
 from rig.runs.store import load_run
 from tests.services.fake_driver import samples
 
@@ -86,9 +88,16 @@ def test_a_parquet_file_has_units_at_its_fields(run: Path, tmp_path: Path) -> No
     assert json.loads(found.schema.metadata[b"lock_1"]) == "closed"
 
 
-def test_an_mdf_file_has_signals_over_time(run: Path, tmp_path: Path) -> None:
+def test_an_mdf_file_has_signals_over_the_time_of_the_run(run: Path, tmp_path: Path) -> None:
+    """Its start and a signal's time give the date of a sample, whenever it is exported."""
+    log = EventLog(run)
+    log.append(STREAM, 7000, {"t": 0.5, "stream": 0})
+    log.close()
+    (event,) = read_events(run)
     export_run(run, tmp_path / "out", "mf4")
     with MDF(tmp_path / "out" / "step1_r1.mf4") as found:
+        zero = datetime.fromisoformat(event["time"]) - timedelta(seconds=0.5)
+        assert abs(found.header.start_time - zero) < timedelta(milliseconds=1)
         signal = found.get("cap_pressure_1")
         np.testing.assert_array_equal(signal.samples, ONE.channels["cap_pressure_1"])
         np.testing.assert_allclose(signal.timestamps, 2.5 + ONE.time, rtol=1e-12)

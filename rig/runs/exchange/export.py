@@ -10,6 +10,7 @@ import importlib.util
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ from rig.model.records import LOADED, Record, stated_load
 from rig.model.rig import Rig
 from rig.runs import store
 from rig.runs.files import new_folder
+from rig.runs.runstate import read_events, stream_clocks
 from rig.runs.stream import RunHead, iterate_records, read_run_head
 
 Array = NDArray[np.float64]
@@ -65,19 +67,32 @@ def export_run(
         raise InputError(f"--format {kind}: expected one of: {' '.join(WRITERS)}")
     head = read_run_head(run)
     store.refuse_occupied(out)
+    began = _began(run)
     names = []
     with new_folder(out) as folder:  # a partial export would look complete
         for record in iterate_records(run):
             names.append(f"{record.name}.{kind}")
             added = {} if more is None else more(record)
-            WRITERS[kind](folder / names[-1], sheet(head.rig, record, added))
+            WRITERS[kind](folder / names[-1], sheet(head.rig, record, added, began))
         if kind in ("csv", "mat"):
             names += _way_back(run, folder, head, kind)
     return [out / name for name in names]
 
 
-def sheet(rig: Rig, record: Record, more: Mapping[str, Array]) -> Sheet:
-    """Return a record as columns: time, its channels, then `model_NAME` of `more`."""
+def _began(run: Path) -> datetime:
+    """Return the date at time 0 of a run: of its first block, else of its folder."""
+    clocks = stream_clocks(read_events(run))
+    if not clocks:
+        return datetime.fromisoformat(store.read_header(run).created)
+    first = clocks[min(clocks)]
+    return datetime.fromisoformat(first.host) - timedelta(seconds=first.began)
+
+
+def sheet(rig: Rig, record: Record, more: Mapping[str, Array], began: datetime) -> Sheet:
+    """Return a record as columns: time, its channels, then `model_NAME` of `more`.
+
+    `began` is the date at time 0.
+    """
     order = [name for name in rig.recorded if name in record.channels]
     names = [*order, *(name for name in record.channels if name not in order)]
     columns = {TIME: record.start + record.time} | {name: record.channels[name] for name in names}
@@ -87,6 +102,7 @@ def sheet(rig: Rig, record: Record, more: Mapping[str, Array]) -> Sheet:
     about = {
         **record.attributes,
         "rig": rig.name,
+        "run_began": began.isoformat(),
         "record": record.name,
         "step": record.step,
         "repeat": record.repeat,
@@ -141,6 +157,7 @@ def _write_mf4(path: Path, sheet: Sheet) -> None:
         if name != TIME
     ]
     with MDF(version="4.10") as file:
+        file.header.start_time = datetime.fromisoformat(sheet.about["run_began"])
         file.append(signals, comment=json.dumps(dict(sheet.about)), common_timebase=True)
         file.save(path)
 
