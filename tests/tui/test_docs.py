@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from rig.tui.app import HELP
 from tests.tui.capture import DOCS, PICTURE, arguments_of, capture, drawing
 
 TEXT = re.compile(
@@ -32,6 +33,14 @@ async def test_the_pictures_in_the_page_are_what_the_command_above_them_makes(
     assert made == text, (
         "docs/screen.md is not up to date: `python -m tests.tui.capture --docs` writes its pictures"
     )
+
+
+def test_the_help_has_every_key_of_the_page() -> None:
+    table = DOCS.read_text(encoding="utf-8").split("\n## Keys\n")[1].split("\n## ")[0]
+    cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| ")][1:]
+    keys = {k for cell in cells for k in re.findall(r"`(.)`", cell)} - {"?"}  # which opens it
+    words = {word.rstrip(",") for line in HELP for word in line.split()}
+    assert {k.replace("-", "−") for k in keys} <= words | {word.lower() for word in words}
 
 
 async def test_the_readmes_picture_is_the_screen_as_it_is_and_loads_nothing() -> None:

@@ -214,12 +214,14 @@ async def test_a_reset_without_a_reason_resets_nothing(tripped_run: Machine, bra
 async def test_a_reset_that_fails_says_why_and_the_alarm_stays(
     tripped_run: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    broken = "import sys; sys.stderr.write('bramah: the device does not answer\\n'); sys.exit(4)"
+    said = "the device does not answer at this address; is its power on, and what should be done"
+    broken = f"import sys; sys.stderr.write('bramah: {said} is at the end\\n'); sys.exit(4)"
     monkeypatch.setattr(jobs, "BRAMAH", (sys.executable, "-c", broken))
     async with glass(tripped_run) as shown:
         await keys(shown, "5", "k", "r", "x", "enter")
         await shown.said("reset: DEVICE LOST: the device does not answer")
         assert "LATCHED" in shown.text
+        assert "is at the end" in shown.text
 
 
 def by_hand(**changes: object) -> Recorded:

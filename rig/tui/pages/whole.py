@@ -13,6 +13,7 @@ from rig.tui.pages import estimates, levels, manual, operation, overview, runs, 
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
 
+REMARK_ROWS: Final = 3  # at most, of the result of an action
 LEAST: Final = (60, 16)  # a smaller terminal shows only the state and the stop key
 NOTICES: Final = 6  # rows they may take
 Page = Callable[[PlotView, int, int], list[Row]]
@@ -56,8 +57,9 @@ def compose(view: PlotView, width: int, height: int) -> list[Row]:
         return too_small(view, width, height)
     head = [*header(view, width), *notice_rows(view, width)]
     foot = [_keys(view, width)]
-    if view.remark:
-        foot.insert(0, fit(row((" ", ""), (view.remark, STRONG)), width))
+    if view.remark:  # what to do after a failed action stands at its end
+        lines = wrapped(view.remark, width - 1, STRONG)[:REMARK_ROWS]
+        foot = [*(fit(((" ", ""), *line), width) for line in lines), *foot]
     room = max(height - len(head) - len(foot), 0)
     rows = block([*head, *block(_page(view, width, room), width, room), *foot], width, height)
     return _above(rows, view, width) if view.dialog is not None else rows
