@@ -115,12 +115,13 @@ def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
 
 
 def moved_parameter(
-    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str = ""
-) -> tuple[str, float] | None:
+    train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str = "",
+    least: float = TRACE.noted_shift,
+) -> tuple[str, float] | None:  # fmt: skip
     """Return the baseline parameter that a rival changes most, and its relative change.
 
-    It changes by at least `TRACE.noted_shift` and lies outside the rival's 95 % interval: the
-    stated intervals would be wrong if the rival were true. None where no parameter does. Those of
+    It changes by at least `least` and lies outside the rival's 95 % interval: the stated intervals
+    would be wrong if the rival were true. None where no parameter does. Those of
     the baseline's term of the same `law` are left out (viscous friction beside dry `friction`,
     whose forms differ by a slope too), and for the others it is enough that the rival's interval
     is wider than `TRACE.open_share`: its end farther from the named set's value gives the change.
@@ -142,7 +143,7 @@ def moved_parameter(
         elif abs(other - value) <= half_width:
             continue
         change = value / other - 1.0 if c.reciprocal else other / value - 1.0
-        if abs(change) > max(TRACE.noted_shift, abs(most[1]) if most else 0.0):
+        if abs(change) > max(least, abs(most[1]) if most else 0.0):
             most = c.parameter, float(change)
     return most
 

@@ -48,7 +48,7 @@ def sets_with_small_effect(
             winner.fit.energy - larger.fit.energy > price
             and not hypotheses.physical_problem(larger)
             and loses_by_restriction(left, held_out_residual(holdout_data, larger.fit))
-            and (moved := moved_parameter(hypotheses.train_data, winner, larger))
+            and (moved := moved_parameter(hypotheses.train_data, winner, larger, least=0.0))
         ):
             found.append((larger, moved))
     least = min((o.fit.energy for o, _ in found), default=0.0)
@@ -70,9 +70,11 @@ def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[tuple[Used,
 
 
 def small_effect_notes(winner: Hypothesis, larger: Sequence[tuple[Hypothesis, Moved]]) -> list[str]:
-    """Name the further effects of larger sets, and the parameters that they change most."""
+    """Name the further effects of larger sets that change a parameter by `TRACE.noted_shift`."""
     out = []
     for hypothesis, (parameter, change) in larger:
+        if abs(change) < TRACE.noted_shift:
+            continue
         terms = (u.term for u in hypothesis.effects)
         fresh = [term for term in terms if (term.name, term.where) not in winner.keys]
         places = " and ".join(place_in_words(term.where) for term in fresh)
