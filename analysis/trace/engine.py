@@ -48,6 +48,7 @@ from analysis.trace.next_experiment.detection_limits import (
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.notes import (
     evidence_notes,
+    not_judged_notes,
     record_condition_notes,
     refitted_notes,
     rival_notes,
@@ -289,6 +290,11 @@ def _traced(
         *prepared.notes,
         *unrepeated_notes(train_data),
         *finding.notes,
+        *(
+            not_judged_notes(finding.remainders, error.noise, error.after)
+            if finding.verdict == UNEXPLAINED and not finding.notes
+            else ()
+        ),
         *phase_notes(finding.named, records.lines),
         *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
         *refitted_notes(winner.fit, last, after),

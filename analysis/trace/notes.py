@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
 from analysis.effects.base import Effect
@@ -19,6 +19,7 @@ from analysis.trace.data.noise_floor import (
 )
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.judge.held_out import refitted_names
+from analysis.trace.remaining import Remainder
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.refinement import ExactFit
@@ -158,6 +159,24 @@ def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
         f"the held-out records show {', '.join(names)} at least "
         f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
         "do: the errors are given with their values; record training motions like the held-out ones"
+    ]
+
+
+def not_judged_notes(
+    left: Sequence[Remainder], noise: Mapping[str, float], after: Mapping[str, float]
+) -> list[str]:
+    """State what speaks against an explanation where the judging rows do not show it.
+
+    `noise` and `after` are noise floor and error of the judging rows, by equation.
+    """
+    words: dict[str, list[str]] = {}
+    for r in left:
+        if r.veto and after[r.equation] <= TRACE.noted_ratio * noise[r.equation]:
+            words.setdefault(r.equation, []).append(r.words)
+    return [
+        f"{equation}: {', '.join(found)}; the rows that judge hold noise alone, so that the cause "
+        "does not act in all parts of the records"
+        for equation, found in words.items()
     ]
 
 

@@ -14,8 +14,8 @@ from analysis.trace.in_motion import rest_phase_notes
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates
 from analysis.trace.judge.held_out import completed
 from analysis.trace.judge.unknown_cause import tied_in_held_out
-from analysis.trace.notes import undetermined_notes
-from analysis.trace.remaining import tolerance_words
+from analysis.trace.notes import not_judged_notes, undetermined_notes
+from analysis.trace.remaining import Remainder, tolerance_words
 from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import quantity, sentence, tolerated_error_notes
@@ -182,3 +182,19 @@ def test_a_lopsided_interval_is_stated_by_its_ends() -> None:
     """A breakaway of unknown form is known to a factor."""
     assert quantity(Estimate(96.0, "N", 50.0, (31.0, 196.0))) == "96 (31 to 200) N"
     assert quantity(Estimate(96.0, "N", 10.0, (76.0, 117.0))) == "96 ± 20 N"
+
+
+def test_what_only_some_rows_hold_is_stated_where_the_errors_do_not_show_it() -> None:
+    """A spool sticks in some blocks: those that judge have none, and all is at the floor."""
+    left = [
+        Remainder("flow_cap_1", "the repeatable energy is 7 times the band", True),
+        Remainder("flow_cap_1", "held-out error 4.1 times the noise floor", True),
+        Remainder("flow_rod_1", "2 % of the repeatable energy remains", False),
+        Remainder("torque_1", "the repeatable energy is 9 times the band", True),
+    ]
+    noise = dict.fromkeys(("flow_cap_1", "flow_rod_1", "torque_1"), 1.0)
+    (note,) = not_judged_notes(left, noise, noise | {"torque_1": 3.0})
+    assert note.startswith(
+        "flow_cap_1: the repeatable energy is 7 times the band, held-out error 4.1 times the noise "
+        "floor; the rows that judge hold noise alone"
+    )
