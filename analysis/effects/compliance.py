@@ -26,6 +26,7 @@ from analysis.terms.base import (
     kernel,
 )
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 ATMOSPHERE: Final = 101_325.0  # [Pa]
 DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sensor's error
@@ -124,8 +125,9 @@ class EntrainedAir(Effect):
 class DeadVolume(Effect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
 
-    A hose gives like more oil, the less the higher its pressure p: V_dead (1 + k p0) / (1 + k p), k
-    its stiffening, p0 half of the supply's pressure (Merritt 1967, chapter 1: effective modulus).
+    It is negative where the file states more than there is, at most the whole pipe. A hose gives
+    like more oil, the less the higher its pressure p: V_dead (1 + k p0) / (1 + k p), k its
+    stiffening, p0 half of the supply's pressure (Merritt 1967, chapter 1: effective modulus).
     Enters as V_dead dp/dt / b (continuity; Merritt 1967, chapter 3), in proportion to the 1/b
     that all chambers share: a shape, so that b stays one. For one chamber the others separate it
     from a smaller b; the same volume in all chambers is separated only by the change of V with the
@@ -173,14 +175,15 @@ class DeadVolume(Effect):
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber.
 
-        Its stiffening [1/Pa] is a detail.
+        It is not below the stated pipe's volume, negative. Its stiffening [1/Pa] is a detail.
         """
         cap, rod = map(float, rig.chamber_volumes(self.joint, np.zeros(())))
         known = cap if self.side == "cap" else rod
-        grid = (0.05 * known, 0.25 * known, 1.0 * known)
+        stated = self._stated(rig)
+        grid = (-0.2 * stated, 0.05 * known, 0.25 * known, 1.0 * known)
         volume, stiffening = self.shape_names()
         return (
-            Shape(volume, "m^3", 0.0, MOST_VOLUME * known, grid, 0.0),
+            Shape(volume, "m^3", -stated, MOST_VOLUME * known, grid, 0.0),
             Shape(stiffening, "1/Pa", 0.0, 1e-6, (1e-7,), resolution=True, detail=True),
         )
 
@@ -192,6 +195,22 @@ class DeadVolume(Effect):
         slack, stiffening = self.slack(rig, shape)
         V[:, self.joint] += slack / (1.0 + stiffening * np.maximum(p, 0.0))
         return replace(signals, **{field: V})
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the pipe's volume where the rig file has too much."""
+        stated = self._stated(rig)
+        more = self.shape_of(rig, shape)[0]
+        if more >= 0.0:
+            return ""
+        return (
+            f"by these records the pipe holds {plain(1e6 * (stated + more), 3)} cm³, not the "
+            f"{plain(1e6 * stated, 3)} cm³ of the rig file (`{self.side}_pipe_volume`)"
+        )
+
+    def _stated(self, rig: Rig) -> float:
+        """Return the volume of the chamber's pipe in the rig file [m^3]."""
+        cylinder = rig.joints[self.joint].cylinder
+        return float(cylinder.cap_pipe_volume if self.side == "cap" else cylinder.rod_pipe_volume)
 
     def slack(self, rig: Rig, shape: Sequence[float]) -> tuple[float, float]:
         """Return the volume [m^3] at no pressure and its stiffening [1/Pa]."""

@@ -23,6 +23,7 @@ from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
+from tests.analysis import small_bench
 from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs, understated
 
 BOTH = (
@@ -305,3 +306,20 @@ def test_a_null_that_may_be_the_sensors_own_is_confounded_with_it(rig: Rig) -> N
     assert found.parameters["u_null_2"].value == pytest.approx(3e-3, rel=0.05)
     assert ("sensor_offset", "joint 2") in [(r.name, r.where) for r in found.rivals if r.tied]
     assert result.next_experiment is None  # no data of this rig can tell them apart
+
+
+def test_a_pipe_of_which_the_rig_file_states_too_much_is_found(rig: Rig) -> None:
+    """The cap side's pipe of joint 2 holds 63 cm³; the file says 1.6 times as much."""
+    joint = rig.joints[1]
+    true = joint.cylinder.cap_pipe_volume
+    cylinder = joint.cylinder.model_copy(update={"cap_pipe_volume": 1.6 * true})
+    joints = (rig.joints[0], joint.model_copy(update={"cylinder": cylinder}))
+    wrong = rig.model_copy(update={"joints": joints})
+    train, held_out = (replace(run, rig=wrong) for run in pair_of_runs(rig))
+    found = trace([train], [held_out], look_ahead=False)
+    assert (found.verdict, [(e.name, e.where) for e in found.effects]) == (
+        "explained", [("dead_volume", "joint 2 cap")]
+    )  # fmt: skip
+    assert found.effects[0].parameters["V_dead_2_cap"].value == pytest.approx(-0.6 * true, rel=0.01)
+    assert found.model_after.values["b"] == pytest.approx(small_bench.TRUTH["b"], rel=2e-3)
+    assert any("the pipe holds 63 cm³, not the 101 cm³ of the rig file" in n for n in found.notes)
