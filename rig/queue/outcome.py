@@ -40,11 +40,11 @@ class ItemOutcome:
         """Return the outcome with a further reason."""
         return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
 
-    def as_requested(self, state: str) -> ItemOutcome:
-        """Return the outcome with `state` if the process ended on that request."""
+    def as_requested(self, state: str, why: str) -> ItemOutcome:
+        """Return the outcome with `state` and the reason `why` if the process ended on request."""
         if not state or self.state not in (it.STOPPED, it.FAILED):
             return self
-        return replace(self, state=state, latched=False, in_use=False)
+        return ItemOutcome(state, why).adding(self.reason)
 
 
 def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:

@@ -82,7 +82,7 @@ def start(
 def ask_to_end(pid: int) -> None:
     """Send SIGTERM, on which a run zeroes its outputs and ends; ignores an ended process."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.kill(pid, signal.SIGINT)
+        os.kill(pid, signal.SIGTERM)
 
 
 def call(

@@ -294,7 +294,7 @@ class Runner:
             raise
         began = store.is_run(Path(item.run))
         outcome = outcome_of(child.returncode, processes.reason_of(path), began=began)
-        return outcome.as_requested(request)
+        return outcome.as_requested(request, self._why(request))
 
     def _watch(self, item: Item, over: Callable[[], bool], pid: Callable[[], int | None]) -> str:
         """Wait until a process has ended; return the state for which it was asked to end, or ''."""
@@ -410,7 +410,11 @@ class Runner:
             )
             request = self._watch(item, lambda: not held(lock), lambda: _pid_of(item)) or request
         said = processes.reason_of(log_of(self._queue.path, item))
-        return outcome_of_folder(Path(item.run), said).as_requested(request)
+        return outcome_of_folder(Path(item.run), said).as_requested(request, self._why(request))
+
+    def _why(self, request: str) -> str:
+        """Return why a process was asked to end, for the state that was requested."""
+        return "cancelled by a person" if request == it.CANCELLED else self._stop.reason or ""
 
     def _notify(self, event: str, item: Item | None, reason: str) -> None:
         counts = Counter(other.state for other in self._queue.items())

@@ -213,6 +213,7 @@ def test_pause_lets_the_present_item_end_and_nothing_more_start(night: Night) ->
         store.cancel(1, "me")
     assert child.wait(LONG) == 1
     assert night.states() == ["cancelled", "queued"]
+    assert night.item(1).reason.startswith("cancelled by a person; stopped by SIGTERM")
     run = Path(night.item(1).run)
     assert (run / "state").read_text() == "aborted\n"
     told = run.with_suffix(".device").read_text().split()
@@ -224,14 +225,21 @@ def test_pause_lets_the_present_item_end_and_nothing_more_start(night: Night) ->
     assert night.states() == ["cancelled", "done"]
 
 
-def test_ctrl_c_at_the_runner_ends_the_item_safely(night: Night) -> None:
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [(2, "stopped by operator (Ctrl-C)"), (1, "stopped because the terminal closed")],
+)
+def test_a_signal_at_the_runner_ends_the_item_safely(
+    night: Night, number: int, reason: str
+) -> None:
     night.add("endless")
     night.add("done")
     child = night.process()
     until(lambda: night.starts(1) == 1, "the item runs")
-    child.send_signal(2)
+    child.send_signal(number)
     assert child.wait(LONG) == 130
     assert night.states() == ["stopped", "queued"]
+    assert night.item(1).reason == f"{reason}; stopped by SIGTERM"
     assert Path(night.item(1).run).with_suffix(".device").read_text().split()[-3] == "zero"
 
 
