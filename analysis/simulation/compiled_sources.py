@@ -37,7 +37,7 @@ def key_of(source: str) -> str:
     """Return the hash of a source and of everything that its compiled code depends on."""
     versions = [platform.python_version(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
     machine = [platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
-    whole = "\n".join((*versions, *machine, str(config.CACHE_DIR), source))
+    whole = "\n".join((*versions, *machine, source))
     return hashlib.sha256(whole.encode()).hexdigest()[:32]
 
 
@@ -88,11 +88,18 @@ def compiled_now(source: str, subject: str) -> Any:
 
 
 def _run(source: str, path: Path) -> Any:
-    """Execute a source as the file at `path`; numba compiles it, or loads it from that folder."""
+    """Execute a source as the file at `path`; numba compiles it, or loads it from that folder.
+
+    Its files are in that folder whatever NUMBA_CACHE_DIR states, so that their checksums hold.
+    """
     # numba finds the module of the code that it loads by this name.
     module = ModuleType(f"bramah_rates_{key_of(source)}")
     sys.modules[module.__name__] = module
-    exec(compile(source, str(path), "exec"), module.__dict__)
+    stated, config.CACHE_DIR = config.CACHE_DIR, ""
+    try:
+        exec(compile(source, str(path), "exec"), module.__dict__)
+    finally:
+        config.CACHE_DIR = stated
     return module.rates
 
 

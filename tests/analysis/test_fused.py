@@ -12,6 +12,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -342,6 +343,19 @@ def test_a_damaged_cache_is_made_again_and_the_numbers_stay(
     caplog.clear()
     run_small()
     assert caplog.text == ""  # and what was made again is whole
+
+
+def test_a_folder_that_numba_is_to_use_for_its_files_harms_no_compiled_code(
+    cache: Path, caplog: pytest.LogCaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NUMBA_CACHE_DIR is set: the code stands beside its checksums all the same."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "numba"))
+    q = run_small()[1]
+    forget()
+    caplog.clear()
+    np.testing.assert_array_equal(run_small()[1], q)
+    assert caplog.text == ""
+    assert str(tmp_path / "numba") == numba.config.CACHE_DIR
 
 
 def test_code_that_belongs_to_another_source_is_never_run(
