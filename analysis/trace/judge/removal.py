@@ -91,31 +91,33 @@ def removal_of(
     """
     before, now = energy_above_noise(holdout_data, without), energy_above_noise(holdout_data, after)
     shares, above = {}, set()
-    for equation in before.keys() & changes.keys():
-        rows = _rows_of(holdout_data, equation)
-        change = without[rows] - after[rows]
+    for equation in changes:  # in their order: a set's would change the sum's last digit
+        if equation not in before:
+            continue
+        start = _residual_of(holdout_data, without, (equation,))
+        change = start - _residual_of(holdout_data, after, (equation,))
         size = float(np.linalg.norm(change))
-        if before[equation] > TRACE.standard_errors * np.sqrt(2.0 * len(rows)):
+        if before[equation] > TRACE.standard_errors * np.sqrt(2.0 * len(start)):
             above.add(equation)
             shares[equation] = max(-1.0, 1.0 - max(0.0, now[equation]) / before[equation])
         elif size > 2.0 * TRACE.standard_errors:
             # 1 on average if the effect is right, 0 if there is none; the noise makes it 1 / size.
-            shares[equation] = float(np.clip(without[rows] @ change / size**2, -1.0, 1.0))
+            shares[equation] = float(np.clip(start @ change / size**2, -1.0, 1.0))
     total = sum(changes[e] for e in shares)
     share = sum(changes[e] * v for e, v in shares.items()) / total if total > 0.0 else 0.0
     return Removal(share, bool(shares) and not above)
 
 
-def _rows_of(data: RegressionData, equation: str) -> NDArray[np.int64]:
-    """Return the numbers (m,) of an equation's rows."""
-    parts = [s.where for s in data.segments if s.equation == equation]
-    return np.concatenate([np.arange(part.start, part.stop) for part in parts])
-
-
 def rms_in(data: RegressionData, residual: Array, equations: Collection[str]) -> float:
     """Return the rms of whitened residuals (M,) in some equations; NaN where they have no rows."""
+    part = _residual_of(data, residual, equations)
+    return float(np.sqrt(np.mean(part**2))) if len(part) else float("nan")
+
+
+def _residual_of(data: RegressionData, residual: Array, equations: Collection[str]) -> Array:
+    """Return the part (m,) of a residual (M,) in some equations."""
     parts = [residual[s.where] for s in data.segments if s.equation in equations]
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
