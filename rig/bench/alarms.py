@@ -16,9 +16,15 @@ from rig.model.trips import Violation, describe
 
 log = logging.getLogger(__name__)
 
-_OF_EVENTS = frozenset({"tick", "time"})  # of an alarm: every event has its own, `t` and the date
+# Of an alarm or a violation: every event has its own tick, and the time in the run and the date.
+_OF_EVENTS = frozenset({"tick", "time", "seconds"})
 
 OnEvent = Callable[[str, int | None, Mapping[str, Any]], None]
+
+
+def event_fields(what: Alarm | Violation) -> dict[str, Any]:
+    """Return the data of an alarm or violation for an event, without what every event has."""
+    return {k: v for k, v in asdict(what).items() if k not in _OF_EVENTS}
 
 
 class AlarmLog:
@@ -80,8 +86,7 @@ class AlarmLog:
         )
         if not alarm.trips:
             log.warning("warning: %s", alarm.sentence)
-        about = {k: v for k, v in asdict(now).items() if k not in _OF_EVENTS}
-        self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **about})
+        self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **event_fields(now)})
         return alarm.key
 
     def acknowledge(self, key: str | None, tick: int) -> None:

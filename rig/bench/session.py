@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -30,7 +30,7 @@ from drivers.base import (
     SampleBlock,
 )
 from rig.bench.after_zero import record_zero
-from rig.bench.alarms import AlarmLog
+from rig.bench.alarms import AlarmLog, event_fields
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
 from rig.bench.latch import BenchState
@@ -59,7 +59,6 @@ from rig.runs.recorder import Recorder, RecordMeta
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 _CONTROLS = {TAKE: "taken", RELEASE: "released"}
-_OF_EVENTS = frozenset({"tick", "seconds"})  # of a violation: every event has them itself
 
 
 class Bench:
@@ -376,7 +375,7 @@ class Bench:
 
     def _report(self, trip: SafetyTrip) -> None:
         log.info("%s", trip)
-        about = {k: v for k, v in asdict(trip.violation).items() if k not in _OF_EVENTS}
+        about = event_fields(trip.violation)
         with suppress(RecordingFailed):  # the trip is the error to report
             self.event("trip", trip.tick, message=str(trip), **about)
 
