@@ -44,6 +44,14 @@ def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
     return described, make_driver(described.wire, described)
 
 
+def refuse_endpoint_alone(rig: str | None, endpoint: str | None) -> None:
+    """Raise InputError for an endpoint without a rig, which says what is at it."""
+    from rig.model.parse import InputError
+
+    if rig is None and endpoint is not None:
+        raise InputError("--endpoint does not say what is there; name the bench: --rig RIG")
+
+
 def the_only(rigs: list[Path], none: str, state: str) -> Path:
     """Return the description of the only bench of this computer in a state (`tripped`, `in use`).
 

@@ -20,7 +20,12 @@ from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.execution.attended import TrackedEstimates, terminal_lines
-from rig.cli.execution.device import bench_at, device_of, the_only
+from rig.cli.execution.device import (
+    bench_at,
+    device_of,
+    refuse_endpoint_alone,
+    the_only,
+)
 from rig.cli.proof.proofs import proved
 from rig.cli.proof.space import require_space
 from rig.cli.proof.twin_choice import twin_source
@@ -169,8 +174,7 @@ def reset_device(rig: str | None, endpoint: str | None, reason: str) -> str:
     `rig` may be the name in a rig file too, as messages on a trip state it: the rig is then that
     which was driven last under this name. Without one it is the only bench with a stored trip.
     """
-    if rig is None and endpoint is not None:
-        raise InputError("reset: name the bench at --endpoint: --rig RIG")
+    refuse_endpoint_alone(rig, endpoint)
     if rig is None:
         rig = str(the_only(tripped_rigs(), "no trip is stored on this computer", "tripped"))
     try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
-from rig.cli.execution.device import device_of, print_pressure
+from rig.cli.execution.device import device_of, print_pressure, refuse_endpoint_alone
 from rig.cli.options import EndpointOption, KnownRigOption
 from rig.cli.text.output import progress
 
@@ -38,9 +38,10 @@ def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     from rig.bench.latch import rigs_in_use
     from rig.model.parse import InputError
 
+    refuse_endpoint_alone(rig, endpoint)
     rigs = [rig] if rig is not None else [str(path) for path in rigs_in_use()]
-    if not rigs or (rig is None and endpoint is not None):
-        raise InputError(f"{'' if rigs else f'{NOT_IN_USE}; '}name the bench: --rig RIG")
+    if not rigs:
+        raise InputError(f"{NOT_IN_USE}; name the bench: --rig RIG")
     errors: list[Exception] = []
     for known in rigs:  # an error of one bench must not keep another from being stopped
         try:
