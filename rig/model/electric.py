@@ -15,12 +15,7 @@ from rig.model import channels as ch
 from rig.model.parameters import inertia_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.parts import Array, Part
-from rig.model.quantity import (
-    Length,
-    Time,
-    UnitError,
-    parse_quantity,
-)
+from rig.model.quantity import Length, Time, UnitError, parse_quantity
 
 UNKNOWN = "unknown"
 INCLINATION = "base_inclination"

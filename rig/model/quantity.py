@@ -36,7 +36,7 @@ def _registry() -> Any:
 
 
 @functools.cache
-def _linear_map(unit: str, si: str) -> tuple[float, float]:
+def unit_map(unit: str, si: str) -> tuple[float, float]:
     """Return (scale, offset) with value_si = scale * value + offset.
 
     Raises UnitError for an unknown unit or one of another dimension.
@@ -55,7 +55,7 @@ def _other_dimension(unit: str, si: str) -> UnitError:
 
 
 def map_by_pint(unit: str, si: str) -> tuple[float, float]:
-    """Return (scale, offset) as `_linear_map`, for any unit that pint knows; raises UnitError."""
+    """Return (scale, offset) as `unit_map`, for any unit that pint knows; raises UnitError."""
     registry = _registry()
     text = unit or "dimensionless"
     target = si or "dimensionless"
@@ -73,13 +73,8 @@ def map_by_pint(unit: str, si: str) -> tuple[float, float]:
 
 def to_si(value: float, unit: str, si: str) -> float:
     """Convert a number in `unit` to the SI unit `si` (a float; raises UnitError)."""
-    scale, offset = _linear_map(unit, si)
+    scale, offset = unit_map(unit, si)
     return scale * value + offset
-
-
-def unit_map(unit: str, si: str) -> tuple[float, float]:
-    """Return (scale, offset) of the map from `unit` to `si`, for whole arrays."""
-    return _linear_map(unit, si)
 
 
 def parse_quantity(text: str, si: str) -> float:

@@ -6,9 +6,9 @@ independently of the others. Without the section the numbers count as exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from pydantic import Field, ValidationError
 
@@ -27,25 +27,12 @@ class Tolerances(Part):
     mid_length: Length = Field(default=0.0, ge=0, description="of mid_length [m]")
 
 
-class _Kind(NamedTuple):
-    stated: Callable[[Tolerances], float]
-    part: str
-    keys: tuple[str, ...]
-    relative: bool
-
-
+# Of each tolerance: the part of a joint, its keys, and whether it is relative to the number.
 _KINDS: Final = {
-    "area": _Kind(lambda stated: stated.area, "cylinder", ("cap_area", "rod_area"), relative=True),
-    "volume": _Kind(
-        lambda stated: stated.volume,
-        "cylinder",
-        ("cap_pipe_volume", "rod_pipe_volume"),
-        relative=True,
-    ),
-    "pin": _Kind(lambda stated: stated.pin, "linkage", ("base_pin", "arm_pin"), relative=False),
-    "mid_length": _Kind(
-        lambda stated: stated.mid_length, "linkage", ("mid_length",), relative=False
-    ),
+    "area": ("cylinder", ("cap_area", "rod_area"), True),
+    "volume": ("cylinder", ("cap_pipe_volume", "rod_pipe_volume"), True),
+    "pin": ("linkage", ("base_pin", "arm_pin"), False),
+    "mid_length": ("linkage", ("mid_length",), False),
 }
 
 
@@ -87,13 +74,13 @@ def uncertain_numbers(
         return ()
     out = []
     for i, joint in enumerate(joints):
-        for name, kind in _KINDS.items():
-            stated = kind.stated(tolerances)
-            words = f"{100 * stated:.3g} %" if kind.relative else f"{1e3 * stated:.3g} mm"
-            for key in kind.keys:
-                size = getattr(getattr(joint, kind.part), key) if kind.relative else 1.0
+        for kind, (part, keys, relative) in _KINDS.items():
+            stated = getattr(tolerances, kind)
+            words = f"{100 * stated:.3g} %" if relative else f"{1e3 * stated:.3g} mm"
+            for key in keys:
+                size = getattr(getattr(joint, part), key) if relative else 1.0
                 if stated > 0:
-                    out.append(UncertainNumber(i, name, kind.part, key, stated * size, words))
+                    out.append(UncertainNumber(i, kind, part, key, stated * size, words))
     return tuple(out)
 
 

@@ -55,7 +55,7 @@ def _message(
     for signal, bits in signals.items():
         placed.append(_signal(signal, start, bits, sender))
         start += bits
-    return _whole(name, identifier, -(-start // 8), placed, sender, note=note)
+    return Message(identifier, name, -(-start // 8), placed, comment=note, senders=[sender])
 
 
 def _parts(
@@ -64,7 +64,7 @@ def _parts(
     (signal,) = signals
     note = "Part of a message: its place in the first byte, its bytes in the others."
     placed = [_signal(signal, 0, 8, sender)]
-    return _whole(name, identifier, size, placed, sender, note=note)
+    return Message(identifier, name, size, placed, comment=note, senders=[sender])
 
 
 def _rows(rig: Rig, size: int) -> Iterator[Message]:
@@ -82,26 +82,19 @@ def _rows(rig: Rig, size: int) -> Iterator[Message]:
 def _row(index: int, bits: int, signals: list[Signal]) -> Message:
     size = next(size for size in names.FD_SIZES if 8 * size >= bits)
     note = "Samples of one tick; the frames of a row follow each other."
-    return _whole(f"bench_row_{index + 1}", ROW_ID + index, size, signals, BENCH, note=note)
+    name = f"bench_row_{index + 1}"
+    return Message(ROW_ID + index, name, size, signals, comment=note, senders=[BENCH])
 
 
 def _column(rig: Rig, name: str, start: int) -> Signal:
-    kind, joint = ch.kind_of(name)
-    if kind == ch.COMMAND:
-        valve = rig.joints[(joint or 1) - 1].valve
-        top = (1 << (valve.command_bits - 1)) - 1
-        low, high, least = 0.0, valve.command_range, -valve.command_range
-    else:
-        sensor = rig.sensors.of(kind)
-        (low, high), top = sensor.range, (1 << sensor.bits) - 1
-        least = low
+    low, high, top, signed = names.converter_of(rig, name)
     return Signal(
         name,
         start,
         _COLUMN_BITS,
-        is_signed=kind == ch.COMMAND,
+        is_signed=signed,
         conversion=BaseConversion.factory((high - low) / top, low),
-        minimum=least,
+        minimum=-high if signed else low,
         maximum=high,
         unit=ch.unit_of(name),
         receivers=[HOST],
@@ -110,15 +103,3 @@ def _column(rig: Rig, name: str, start: int) -> Signal:
 
 def _signal(name: str, start: int, bits: int, sender: str) -> Signal:
     return Signal(name, start, bits, receivers=[HOST if sender == BENCH else BENCH])
-
-
-def _whole(
-    name: str,
-    identifier: int,
-    size: int,
-    signals: list[Signal],
-    sender: str,
-    *,
-    note: str,
-) -> Message:
-    return Message(identifier, name, size, signals, comment=note, senders=[sender])

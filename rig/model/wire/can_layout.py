@@ -262,14 +262,7 @@ class _Reader:
         )
 
     def _same_conversion(self, signal: Any, rig: Rig) -> None:
-        kind, joint = ch.kind_of(signal.name)
-        if kind == ch.COMMAND:
-            valve = rig.joints[(joint or 1) - 1].valve
-            low, high = 0.0, valve.command_range
-            top, signed = (1 << (valve.command_bits - 1)) - 1, True
-        else:
-            sensor = rig.sensors.of(kind)
-            (low, high), top, signed = sensor.range, (1 << sensor.bits) - 1, False
+        low, high, top, signed = converter_of(rig, signal.name)
         step = (high - low) / top
         scale, offset = float(signal.scale), float(signal.offset)
         if (
@@ -283,6 +276,16 @@ class _Reader:
                 f"{', signed' if signal.is_signed else ''}; rig {rig.name!r} converts by "
                 f"{step:.9g} and {low:.9g} {unit}{', signed' if signed else ''}"
             )
+
+
+def converter_of(rig: Rig, name: str) -> tuple[float, float, int, bool]:
+    """Return (value of code 0, of the largest code [SI], largest code, whether signed)."""
+    kind, joint = ch.kind_of(name)
+    if kind == ch.COMMAND:
+        valve = rig.joints[(joint or 1) - 1].valve
+        return 0.0, valve.command_range, (1 << (valve.command_bits - 1)) - 1, True
+    sensor = rig.sensors.of(kind)
+    return *sensor.range, (1 << sensor.bits) - 1, False
 
 
 def _bits(rig: Rig, name: str) -> int:
