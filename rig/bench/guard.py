@@ -19,32 +19,16 @@ from numpy.typing import NDArray
 from drivers.base import SampleBlock
 from rig.bench.checks import bands
 from rig.bench.checks.active_warnings import ActiveWarnings, Key
-from rig.bench.checks.frozen import Frozen
+from rig.bench.checks.bands import EXCITED, FREE, JOGGED, JointRole, piston_bounds
+from rig.bench.checks.catalogue import catalogue
 from rig.bench.checks.plausibility import Plausibility
 from rig.bench.checks.rates import rate_window, rates
 from rig.bench.checks.recent import Recent
-from rig.bench.checks.roles import EXCITED, FREE, JOGGED, JointRole, piston_bounds
-from rig.bench.checks.saturation import Saturation
 from rig.bench.checks.settings import GuardSettings
+from rig.bench.checks.single_sensor import Frozen, Saturation
 from rig.model import channels as ch
 from rig.model.rig import Rig
-from rig.model.trips import (
-    ABOVE_SUPPLY,
-    DEVICE,
-    DRIFTS,
-    EMPTY_CHAMBER,
-    FINITE,
-    FROZEN,
-    GAP,
-    NOISY,
-    NOT_FOLLOWING,
-    NOTHING_MOVES,
-    SENSOR_DRIFT,
-    STALE,
-    SUPPLY_LOST,
-    SWAPPED,
-    Violation,
-)
+from rig.model.trips import DEVICE, FINITE, FROZEN, GAP, STALE, Violation
 
 __all__ = [
     "EXCITED", "FREE", "JOGGED", "Guard", "GuardSettings", "JointRole", "piston_bounds",
@@ -53,18 +37,11 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# Checks whose action the rig file sets (`rig.model.alarms.bands.CheckActions`).
+# Checks whose action the rig file sets, by name (`rig.model.alarms.bands.CheckActions`).
 ACTIONS: Final = {
-    FROZEN: "frozen_sensor",
-    NOT_FOLLOWING: "spool_not_following",
-    EMPTY_CHAMBER: "chamber_without_pressure",
-    SUPPLY_LOST: "supply_lost",
-    NOTHING_MOVES: "nothing_moves",
-    ABOVE_SUPPLY: "pressure_above_supply",
-    DRIFTS: "drift_at_rest",
-    NOISY: "noisy_sensor",
-    SWAPPED: "swapped_pressures",
-    SENSOR_DRIFT: "drifting_pressure_sensor",
+    text.limit: text.key.removeprefix("checks.")
+    for text in catalogue()
+    if text.key.startswith("checks.")
 }
 
 

@@ -1,4 +1,4 @@
-"""A driver whose outputs are zeroed before any error of a call is raised."""
+"""A driver whose outputs are zeroed before any error of a call is raised; proof that they are."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Final, TypeVar
+
+import numpy as np
 
 from drivers.base import (
     DeviceError,
@@ -20,6 +22,7 @@ from drivers.base import (
 )
 from rig.bench.settings import BENCH
 from rig.model.rig import Rig
+from rig.model.trips import RecordingFailed
 
 log = logging.getLogger(__name__)
 Result = TypeVar("Result")
@@ -133,6 +136,35 @@ class Outputs:
         return [
             _bounded(law, joint.limits.command) for law, joint in zip(laws, joints, strict=True)
         ]
+
+    def record_zero(
+        self, keep: Callable[[SampleBlock], None], clock: Callable[[], float], seconds: float
+    ) -> bool:
+        """Record blocks until every command has been zero for `seconds` of consecutive samples.
+
+        Call with the outputs zeroed. Returns False if the device still reports a command at the
+        end. Ends early if the device or the disk fails, and after `seconds` plus
+        `BENCH.queued_seconds` of device time, or that much wall time plus two answer times.
+        """
+        rig = self._rig
+        wanted = round(seconds * rig.sample_rate)
+        most = round((seconds + BENCH.queued_seconds) * rig.sample_rate)
+        deadline = clock() + seconds + BENCH.queued_seconds + 2 * rig.wire.timeout
+        quiet = taken = 0
+        moving = False
+        while quiet < wanted and taken < most and clock() < deadline:
+            try:
+                block = self.safely(self.driver.read_block)
+                keep(block)
+            except (DeviceError, RecordingFailed) as error:
+                log.warning("%.1f s recorded after zeroing: %s", taken / rig.sample_rate, error)
+                return True
+            nonzero = np.flatnonzero((block.data[:, len(rig.channels) :] != 0.0).any(axis=1))
+            since = len(block.data) - 1 - int(nonzero[-1]) if len(nonzero) else None
+            moving = since == 0
+            quiet = quiet + len(block.data) if since is None else since
+            taken += len(block.data)
+        return not moving
 
     def close(self, *, tripped: bool = False) -> bool:
         """Zero again, stop the stream, close the wire; return whether zero is sure; never raise.

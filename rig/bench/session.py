@@ -29,17 +29,15 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
 )
-from rig.bench.after_zero import record_zero
 from rig.bench.alarms import AlarmLog, event_fields
 from rig.bench.guard import Guard, GuardSettings, JointRole
-from rig.bench.handles import RecordHandle
 from rig.bench.latch import BenchState
 from rig.bench.lateness import ArrivalClock, HostTiming
-from rig.bench.observers import Observers
+from rig.bench.observers import Observers, RecordHandle
 from rig.bench.outputs import UNSURE, Outputs
 from rig.bench.screens.commands import ACKNOWLEDGE, RELEASE, STOP, TAKE, Judge
 from rig.bench.screens.display import LOST, Display
-from rig.bench.screens.past import PlanLine
+from rig.bench.screens.snapshot import PlanLine
 from rig.bench.screens.sockets import Publisher
 from rig.bench.settings import BENCH
 from rig.bench.stops import StopFlag
@@ -105,9 +103,8 @@ class Bench:
         self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
         self._judge: Judge | None = None
-        self.recorded_after = (
-            BENCH.zero_seconds
-        )  # [s] recorded with the outputs at zero after an early end
+        # Recorded with the outputs at zero after an early end [s].
+        self.recorded_after = BENCH.zero_seconds
 
     # Entry and exit
 
@@ -222,14 +219,9 @@ class Bench:
             # The last picture on a screen has the outputs at zero.
             self._display.show(block, 0.0, self.lost_samples, self._guard.roles)
 
-        seconds = self.recorded_after
-
-        def read() -> SampleBlock:
-            return self._outputs.safely(self._driver.read_block)
-
-        after_zero = record_zero(self.rig, read, keep, self._clock, seconds)
+        at_zero = self._outputs.record_zero(keep, self._clock, self.recorded_after)
         self._display.last()
-        return after_zero is not False
+        return at_zero
 
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:
         if self.recorder is None:
@@ -499,8 +491,6 @@ def _outcome(error: BaseException | None) -> tuple[str, str]:
         return runstate.TRIPPED, str(error)
     if isinstance(error, KeyboardInterrupt):
         return runstate.ABORTED, "stopped by operator (Ctrl-C)"
-    if isinstance(
-        error, DeviceError
-    ):  # the message tells a reader of the folder that the device was the cause
+    if isinstance(error, DeviceError):  # a reader of the folder sees that the device was the cause
         return runstate.ABORTED, f"device: {error}"
     return runstate.ABORTED, str(error) or type(error).__name__

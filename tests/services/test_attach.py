@@ -24,8 +24,17 @@ from hypothesis import strategies as st
 from drivers.base import DeviceLost, SampleBlock
 from rig.bench.guard import EXCITED, JointRole
 from rig.bench.screens.commands import CommandHolder
-from rig.bench.screens.past import KEPT, PastKeeper, PastMinute, PlanLine, past_from
-from rig.bench.screens.snapshot import Snapshot, decimate, from_json, to_json
+from rig.bench.screens.snapshot import (
+    KEPT,
+    PastKeeper,
+    PastMinute,
+    PlanLine,
+    Snapshot,
+    decimate,
+    from_json,
+    past_from,
+    to_json,
+)
 from rig.bench.screens.sockets import AttachError, Attachment, Command, Endpoint, Publisher
 from rig.bench.session import Bench
 from rig.model.trips import OperatorStop, SafetyTrip

@@ -10,7 +10,7 @@ from pathlib import Path
 from textual.pilot import Pilot
 
 from rig.bench.screens.commands import Command
-from rig.bench.screens.past import PastMinute
+from rig.bench.screens.snapshot import PastMinute
 from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.tui.app import Monitor
 from rig.tui.following.link import SnapshotSource

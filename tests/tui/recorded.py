@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.bench.screens.past import PastMinute, PlanLine
+from rig.bench.screens.snapshot import PastMinute, PlanLine
 from rig.bench.screens.sockets import ChannelView, Snapshot
 from rig.model.alarms.states import Alarm, AlarmState
 

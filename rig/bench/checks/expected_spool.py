@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-_SQUARINGS, _TERMS = (
-    10,
-    8,
-)  # terms of the series of the matrix exponential: exact to rounding for small w dt
+# Of the series of the matrix exponential: exact to rounding for small w dt.
+_SQUARINGS, _TERMS = 10, 8
 _AT_ONCE: Final = 128  # samples
 
 

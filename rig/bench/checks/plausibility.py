@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from drivers.base import SampleBlock
 from rig.bench.checks import pressure_sensors
 from rig.bench.checks.active_warnings import Key, key_of
+from rig.bench.checks.bands import JointRole
 from rig.bench.checks.expected_spool import ExpectedSpool
-from rig.bench.checks.frozen import SWING
 from rig.bench.checks.pressure_sensors import PressureFinding, SlowRows
-from rig.bench.checks.roles import JointRole
 from rig.bench.checks.settings import GuardSettings
+from rig.bench.checks.single_sensor import SWING
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.trips import (

@@ -22,9 +22,8 @@ class GuardSettings:
 
     # Warnings: against chatter
     warning_delay: float = 0.05  # [s] outside the band; five blocks of the shipped bench
-    dead_band: float = (
-        0.02  # hysteresis: share of the band's width; four times the noise of a worn sensor
-    )
+    # Hysteresis: share of the band's width; four times the noise of a worn sensor.
+    dead_band: float = 0.02
     return_after: float = 1.0  # [s] inside before a warning ends; time for a person to read it
 
     # Plausibility: features over a window, every `hop`
@@ -50,18 +49,16 @@ class GuardSettings:
     # Swings of a closed cylinder's pressures against each other; sound: within 1.2 of the ratio
     # that its volumes say, correlated by -0.97; plugs exchanged: 10 times off.
     swing_span: float = 1.0  # [s]; a period of 1 Hz
-    swing_noise: float = (
-        5.0  # times the noise of a 20 ms mean, standard deviation; smaller swings are not judged
-    )
+    # Times the noise of a 20 ms mean, standard deviation; smaller swings are not judged.
+    swing_noise: float = 5.0
     swing_factor: float = 3.0  # off the ratio either way: the sensor is not of this cylinder
     swing_match: float = 1.5  # off the ratio at most: another joint's sensor is
     swing_phase: float = 0.9  # least correlation of opposite phase
     # Trend of an excited joint's force that its motion does not explain
     trend_span: float = 2.0  # [s]; two periods of 1 Hz
     trend: float = 0.1  # of supply.pressure over the span
-    trend_alone: float = (
-        0.7  # share of the variance of time that the motion must not explain: excludes slow ramps
-    )
+    # Share of the variance of time that the motion must not explain: excludes slow ramps.
+    trend_alone: float = 0.7
     trend_clear: float = 2.0  # times the residual without it
     trend_other: float = 0.25  # of the drifting sensor's trend, in the other chamber, at most
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,8 +15,14 @@ from drivers.base import SampleBlock
 from rig.bench.checks import bands
 from rig.bench.guard import GuardSettings, JointRole, piston_bounds
 from rig.bench.screens.commands import Command, Judge
-from rig.bench.screens.past import PastKeeper, PlanLine
-from rig.bench.screens.snapshot import Band, BenchView, Progress, take_snapshot
+from rig.bench.screens.snapshot import (
+    Band,
+    BenchView,
+    PastKeeper,
+    PlanLine,
+    Progress,
+    take_snapshot,
+)
 from rig.bench.screens.sockets import Publisher
 from rig.model import channels as ch
 from rig.model.alarms.states import AlarmTable
@@ -131,20 +138,12 @@ class Display:
         limits_by_channel: Limits = {}
         for name in self._units:
             kind, joint = ch.kind_of(name)
-            limits_by_channel[name] = (None, None)
-            if joint is None:
-                shared = self._rig.limits
-                limit = shared.supply_pressure if kind == ch.SUPPLY else shared.oil_temperature
-                limits_by_channel[name] = limit or (None, None)
-                continue
-            limits = self._rig.joints[joint - 1].limits
-            if kind in (ch.CAP, ch.ROD):
-                limits_by_channel[name] = limits.pressure
-            elif kind == ch.COMMAND:
-                limits_by_channel[name] = (-limits.command, limits.command)
-            elif kind == ch.PISTON and self._roles:
-                _, *ends = piston_bounds(self._roles[joint - 1], self._rig, joint - 1)
-                limits_by_channel[name] = (ends[0], ends[1])
+            low, high = self._rig.limits_of(name)
+            if kind == ch.PISTON and joint is not None:
+                low = math.inf  # unknown without a role
+                if self._roles:
+                    _, low, high = piston_bounds(self._roles[joint - 1], self._rig, joint - 1)
+            limits_by_channel[name] = (low, high) if math.isfinite(low) else (None, None)
         return limits_by_channel
 
     def ended(self, state: str, message: str, *, lost: bool = False) -> None:

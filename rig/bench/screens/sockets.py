@@ -5,7 +5,7 @@ Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB:
 commands are polled.
 Requests and answers are JSON (`rig.bench.screens.commands`): {"command", "value", "holder", "pid"},
 then {"ok"}, with a one-line "error" if the command was refused. The answer to "past" has a second
-frame (`rig.bench.screens.past`).
+frame (`rig.bench.screens.snapshot`).
 """
 
 from __future__ import annotations
@@ -36,8 +36,14 @@ from rig.bench.screens.commands import (
     own_command,
     to_bytes,
 )
-from rig.bench.screens.past import PastMinute, past_from
-from rig.bench.screens.snapshot import ChannelView, Snapshot, from_json, to_json
+from rig.bench.screens.snapshot import (
+    ChannelView,
+    PastMinute,
+    Snapshot,
+    from_json,
+    past_from,
+    to_json,
+)
 from rig.runs.runstate import process_alive
 
 __all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", "Snapshot"]
@@ -290,9 +296,8 @@ class Attachment:
 
     def _exchange(self, command: Command, timeout: float) -> list[bytes] | str:
         """Return the frames of the answer, or the reason in one line why there is none."""
-        asking = self._context.socket(
-            zmq.REQ
-        )  # a new socket: one without its answer cannot be used again
+        # A new socket: one without its answer cannot be used again.
+        asking = self._context.socket(zmq.REQ)
         asking.setsockopt(zmq.LINGER, 0)
         try:
             asking.connect(_address(self.endpoint.cmd))

@@ -16,7 +16,7 @@ from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import known_rigs, reset_bench, tripped_rigs
-from rig.bench.screens.past import PlanLine
+from rig.bench.screens.snapshot import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.execution.attended import TrackedEstimates, terminal_lines

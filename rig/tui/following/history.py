@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.screens.past import PastMinute
+from rig.bench.screens.snapshot import PastMinute
 from rig.bench.screens.sockets import ChannelView, Snapshot
 from rig.tui.units import limit
 

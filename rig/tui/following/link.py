@@ -17,7 +17,7 @@ from typing import Final, Protocol
 
 from rig.bench.latch import BenchState
 from rig.bench.screens.commands import Command, own_command
-from rig.bench.screens.past import PastMinute, PlanLine
+from rig.bench.screens.snapshot import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.model.parts import Wire
 from rig.runs.runstate import read_events

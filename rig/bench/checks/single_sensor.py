@@ -1,4 +1,4 @@
-"""Sensors that keep one value while their joint moves.
+"""Sensors that keep one value while their joint moves, or that stay at an end of their range.
 
 A sensor is *frozen* when an excited joint's channel keeps one value over `frozen_after` while that
 joint's command and another of its channels move. This cannot be a slow signal on a coarse
@@ -6,8 +6,7 @@ converter: only sensors whose stated noise is a code or more are judged. Even at
 in a row of such a sensor read the same code with a probability of at most q / (2 sigma sqrt(pi)) <
 0.29 (q: one code), 250 of them with 0.29^249. Noise four times smaller than stated would still need
 a pressure or position constant to a code while the joint moves. In a jog the command is constant
-and nothing else need change: there the position alone is judged. A sensor at an end of its range is
-left to the check for saturation.
+and nothing else need change: there the position alone is judged.
 """
 
 from __future__ import annotations
@@ -17,14 +16,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.base import SampleBlock
+from rig.bench.checks.bands import Counts, first_of, run_lengths
+from rig.bench.checks.settings import GuardSettings
 from rig.model import channels as ch
 from rig.model.rig import Rig
+from rig.model.trips import SATURATED, Violation
 
 Array = NDArray[np.float64]
 
 SWING: Final = 0.05  # share of the command's limit, peak to peak, that moves a joint
 HELD: Final = 0.01  # share of the command's limit that, kept up in a jog, moves a joint
 _MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
+
+
+_VACUUM = -90e3  # no gauge pressure is far below this, so such a range cannot be exceeded
 
 
 class Frozen:
@@ -62,3 +68,46 @@ class Frozen:
         elif np.ptp(command) < self._swing or not (np.ptp(values, axis=0) > self._moved).any():
             return None
         return int(self._columns[np.argmax(still)]) if still.any() else None
+
+
+class Saturation:
+    """Finds channels whose samples stay at an end of their range, across blocks."""
+
+    def __init__(self, rig: Rig, settings: GuardSettings) -> None:
+        self._rig = rig
+        counts, middles = [], []
+        for name in rig.channels:
+            kind, _ = ch.kind_of(name)
+            low, high = rig.sensors.of(kind).range
+            vacuum = kind in (ch.CAP, ch.ROD) and low <= _VACUUM
+            usual = settings.saturated_samples
+            counts.append((usual, settings.saturated_samples_vacuum if vacuum else usual))
+            middles.append((low + high) / 2)
+        self._at_high, self._at_low = np.array(counts).T
+        self._middles = np.array(middles)
+        self.forget()
+
+    def forget(self) -> None:
+        """Reset: the next samples do not continue the previous ones."""
+        self._runs: Counts = np.zeros(len(self._middles), dtype=np.int64)
+        self._any = False  # a channel was at an end in the latest block
+
+    def find(self, block: SampleBlock) -> list[Violation]:
+        """Return the violation of the first channel too long at an end; empty if there is none."""
+        if not np.count_nonzero(block.saturated):
+            if self._any:
+                self.forget()
+            return []
+        runs = run_lengths(block.saturated, self._runs)
+        self._runs, self._any = runs[-1], True
+        measured = block.data[:, : runs.shape[1]]
+        over = runs >= np.where(measured > self._middles, self._at_high, self._at_low)
+        if not over.any():
+            return []
+        row, column = first_of(over)
+        name = self._rig.channels[column]
+        kind, joint = ch.kind_of(name)
+        ends = self._rig.sensors.of(kind).range
+        value = float(measured[row, column])
+        tick = block.tick + row
+        return [Violation(SATURATED, value, ends, ch.unit_of(name), joint, name, tick)]
