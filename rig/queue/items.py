@@ -67,7 +67,6 @@ class StartCondition:
     `part` is '' for a channel; value, std or rsd (standard error over value) for a parameter.
     """
 
-    text: str
     name: str
     part: str
     sign: str
@@ -98,7 +97,7 @@ def channel_condition(text: str) -> StartCondition:
         bound = to_si(float(parts["number"]), parts["unit"], unit)
     except ValueError as error:
         raise InputError(f"--when {text!r}: {error}") from error
-    return StartCondition(text, name, "", parts["sign"], bound)
+    return StartCondition(name, "", parts["sign"], bound)
 
 
 def result_condition(text: str) -> StartCondition:
@@ -110,7 +109,7 @@ def result_condition(text: str) -> StartCondition:
     if parts["unit"] not in ("", "%"):
         raise InputError(f"--if {text!r}: the unit is {parts['unit']!r}; expected % or none")
     scale = 0.01 if parts["unit"] else 1.0
-    return StartCondition(text, parts["name"], part, parts["sign"], scale * float(parts["number"]))
+    return StartCondition(parts["name"], part, parts["sign"], scale * float(parts["number"]))
 
 
 def check_wanted(text: str, known: Collection[str]) -> None:
@@ -199,10 +198,14 @@ class QueueJob:
         """Return the arguments of the proof on the twin, with JSON on standard output."""
         return ["check", self.protocol, "--rig", self.rig, *self.options, "--json", "-"]
 
+    @property
+    def bench_words(self) -> list[str]:
+        """The arguments that name the bench."""
+        return ["--rig", self.rig, *(["--endpoint", self.endpoint] if self.endpoint else [])]
+
     def run_words(self, folder: str) -> list[str]:
         """Return the arguments of the run into `folder`."""
-        place = ["--endpoint", self.endpoint] if self.endpoint else []
-        line = ["run", self.protocol, "--rig", self.rig, "--out", folder, *place]
+        line = ["run", self.protocol, *self.bench_words, "--out", folder]
         return [*line, *self.options, *self.run_options]
 
 

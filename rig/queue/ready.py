@@ -30,9 +30,8 @@ class Readiness:
     state: str = ""
 
 
-Reading = Callable[
-    [QueueJob], Mapping[str, float] | str
-]  # channel means in SI, or the reason why they cannot be read
+# Channel means in SI, or the reason why they cannot be read.
+Reading = Callable[[QueueJob], Mapping[str, float] | str]
 InUse = Callable[[QueueJob], str]  # who has the bench, '' where it may be free
 
 

@@ -30,8 +30,8 @@ from rig.queue import items as it
 from rig.queue import processes, ready
 from rig.queue.hook import Hook
 from rig.queue.items import Item, QueueJob
-from rig.queue.locks import LockFile, held, holder
 from rig.queue.outcome import ItemOutcome, outcome_of, outcome_of_folder
+from rig.queue.processes import LockFile, held, holder
 from rig.queue.store import QueueStore
 from rig.runs import runstate, store
 
@@ -231,16 +231,13 @@ class Runner:
         key = (job.rig, job.endpoint)
         kept = self._readings.get(key)
         if kept is None or time.monotonic() - kept[0] > self._settings.probe_every:
-            place = ["--endpoint", job.endpoint] if job.endpoint else []
-            words = ["probe", "--rig", job.rig, *place, "--json", "-"]
+            words = ["probe", *job.bench_words, "--json", "-"]
             answer = self._call(words, self._settings.probe_seconds)
             readings = answer.as_json()
             means: dict[str, float] | str = answer.reason or (
                 f"`bramah probe` wrote {answer.output[:60]!r}, not a JSON list of channels"
             )
-            if isinstance(
-                readings, list
-            ):  # exit code of an implausible channel, which does not matter here
+            if isinstance(readings, list):  # also where the exit code says that one is implausible
                 means = {
                     reading["channel"]: float(reading["mean"])
                     for reading in readings
@@ -344,9 +341,7 @@ class Runner:
 
     def _make_safe(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
         """Zero the outputs of a bench whose process died; the watchdog has probably done so."""
-        job = item.job
-        place = ["--endpoint", job.endpoint] if job.endpoint else []
-        words = ["stop", "--rig", job.rig, *place]
+        words = ["stop", *item.job.bench_words]
         answer = processes.call(self._program, words, self._settings.probe_seconds)
         if answer.code == 0:
             return outcome.adding("outputs confirmed at zero")

@@ -22,16 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.model import channels as ch
+from rig.model.records import Run
 from rig.model.trips import RecordingFailed
+from rig.runs import store
 from rig.runs.archive_reader import FORMAT
 from rig.runs.files import sync_to_disk
 from rig.runs.journal import Journal
-from rig.runs.runstate import BETWEEN, StreamClock, read_events, stream_clocks
+from rig.runs.runstate import BETWEEN, DONE, StreamClock, read_events, stream_clocks, write_state
 from rig.runs.sections import Assembled, Section, Written, assemble, blocks_of, plan
 
 Array = NDArray[np.float64]
 
-NAME = "records.h5"
 _CHUNK = 1 << 14  # chunk size [samples], read and checked as a whole
 
 
@@ -48,9 +49,8 @@ def write_group(
         target.attrs[key] = _plain(value)
     for name, values in columns.items():
         data = np.ascontiguousarray(values, dtype="<f8")
-        whole = (
-            data.ndim == 1 and len(data) > 0
-        )  # a checksum needs chunks, which need a length above 0
+        # A checksum needs chunks, which need a length above 0.
+        whole = data.ndim == 1 and len(data) > 0
         dataset = target.create_dataset(
             name, data=data, fletcher32=whole, chunks=(min(len(data), _CHUNK),) if whole else None
         )
@@ -66,25 +66,18 @@ def _plain(value: Any) -> Any:
 
 
 def record_attributes(
-    step: str,
-    repeat: int,
-    locked: Sequence[int],
-    sample_rate: float,
-    start: float,
-    period: int,
-    lines: Sequence[int],
-    complete: bool,
+    meta: Mapping[str, Any], sample_rate: float, start: float, *, complete: bool
 ) -> dict[str, Any]:
-    """Return the attributes that every record has."""
+    """Return the attributes that every record has; `meta` holds those of its description."""
     return {
         "kind": "record",
-        "step": step,
-        "repeat": repeat,
-        "locked": list(locked),
+        "step": meta["step"],
+        "repeat": meta["repeat"],
+        "locked": list(meta["locked"]),
         "sample_rate": sample_rate,
         "start_s": start,
-        "period": period,
-        "lines": list(lines),
+        "period": meta["period"],
+        "lines": list(meta["lines"]),
         "complete": int(complete),
     }
 
@@ -95,20 +88,9 @@ def _attributes(
     meta = section.meta
     device = section.start / sample_rate
     start = device if clock is None else clock.at(section.start, sample_rate)
-    attributes: dict[str, Any]
+    attributes = {"kind": BETWEEN, "sample_rate": sample_rate, "start_s": start}
     if meta:
-        attributes = record_attributes(
-            meta["step"],
-            meta["repeat"],
-            meta["locked"],
-            sample_rate,
-            start,
-            meta["period"],
-            meta["lines"],
-            section.complete,
-        )
-    else:
-        attributes = {"kind": BETWEEN, "sample_rate": sample_rate, "start_s": start}
+        attributes = record_attributes(meta, sample_rate, start, complete=section.complete)
     return {
         **meta.get("attributes", {}),
         **attributes,
@@ -182,7 +164,7 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
     sections = plan(journal, spans)
     columns, rate = journal.meta("columns"), float(journal.meta("sample_rate"))
     clocks = stream_clocks(read_events(folder))
-    fresh = folder / f"{NAME}.tmp"
+    fresh = folder / f"{store.ARCHIVE}.tmp"
     lost = 0
     try:
         with create(fresh, rig_name) as file:
@@ -194,12 +176,12 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
                 _note_saturation(file[section.group], columns, assembled)
                 lost += assembled.lost if section.meta else 0
         damaged = verify(journal, fresh, sections)
-        put_in_place(fresh, folder / NAME)
+        put_in_place(fresh, folder / store.ARCHIVE)
     except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
         fresh.unlink(missing_ok=True)
         raise RecordingFailed(
-            f"{folder / NAME}: cannot be written ({error}); the journal keeps every sample: free "
-            "some disk space, then `bramah recover` this run"
+            f"{folder / store.ARCHIVE}: cannot be written ({error}); the journal keeps every "
+            "sample: free some disk space, then `bramah recover` this run"
         ) from error
     records = [section for section in sections if section.meta]
     partial = sum(not section.complete for section in records)
@@ -209,9 +191,8 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
 
 
 def _note_saturation(group: h5py.Group, columns: Sequence[str], assembled: Assembled) -> None:
-    for name, count in zip(
-        columns, assembled.saturated, strict=False
-    ):  # commands have no saturation flags
+    # Commands have no saturation flags.
+    for name, count in zip(columns, assembled.saturated, strict=False):
         group[name].attrs["saturated_samples"] = int(count)
 
 
@@ -243,3 +224,19 @@ def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:
             f"only {total} of {int(spans.samples.sum())} samples of the journal are in it"
         )
     return damaged
+
+
+def write_run(folder: str | Path, run: Run) -> Path:
+    """Write a finished run folder from records in memory, completely or not at all.
+
+    Raises InputError if it is occupied, RecordingFailed if it cannot be written.
+    """
+    out = Path(folder)
+    with store.whole_run(out, run.rig, run.source) as path:
+        with create(path / store.ARCHIVE, run.rig.name) as file:
+            for order, r in enumerate(run.records):
+                about = record_attributes(vars(r), r.sample_rate, r.start, complete=True)
+                more = {**r.attributes, **about, "stream": order, "start_tick": 0}
+                write_group(file, r.name, r.channels, more, run.rig.unit_of)
+        write_state(path, DONE)
+    return out

@@ -22,26 +22,18 @@ log = logging.getLogger(__name__)
 FINALISED: Final = "was finalised already; there is nothing to recover"
 
 
-@dataclass(frozen=True)
-class RecoverReport:
-    """Result of `recover`; `records` counts complete and partial ones.
-
-    Counts: `samples` within records, `lost_samples` missing in them, samples `outside` records.
+@dataclass(frozen=True, kw_only=True)
+class RecoverReport(Written):
+    """Result of `recover`: counts of the records, and what a person is told.
 
     `damaged` is the path of a damaged journal, from which at least `missing` samples are lost.
     """
 
     path: Path
     state: str
-    records: int
-    partial: int
-    samples: int
-    lost_samples: int
-    damaged_blocks: int
     message: str
     damaged: Path | None = None
     missing: int = 0
-    outside: int = 0
 
 
 def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
@@ -109,7 +101,7 @@ def _from_damaged(folder: Path, rig: Rig, state_before: str, damage: str) -> Rec
     """Finalise the readable part of a damaged or cut off journal and keep the journal."""
     path = folder / runstate.JOURNAL
     state = _outcome(path) or state_before
-    journal, rebuilt = rebuild(path, rig, damage)
+    journal, rebuilt = rebuild(path, rig)
     try:
         if not rebuilt.blocks:
             journal.delete()
@@ -194,17 +186,7 @@ def _end(folder: Path, state: str) -> None:
 
 
 def _report(folder: Path, state: str, written: Written, message: str) -> RecoverReport:
-    return RecoverReport(
-        folder,
-        state,
-        written.records,
-        written.partial,
-        written.samples,
-        written.lost_samples,
-        written.damaged_blocks,
-        message,
-        outside=written.outside,
-    )
+    return RecoverReport(path=folder, state=state, message=message, **vars(written))
 
 
 def _note(folder: Path, state: str, message: str) -> None:

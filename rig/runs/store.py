@@ -1,12 +1,15 @@
-"""Run folders: creating and loading."""
+"""Run folders: creating and loading; software versions of a run."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import platform
 import socket
+import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +22,6 @@ from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed
 from rig.runs.files import new_folder, no_place_for, read_text, replace_text
 from rig.runs.runstate import (
-    DONE,
     EVENTS,
     HEADER,
     INTERRUPTED,
@@ -34,7 +36,6 @@ from rig.runs.runstate import (
     utc_now,
     write_state,
 )
-from rig.runs.versions import versions
 
 T = TypeVar("T", Record, RecordHead)
 
@@ -267,6 +268,50 @@ def _digest(path: Path) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def mark_done(folder: Path) -> None:
-    """Set the state of a run without a journal (an import) to done."""
-    write_state(folder, DONE)
+# Libraries that decode, store or compute data; a repeated run needs the same versions.
+_LIBRARIES = ("numpy", "scipy", "numba", "h5py", "pymodbus", "pyserial", "pydantic")
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+def _git(*words: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(_ROOT), *words],
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=True,
+            stdin=subprocess.DEVNULL,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def commit() -> str | None:
+    """Return the commit of the source tree in use ('-dirty' if changed), None if installed."""
+    if not (_ROOT / ".git").exists():
+        return None
+    head = _git("rev-parse", "HEAD")
+    if not head:
+        return None
+    return f"{head}-dirty" if _git("status", "--porcelain", "--untracked-files=no") else head
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def versions() -> dict[str, str]:
+    """Return the software versions and the platform of this process."""
+    out = {
+        "bramah": _version("bramah") or "unknown",
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{name: version for name in _LIBRARIES if (version := _version(name)) is not None},
+    }
+    source = commit()
+    return out if source is None else {**out, "commit": source}

@@ -27,7 +27,7 @@ from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.store import load_run
 from rig.runs.stream import iterate_records, open_record, read_run_head
 from tests.variants import kept

@@ -22,7 +22,7 @@ from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import Pool, Processes, Serial
 from rig.model.parse import InputError
 from rig.model.records import Run
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from tests.analysis.pool_work import about, broken, gone, noise, square
 from tests.analysis.test_accumulate import assert_same
 from tests.cli.bench import bramah_here

@@ -15,7 +15,7 @@ from analysis.terms import with_effects
 from analysis.terms.base import Used
 from rig.model.records import Run
 from rig.model.rig import ElectricRig
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.rigs import load_rig
 from tests.analysis.test_accumulate import assert_same
 from tests.analysis.test_lost_samples import with_lost

@@ -20,7 +20,7 @@ from analysis.trace.engine import trace
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.tolerances import Tolerances
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.rigs import load_rig
 from tests.analysis.test_accumulate import assert_same
 from tests.analysis.trace.hidden import pair_of_runs

@@ -20,7 +20,7 @@ from analysis.terms.base import Used
 from rig.cli.errors import WorkError
 from rig.cli.main import app
 from rig.model.parse import InputError
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.store import load_run
 from tests.analysis import small_bench as bench
 

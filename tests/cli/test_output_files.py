@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from tests.analysis import small_bench as bench
 from tests.cli.bench import bramah, bramah_here, words
 from tests.variants import kept

@@ -22,7 +22,7 @@ from drivers.conformance import (
 )
 from drivers.replay import ReplayDriver
 from rig.model.rig import Rig
-from rig.runs import archive
+from rig.runs import archive, store
 from tests.hil_sim.integrator import seed_rig
 
 PLAYS = Capabilities(outputs=False, latches_trips=False)
@@ -34,7 +34,7 @@ def recording(folder: Path, samples: int = 4000, lost: slice = slice(0, 0)) -> P
     data = 1e-6 * np.arange(samples)[:, None] + np.zeros(len(rig.recorded))
     data[lost] = np.nan
     third = samples // 3
-    with archive.create(folder / archive.NAME, rig.name) as file:
+    with archive.create(folder / store.ARCHIVE, rig.name) as file:
         for group, first, end in (
             ("step1_r1", third, 2 * third),
             ("between/0001", 0, third),

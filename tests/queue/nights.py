@@ -18,7 +18,7 @@ from rig.bench.latch import BenchState
 from rig.queue import processes
 from rig.queue.hook import Hook
 from rig.queue.items import Item, QueueJob
-from rig.queue.locks import LockFile
+from rig.queue.processes import LockFile
 from rig.queue.runner import QueueReport, QueueSettings, Runner
 from rig.queue.store import QueueStore
 from rig.runs.rigs import load_rig

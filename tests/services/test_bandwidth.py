@@ -12,8 +12,7 @@ from analysis.regression.rows import default_filtering
 from analysis.regression.settings import REGRESSION
 from rig.model.records import BANDWIDTH, Record, Run, with_common_bandwidth
 from rig.model.rig import Rig
-from rig.runs.exchange.bandwidth import motion_bandwidth
-from rig.runs.exchange.importer import import_records
+from rig.runs.exchange.importer import import_records, motion_bandwidth
 from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 

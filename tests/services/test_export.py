@@ -15,9 +15,9 @@ from scipy.io import loadmat
 
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
+from rig.runs.archive import write_run
 from rig.runs.exchange import export
 from rig.runs.exchange.export import export_run, library_missing
-from rig.runs.exchange.fixtures import write_run
 from rig.runs.exchange.importer import import_records
 from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig

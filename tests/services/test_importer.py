@@ -13,7 +13,7 @@ from scipy.io import savemat
 
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.exchange.importer import import_records
 from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig

@@ -19,7 +19,7 @@ from rig.cli.bench.stream import cluster_figures, row_figures, spin_figures
 from rig.cli.identification.tracking import Tracking
 from rig.model.records import Record
 from rig.model.rig import Rig
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.recorder import RecordMeta
 from rig.runs.rigs import load_rig
 

@@ -16,7 +16,7 @@ from analysis.report.trace import write_trace_report
 from analysis.trace.loop_rounds import Round
 from analysis.trace.result import Trace
 from rig.model.records import Run
-from rig.runs.versions import versions
+from rig.runs.store import versions
 
 
 def provenance(

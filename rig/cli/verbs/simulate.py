@@ -35,7 +35,7 @@ def simulate(
 
     Example: bramah simulate model.json runs/monday --out runs/monday-simulated
     """
-    from rig.runs.exchange.fixtures import write_run
+    from rig.runs.archive import write_run
     from rig.runs.store import load_run, refuse_occupied
 
     refuse_occupied(out)

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.records import BANDWIDTH, common_bandwidth
+from rig.model.records import BANDWIDTH, bridged, common_bandwidth
 from rig.model.rig import Rig
 from rig.runs import archive, store
-from rig.runs.exchange.bandwidth import motion_bandwidth
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.dead_sensors import silent_sensors
 from rig.runs.exchange.manifest import (
@@ -148,6 +147,39 @@ def _with_bandwidth(rig: Rig, records: list[_Imported]) -> list[_Imported]:
         replace(r, entry=r.entry.model_copy(update=stated)) if is_measured(r) else r
         for r in records
     ]
+
+
+def motion_bandwidth(
+    rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array], rate: float
+) -> float | None:
+    """Return the frequency [Hz] below which `EXCHANGE.velocity_share` of each velocity's power is.
+
+    `channels` are positions (n,) and others by name, `rate` [Hz]. None where no joint moves, and
+    for a record shorter than `EXCHANGE.bandwidth_seconds`, which needs all its rows.
+    """
+    free = [i for i in range(1, len(rig.joints) + 1) if i not in locked]
+    positions = [bridged(channels[ch.channel(rig.position_kind, i)]) for i in free]
+    moving = [x for x in positions if np.ptp(x) > 0.0]
+    if not moving or len(moving[0]) < EXCHANGE.bandwidth_seconds * rate:
+        return None
+    return max(_bandwidth(x, rate) for x in moving)
+
+
+def _bandwidth(position: Array, rate: float) -> float:
+    """Return the bandwidth [Hz] of a position (n,), by a periodogram with Hann's window.
+
+    Lines that noise may cause do not count. White noise is measured in the upper half of the
+    spectrum, where its power is exponentially distributed about the mean, median / ln 2.
+    """
+    power = np.abs(np.fft.rfft((position - np.mean(position)) * np.hanning(len(position)))) ** 2
+    f = np.fft.rfftfreq(len(position), 1.0 / rate)
+    noise = float(np.median(power[f > 0.25 * rate])) / np.log(2.0)
+    inside = f <= EXCHANGE.highest
+    seen = np.where(power > EXCHANGE.above_noise * noise, power, 0.0)[inside]
+    if not seen.any():
+        return EXCHANGE.highest
+    velocity = np.cumsum(seen * f[inside] ** 2)
+    return float(f[inside][np.searchsorted(velocity, EXCHANGE.velocity_share * velocity[-1])])
 
 
 def _common(
@@ -309,19 +341,10 @@ def _write(
 
 
 def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> None:
-    with archive.create(folder / archive.NAME, source.rig.name) as file:
+    with archive.create(folder / store.ARCHIVE, source.rig.name) as file:
         for order, r in enumerate(records):
             meta = r.entry.meta()
-            about = archive.record_attributes(
-                meta.step,
-                meta.repeat,
-                meta.locked,
-                r.sample_rate,
-                r.start,
-                meta.period,
-                meta.lines,
-                True,
-            )
+            about = archive.record_attributes(meta.as_dict(), r.sample_rate, r.start, complete=True)
             more = {
                 "stream": order,
                 "start_tick": 0,

@@ -51,7 +51,6 @@ _UNREADABLE = (
 class Salvage:
     """Contents of a damaged journal; `lost`: samples known to be missing."""
 
-    what: str
     blocks: int
     samples: int
     lost: int
@@ -136,7 +135,7 @@ def _as_block(row: tuple[Any, ...], rig: Rig) -> Block | None:
         return None
 
 
-def rebuild(path: Path, rig: Rig, what: str) -> tuple[Journal, Salvage]:
+def rebuild(path: Path, rig: Rig) -> tuple[Journal, Salvage]:
     """Write the readable part of a damaged journal into a new, open journal beside it.
 
     Raises RecordingFailed if the disk fails.
@@ -160,7 +159,7 @@ def rebuild(path: Path, rig: Rig, what: str) -> tuple[Journal, Salvage]:
         if mark.state != "open" and mark.ticks is not None:
             made.end_mark(number, mark.ticks, mark.state, mark.meta)
     made.in_order()
-    return made, _account(path.parent, what, places, chosen)
+    return made, _account(path.parent, places, chosen)
 
 
 def _keep(
@@ -216,7 +215,6 @@ def _readable(db: sqlite3.Connection, sql: str, first: int, last: int) -> list[t
 
 def _account(
     folder: Path,
-    what: str,
     places: dict[tuple[int, int], tuple[int, int]],
     chosen: Sequence[Mark],
 ) -> Salvage:
@@ -225,7 +223,7 @@ def _account(
     names = {str(mark.meta["name"]) for mark in chosen}
     begun = {str(e["record"]) for e in events if e.get("event") == "record begins"}
     if not places:
-        return Salvage(what, 0, 0, 0, 0, tuple(sorted(begun - names)))
+        return Salvage(0, 0, 0, 0, tuple(sorted(begun - names)))
     keys = sorted(places)
     ticks = np.array([key[1] for key in keys], dtype=np.int64)
     streams = np.array([key[0] for key in keys], dtype=np.int64)
@@ -244,7 +242,6 @@ def _account(
     known += [m.start + m.ticks for m in chosen if m.state == "complete" and m.ticks is not None]
     lost += max(0, max(known, default=0) - int(ends[-1]))
     return Salvage(
-        what,
         len(places),
         int((ends - ticks).sum()),
         lost,

@@ -32,9 +32,8 @@ _STATES = {"open": 21, "complete": 29, "partial": 27, "discarded": 31}  # type o
 
 @dataclass(frozen=True)
 class SalvagedRow:
-    """A row's columns, where it begins in its file, and its number (None if that is damaged)."""
+    """A row's columns and its number (None if that is damaged)."""
 
-    offset: int
     number: int | None
     values: tuple[Any, ...]
 
@@ -92,7 +91,7 @@ def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[Salvaged
         for place in places[like(types)].tolist():
             row = _row(part, place, columns)
             if row is not None:
-                yield SalvagedRow(begin + place, *row)
+                yield SalvagedRow(*row)
 
 
 def _row(part: Bytes, place: int, columns: int) -> tuple[int | None, tuple[Any, ...]] | None:

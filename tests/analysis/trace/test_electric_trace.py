@@ -20,7 +20,7 @@ from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
 from rig.cli.main import app
 from rig.cli.text.trace_text import trace_text
 from rig.model.records import Record, Run
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from rig.runs.rigs import load_rig
 from rig.tui.pages.trace import errors_of
 from rig.tui.run_trace import read_trace

@@ -25,7 +25,7 @@ from rig.cli.main import app
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from rig.runs.exchange.fixtures import write_run
+from rig.runs.archive import write_run
 from tests.analysis.trace.gate_cases import LEAK, at_joint_2, joined
 from tests.analysis.trace.hidden import RMS, experiment, pair_of_runs, pushed
 

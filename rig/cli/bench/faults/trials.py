@@ -34,9 +34,9 @@ from rig.model import channels as ch
 from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
 from rig.model.trips import DEVICE, SafetyTrip
-from rig.runs.archive import NAME
 from rig.runs.recorder import Recorder
 from rig.runs.runstate import BETWEEN
+from rig.runs.store import ARCHIVE
 
 BEGIN: Final = 1.0  # [s] of device time before a fault begins
 REAL_BEGIN: Final = 3.0  # [s], in real time: the clock runs while the session starts
@@ -241,7 +241,7 @@ def _session(
         outcome.seconds = outcome.alarm.time - fault.at if outcome.alarm else None
     outcome.blocks = len(collector.blocks)
     outcome.missing = session.lost_samples
-    outcome.lost_blocks = _not_in(folder / "run" / NAME, rig, collector.blocks)
+    outcome.lost_blocks = _not_in(folder / "run" / ARCHIVE, rig, collector.blocks)
 
 
 def _more_patient(rig: Rig) -> Rig:
