@@ -183,6 +183,13 @@ def display_unit(si: str, table: Mapping[str, DisplayUnit]) -> DisplayUnit:
     return table.get(si) or DisplayUnit(1.0, si)
 
 
+def clock(seconds: int) -> str:
+    """Return a time as a clock shows it: 0:07, 12:30 or 3:05:00."""
+    minutes, rest = divmod(seconds, 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
 def plain(value: float, digits: int) -> str:
     """Return a number with `digits` significant digits, without exponent below 1e5."""
     text = f"{value:.{digits}g}"

@@ -22,11 +22,11 @@ from rig.bench.screens.commands import own_command
 from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import AlarmTable
 from rig.model.parts import Wire
-from rig.tui.acting.manual import ByHand
+from rig.tui.acting.starts import Starts
 from rig.tui.browse import BrowserState
 from rig.tui.canvas import Canvas
 from rig.tui.following.event_lines import KINDS
-from rig.tui.following.link import Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.following.link import Frame, Link, LinkStage, LocalSessions
 from rig.tui.look import OF_A_RECORDED_RUN, PAGES, Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.pages.parts import joints_in
@@ -80,7 +80,7 @@ def automatic_span(speed: float) -> float:
     return next((s for s in LONG_SPANS[2:] if s / speed > CROSSING), LONG_SPANS[-1])
 
 
-class Monitor(ByHand, App[int]):
+class Monitor(Starts, App[int]):
     """The operator's screen: attach, watch, stop, command."""
 
     TITLE = "bramah monitor"
@@ -94,7 +94,7 @@ class Monitor(ByHand, App[int]):
     def __init__(
         self,
         rig: str | None = None,
-        sessions: Sessions | None = None,
+        sessions: LocalSessions | None = None,
         clock: Callable[[], float] = time.monotonic,
         *,
         threaded: bool = True,
@@ -147,7 +147,7 @@ class Monitor(ByHand, App[int]):
         self._wake = self.link.on_window = wake
         while True:
             frame = self.link.frame
-            idle = self._drawn_frame is frame and (frame.over or frame.endpoint is None)
+            idle = self._drawn_frame is frame and not frame.live
             with suppress(TimeoutError):
                 await asyncio.wait_for(woken.wait(), BLINK if idle else SLOW)
             woken.clear()
@@ -199,7 +199,7 @@ class Monitor(ByHand, App[int]):
             force = True
         same = self._drawn_frame is frame and not force
         waits = self.stop_asked is not None and now - self.stop_asked.at < LINGER
-        idle = (frame.over or frame.endpoint is None) and not waits
+        idle = not frame.live and not waits
         if same and (idle or now - self._slow < SLOW):
             return
         self._drawn_frame, self._slow = frame, now
@@ -229,9 +229,8 @@ class Monitor(ByHand, App[int]):
 
     def early_key(self, event: events.Key) -> None:
         """Stop a live run from the thread that reads the terminal, before any drawing."""
-        frame, dialog = self.link.frame, self.dialog
-        run_is_live = frame.endpoint is not None and not frame.over
-        if run_is_live and (event.key == "space" or (event.key == "s" and dialog is None)):
+        stops = event.key == "space" or (event.key == "s" and self.dialog is None)
+        if stops and self.link.frame.live:
             self._stopped_by = event
             self.act_stop()
 
@@ -241,11 +240,10 @@ class Monitor(ByHand, App[int]):
         event.prevent_default()
         key = event.key
         typing = self.dialog is not None and self.dialog.text is not None
-        run_is_live = self.link.frame.endpoint is not None and not self.link.frame.over
         choosing = self.link.frame.stage is LinkStage.CHOOSING
         if event is self._stopped_by:
             self._stopped_by = None
-        elif key == "space" and (run_is_live or choosing or not typing):
+        elif key == "space" and (self.link.frame.live or choosing or not typing):
             self.act_stop()
         elif key == "escape":
             self._escape()

@@ -17,8 +17,7 @@ from rig.queue.store import QueueStore
 from rig.runs.listing.index import indexed_runs
 from rig.runs.listing.summary import RunSummary
 from rig.tui.jobs import VerbJob
-from rig.tui.run_log import RunLog
-from rig.tui.run_trace import RunTrace
+from rig.tui.recorded_run import RunLog, RunTrace
 
 TABS: Final = ("protocols", "runs", "queue")
 STEPS: Final = re.compile(rb"^steps:", re.MULTILINE)

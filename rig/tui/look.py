@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -72,7 +71,6 @@ class PlotView:
     rig: str | None = None
     browsed: BrowserState = field(default_factory=BrowserState)
     marked_session: Endpoint | None = None
-    tripped: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def held(self) -> bool:

@@ -13,8 +13,8 @@ from typing import Final
 from rig.model.parts import Wire
 from rig.tui.following.event_lines import EventLine
 from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions
-from rig.tui.units import age_text, clock_text, shown
-from rig.tui.words import headline, nearest_margin, notices, run_time
+from rig.tui.units import age_text, shown
+from rig.tui.words import headline, nearest_margin, notices, run_time, time_left
 
 LINE_SECONDS: Final = 1.0  # [s]
 
@@ -29,7 +29,7 @@ def status_line(frame: Frame, now: float) -> str:
     if snapshot.repeats > 0:
         parts.append(f"repeat {snapshot.repeat} of {snapshot.repeats}")
     if snapshot.total_s > 0 and not frame.over:
-        parts.append(f"{clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))} left")
+        parts.append(f"{time_left(snapshot)} left")
     margin = nearest_margin(frame)
     if margin is not None:
         how = shown(margin.unit)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from rig.model.units import AXES, display_unit
+from rig.model.units import AXES, clock, display_unit
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,7 @@ def clock_text(seconds: float) -> str:
     """Return 83 s as 1:23, 3723 s as 1:02:03; an unknown time as a dash."""
     if not math.isfinite(seconds) or seconds < 0:
         return "–"
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return clock(int(seconds))
 
 
 def age_text(seconds: float) -> str:

@@ -16,7 +16,7 @@ from rig.tui.drawing.rows import Row
 from rig.tui.drawing.styles import ALARM, ALARM_TEXT, DIM, STALE, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.event_lines import trip_text
 from rig.tui.following.link import ENDED_STATES, QUIET, Frame, LinkStage
-from rig.tui.units import Band, age_text, band, limit, shown
+from rig.tui.units import Band, age_text, band, clock_text, limit, shown
 
 VERY_OLD: Final = 3.0  # from here on old data is red instead of yellow [s]
 CONFIRM: Final = 2.0  # a stop not confirmed within this time is reported [s]
@@ -167,6 +167,11 @@ def run_time(frame: Frame, device_time: float | None = None) -> float:
         return 0.0
     began = snapshot.device_time - snapshot.done_s
     return (snapshot.device_time if device_time is None else device_time) - began
+
+
+def time_left(snapshot: Snapshot) -> str:
+    """Return the expected time to the run's end, as a clock shows it."""
+    return clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))
 
 
 def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> list[Notice]:

@@ -14,8 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rig.tui.browse import BrowserState
-from rig.tui.run_log import read_log
-from rig.tui.run_trace import read_trace
+from rig.tui.recorded_run import read_log, read_trace
 from tests.tui.glass import Machine, Recorded, endpoint, glass
 from tests.tui.recorded import Bench, followed, past, run, snapshot, tripped
 from tests.tui.stored import run_folder

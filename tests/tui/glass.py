@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 from textual.pilot import Pilot
 
@@ -13,7 +14,6 @@ from rig.bench.screens.commands import Command
 from rig.bench.screens.snapshot import PastMinute
 from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.tui.app import Monitor
-from rig.tui.following.link import SnapshotSource
 from rig.tui.words import KeyAnswer
 
 
@@ -54,13 +54,13 @@ class Recorded:
 class Machine:
     """The sessions of a machine: runs come and go."""
 
-    def __init__(self, runs: dict[Endpoint, SnapshotSource] | None = None) -> None:
+    def __init__(self, runs: dict[Endpoint, Any] | None = None) -> None:
         self.runs = dict(runs or {})
 
     def find(self) -> list[Endpoint]:
         return list(self.runs)
 
-    def open(self, where: Endpoint) -> SnapshotSource:
+    def open(self, where: Endpoint) -> Any:
         if where not in self.runs:
             raise ConnectionError(f"{where} has gone")
         return self.runs[where]

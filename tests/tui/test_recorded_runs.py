@@ -16,8 +16,7 @@ from rig.tui.browse import BrowserState
 from rig.tui.following.link import Frame
 from rig.tui.look import PlotView
 from rig.tui.pages.trace import run_trace_page
-from rig.tui.run_log import read_log
-from rig.tui.run_trace import StoredEffect, read_trace
+from rig.tui.recorded_run import StoredEffect, read_log, read_trace
 from tests.services.children import RIG
 from tests.tui.glass import Glass
 from tests.tui.stored import log_bytes, run_folder, trace_json

@@ -22,9 +22,9 @@ from hypothesis import strategies as st
 from textual.app import App
 
 from rig.runs.listing.summary import summarise
-from rig.tui.web.access import NAMES, host_name, refusal
 from rig.tui.web.attached_screen import CLOSED
 from rig.tui.web.page_driver import PageDriver
+from rig.tui.web.server import NAMES, host_name, refusal
 from tests.cli.bench import LONG, SHORT, bramah, simulated, started, wait_for
 from tests.forked import Forked
 from tests.tui.test_attached import sockets, start

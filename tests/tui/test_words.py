@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 from rig.bench.screens.sockets import ChannelView
 from rig.model.alarms.states import Alarm, AlarmTable, raised, returned
 from rig.tui.app import farewell
-from rig.tui.drawing.bar import bar
 from rig.tui.drawing.rows import Row, block, box, row, width_of, window
 from rig.tui.following.event_lines import new_lines
 from rig.tui.following.history import History
 from rig.tui.following.link import Frame, LinkStage
-from rig.tui.pages.gauge import gauge
+from rig.tui.pages.parts import bar, gauge
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown
 from rig.tui.words import (
     Freshness,

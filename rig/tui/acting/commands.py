@@ -17,6 +17,7 @@ from rig.tui.look import Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.words import Stop
 
+CHOOSE_KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
 MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort needs no confirmation
 
 
@@ -27,7 +28,7 @@ class Commands:
         "?": "help", "h": "hold", "z": "zoom", "+": "longer", "-": "shorter", "=": "automatic",
         "f": "filter", "/": "search", "e": "end", "c": "choose", "q": "quit",
         "t": "command", "p": "pause", "n": "skip", "x": "abort", "a": "answer",
-        "k": "acknowledge", "r": "reset",
+        "k": "acknowledge", "r": "reset", "l": "lock", "u": "unlock", "d": "depressurise",
     }  # fmt: skip
 
     link: Link
@@ -94,8 +95,7 @@ class Commands:
             if answer == "yes":
                 act()
 
-        keys = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
-        self.ask(Dialog(title, (text,), choices=("no", "yes"), keys=keys), chosen)
+        self.ask(Dialog(title, (text,), choices=("no", "yes"), keys=CHOOSE_KEYS), chosen)
 
     def act_command(self) -> None:
         """Take the controls, or release them; from another screen only after confirmation."""
@@ -143,8 +143,8 @@ class Commands:
         if snapshot is None or not snapshot.prompt or self.link.frame.over:
             self.remark = "answer: nothing is asked now."
             return
-        keys = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
-        dialog = Dialog("answer", (snapshot.prompt,), choices=tuple(snapshot.answers), keys=keys)
+        choices = tuple(snapshot.answers)
+        dialog = Dialog("answer", (snapshot.prompt,), choices=choices, keys=CHOOSE_KEYS)
         self.ask(dialog, lambda answer: self.command("answer", answer, f"{answer!r} taken"))
 
     # Alarms
@@ -192,14 +192,24 @@ class Commands:
         elif not frame.over:
             self.remark = "reset: the run still holds the bench; wait for its end."
         else:
-            body = (alarm.sentence, "", "What was found and done? It is kept with the trip.")
-            keys = "Enter resets device and bench, Esc closes"
-            self.ask(Dialog("reset", body, text="", keys=keys), lambda why: self._reset(alarm, why))
+            self.ask_reason(alarm.sentence, lambda why: self._reset(alarm, why))
+
+    def ask_reason(self, about: str, reset: Callable[[str], None]) -> None:
+        """Ask what was found and done at a trip, then reset with that reason."""
+
+        def answered(reason: str) -> None:
+            if reason.strip():
+                reset(reason.strip())
+            else:
+                self.remark = "reset: a reset needs a reason; nothing was reset."
+
+        body = (about, "", "What was found and done? It is kept with the trip.")
+        keys = "Enter resets device and bench, Esc closes"
+        self.ask(Dialog("reset", body, text="", keys=keys), answered)
 
     def _reset(self, alarm: Alarm, reason: str) -> None:
         snapshot = self.link.frame.snapshot
-        if snapshot is None or not reason.strip():
-            self.remark = "reset: a reset needs a reason; nothing was reset."
+        if snapshot is None:
             return
         rig, pid = rig_of_run(snapshot.run, snapshot.rig), snapshot.pid
         self.remark = "reset: asking the device ..."
@@ -213,8 +223,4 @@ class Commands:
             self.redraw()
 
         wire = ("--endpoint", snapshot.wire) if snapshot.wire else ()
-        self.start(("reset", "--rig", rig, *wire, "--reason", reason.strip()), changed)
-
-    def start(self, words: tuple[str, ...], changed: Callable[[VerbJob], None]) -> None:
-        """Start a verb in a separate process."""
-        begin(words, changed)
+        begin(("reset", "--rig", rig, *wire, "--reason", reason), changed)

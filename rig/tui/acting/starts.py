@@ -1,4 +1,4 @@
-"""Verbs started from the page of runs: check, run, identify, trace, queue report."""
+"""Verbs started from the page of runs, and manual operation: jog with a dead-man key, lock."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Final
 
 from rig.runs.listing.summary import RunSummary
-from rig.tui.acting.commands import Commands
+from rig.tui.acting.commands import CHOOSE_KEYS, Commands
 from rig.tui.browse import TABS, BrowserState, read_disk
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog
-from rig.tui.run_log import RunLog, read_log
-from rig.tui.run_trace import STORED, RunTrace, read_trace
+from rig.tui.pages.manual import MANUAL
+from rig.tui.recorded_run import STORED, RunLog, RunTrace, read_log, read_trace
 
 REPORT: Final = "trace.html"
-KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
+AGAIN: Final = 0.08  # shortest time between two jogs of a held key [s]
 
 
 def display_here() -> bool:
@@ -31,11 +31,12 @@ def display_here() -> bool:
 
 
 class Starts(Commands):
-    """Starting of verbs; each is a process that outlives the screen."""
+    """Starting of verbs, each a process that outlives the screen; manual operation of joints."""
 
     browsed: BrowserState
     open_page: Callable[[str], None]
     is_web: bool
+    jogged = -float("inf")  # when the newest jog was sent [monotonic s]
     deliver_binary: Callable[..., str | None]
 
     def read_folder(self) -> None:
@@ -64,8 +65,10 @@ class Starts(Commands):
         self.look = replace(self.look, marked=0, offset=0)
 
     def act_enter(self) -> None:
-        """Offer the actions on the marked line."""
-        browsed = self.browsed
+        """Start a manual session on its page; on the page of runs offer what the line allows."""
+        browsed, frame = self.browsed, self.link.frame
+        if self.look.page == "manual" and (frame.snapshot is None or frame.over):
+            self._with_rig(self._start_manual)
         if self.look.page != "runs" or not browsed.lines:
             return
         at = min(self.look.marked, browsed.lines - 1)
@@ -87,7 +90,7 @@ class Starts(Commands):
             })  # fmt: skip
 
     def _offer(self, title: str, acts: dict[str, Callable[[], None]]) -> None:
-        dialog = Dialog(title, choices=tuple(acts), keys=KEYS)
+        dialog = Dialog(title, choices=tuple(acts), keys=CHOOSE_KEYS)
         self.ask(dialog, lambda chosen: acts[chosen]())
 
     def _offer_run(self, run: RunSummary) -> None:
@@ -151,15 +154,9 @@ class Starts(Commands):
         """Reset the bench that a run tripped, with a reason."""
         rig = rig_of_run(str(run.path), run.rig)
 
-        def reset(reason: str) -> None:
-            if reason.strip():
-                self._job(("reset", "--rig", rig, "--reason", reason.strip()))
-            else:
-                self.remark = "reset: a reset needs a reason; nothing was reset."
-
-        body = (run.message, "", "What was found and done? It is kept with the trip.")
-        keys = "Enter resets device and bench, Esc closes"
-        self.ask(Dialog("reset", body, text="", keys=keys), reset)
+        self.ask_reason(
+            run.message, lambda why: self._job(("reset", "--rig", rig, "--reason", why))
+        )
 
     def _open(self, page: Path) -> None:
         if not page.is_file():
@@ -194,7 +191,7 @@ class Starts(Commands):
 
     def _start_run(self, protocol: str) -> None:
         frame = self.link.frame
-        if frame.endpoint is not None and frame.snapshot is not None and not frame.over:
+        if frame.live and frame.snapshot is not None:
             self.remark = f"start: run {frame.snapshot.run} holds the bench; wait for its end."
             return
         self._with_rig(lambda rig: self._confirm_start(protocol, rig))
@@ -228,3 +225,55 @@ class Starts(Commands):
             self.redraw()
 
         begin(words, changed)
+
+    # Manual operation
+
+    def _manual(self, word: str) -> bool:
+        """Return whether the attached session takes jogs; else show why not."""
+        frame = self.link.frame
+        if frame.snapshot is None or frame.over:
+            self.remark = f"{word}: no manual session; Enter on page 9 starts one."
+        elif frame.snapshot.kind != MANUAL:
+            self.remark = f"{word}: refused while a protocol runs."
+        elif self.look.page != "manual":
+            self.remark = f"{word}: on page 9 only."
+        else:
+            return True
+        return False
+
+    def act_jog(self, key: str) -> None:
+        """Move the chosen joint for a short time; a held key repeats this."""
+        now = self.clock()
+        if key not in ("up", "down") or now - self.jogged < AGAIN or not self._manual("jog"):
+            return
+        self.jogged = now
+        self.command("jog", f"{self.look.joint} {'+' if key == 'up' else '-'}")
+
+    def act_lock(self) -> None:
+        """Hold the chosen joint at its position."""
+        if self._manual("lock"):
+            self.command("lock", str(self.look.joint), f"joint {self.look.joint} is held")
+
+    def act_unlock(self) -> None:
+        """Release the chosen joint."""
+        if self._manual("unlock"):
+            self.command("unlock", str(self.look.joint), f"joint {self.look.joint} is free")
+
+    def _start_manual(self, rig: str) -> None:
+        text = f"Nothing moves until a key is held. Take the device of {rig} for manual operation?"
+        self.confirmed("manual", text, lambda: self._job(self._words("manual", rig)))
+
+    def act_depressurise(self) -> None:
+        """Let the pressure out where the rig can, after confirmation; not during a session."""
+        frame = self.link.frame
+        if frame.snapshot is not None and not frame.over:
+            self.remark = "depressurise: end the session that holds the bench first."
+            return
+        text = "Outputs to zero, then the pressure out where the rig can. Go on?"
+        self._with_rig(lambda rig: self.confirmed(
+            "depressurise", text, lambda: self._job(self._words("depressurise", rig))
+        ))  # fmt: skip
+
+    def _words(self, verb: str, rig: str) -> tuple[str, ...]:
+        endpoint = self.browsed.endpoint
+        return (verb, "--rig", rig, *(() if endpoint is None else ("--endpoint", endpoint)))

@@ -35,14 +35,14 @@ class Scale:
         return np.rint(np.clip(share, 0.0, 1.0) * (rows - 1)).astype(np.int64)
 
 
-def scale_around(values: Sequence[float | None], margin: float = 0.05) -> Scale:
+def scale_around(values: Sequence[float | None]) -> Scale:
     """Return a scale that holds every finite value with a margin; never an empty one."""
     finite = [v for v in values if v is not None and np.isfinite(v)]
     if not finite:
         return Scale(0.0, 1.0)
     low, high = min(finite), max(finite)
     # A constant has a scale wide enough for float64 to separate its ends.
-    pad = margin * (high - low) or 0.05 * max(abs(low), abs(high)) or 1.0
+    pad = 0.05 * (high - low) or 0.05 * max(abs(low), abs(high)) or 1.0
     return Scale(low - pad, high + pad)
 
 

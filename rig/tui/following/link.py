@@ -10,14 +10,15 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from rig.bench.latch import BenchState
-from rig.bench.screens.commands import Command, own_command
-from rig.bench.screens.snapshot import PastMinute, PlanLine
+from rig.bench.screens.commands import own_command
+from rig.bench.screens.snapshot import PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.model.parts import Wire
 from rig.runs.runstate import read_events
@@ -33,42 +34,6 @@ QUIET: Final = 0.5  # a run silent for this long is stale, and its process is ch
 KEPT_LINES: Final = 2000  # of the event log, and of estimates
 ANSWERED: Final = 1.0  # time for a run to send its recent history [s]
 ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
-
-
-class SnapshotSource(Protocol):
-    """One connection to a run, as in `rig.bench.screens.sockets.Attachment`."""
-
-    def receive(self, timeout: float) -> Snapshot | None:
-        """Return the next snapshot, or None when none came within `timeout` seconds."""
-        ...
-
-    def send(self, command: str) -> bool:
-        """Send a command; False when the run did not answer."""
-        ...
-
-    def ask(self, command: Command) -> str | None:
-        """Send a command with a value; return None if it was accepted, else why not."""
-        ...
-
-    def past(self, timeout: float) -> PastMinute | None:
-        """Return the run's recent history and its plan; None if it has none."""
-        ...
-
-    def close(self) -> None:
-        """Close the connection."""
-        ...
-
-
-class Sessions(Protocol):
-    """Finds and opens running sessions."""
-
-    def find(self) -> Sequence[Endpoint]:
-        """Return the live sessions, of a wanted rig only if one is named."""
-        ...
-
-    def open(self, endpoint: Endpoint) -> SnapshotSource:
-        """Connect to one of them; raises OSError if it has just ended."""
-        ...
 
 
 class LocalSessions:
@@ -88,8 +53,8 @@ class LocalSessions:
         holder = BenchState(self._wire).holder()
         return [s for s in sessions if holder is not None and s.pid == holder.pid]
 
-    def open(self, endpoint: Endpoint) -> SnapshotSource:
-        """Connect to one of them."""
+    def open(self, endpoint: Endpoint) -> Attachment:
+        """Connect to one of them; raises OSError if it has just ended."""
         return Attachment(endpoint)
 
 
@@ -146,6 +111,11 @@ class Frame:
         return float(self.window.time[-1]) if len(self.window.time) else 0.0
 
     @property
+    def live(self) -> bool:
+        """Whether a run is attached that has not ended."""
+        return self.endpoint is not None and not self.over
+
+    @property
     def over(self) -> bool:
         """Whether the run has ended: by its own message, or because its process has ended."""
         said = self.snapshot is not None and self.snapshot.state in ENDED_STATES
@@ -155,10 +125,12 @@ class Frame:
 class Link:
     """Finds a session, follows it, and makes frames; `step` is one cycle of its thread."""
 
-    def __init__(self, sessions: Sessions, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, sessions: LocalSessions, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._sessions, self._clock = sessions, clock
         self._frame = Frame()
-        self._source: SnapshotSource | None = None
+        self._source: Attachment | None = None
         self._history = History()
         self._chosen: Endpoint | None = None
         self._choosing = False
@@ -204,7 +176,7 @@ class Link:
 
         def send() -> None:
             where = endpoint or self._only_session()
-            answered(where, where is not None and self._send(where, "stop"))
+            answered(where, where is not None and self._send_stop(where))
 
         threading.Thread(target=send, name="bramah-stop", daemon=True).start()
 
@@ -215,11 +187,8 @@ class Link:
 
         def send() -> None:
             try:
-                source = self._sessions.open(endpoint)
-                try:
+                with closing(self._sessions.open(endpoint)) as source:
                     refusal = source.ask(own_command(word, value))
-                finally:
-                    source.close()
             except Exception as error:  # the operator must see any failure
                 log.exception("asking %r of %s failed", word, endpoint)
                 refusal = str(error) or repr(error)
@@ -230,20 +199,17 @@ class Link:
     def _only_session(self) -> Endpoint | None:
         try:
             live = self._sessions.find()
-        except Exception:  # as in _send
+        except Exception:  # as in _send_stop
             log.exception("looking for a session to stop failed")
             return None
         return live[0] if len(live) == 1 else None
 
-    def _send(self, endpoint: Endpoint, command: str) -> bool:
+    def _send_stop(self, endpoint: Endpoint) -> bool:
         try:
-            source = self._sessions.open(endpoint)
-            try:
-                return source.send(command)
-            finally:
-                source.close()
+            with closing(self._sessions.open(endpoint)) as source:
+                return source.send("stop")
         except Exception:  # the operator must see "no answer", not a traceback
-            log.exception("sending %r to %s failed", command, endpoint)
+            log.exception("sending 'stop' to %s failed", endpoint)
             return False
 
     def _run(self) -> None:
@@ -279,7 +245,9 @@ class Link:
         quiet = before.snapshot is not None and now - before.received > QUIET
         snapshot = _with_newest_values(before.snapshot, snapshot)
         self._history.add(snapshot, after_gap=quiet)
-        lines = new_lines(before.snapshot, snapshot)
+        event_lines = before.event_lines
+        if lines := new_lines(before.snapshot, snapshot):
+            event_lines = (*event_lines, *lines)[-KEPT_LINES:]
         estimates = before.estimates
         if snapshot.estimates and (not estimates or estimates[-1].values != snapshot.estimates):
             point = TrackedPoint(snapshot.done_s, snapshot.estimates, snapshot.residuals)
@@ -290,9 +258,7 @@ class Link:
             snapshot=snapshot,
             received=now if _has_news(before.snapshot, snapshot) else before.received,
             speed=_speed(before, snapshot),
-            event_lines=(*before.event_lines, *lines)[-KEPT_LINES:]
-            if lines
-            else before.event_lines,
+            event_lines=event_lines,
             estimates=estimates,
             interval=_interval(before, snapshot),
             worst_age=max(before.worst_age, snapshot.block_age),

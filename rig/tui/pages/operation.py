@@ -13,7 +13,7 @@ from rig.tui.following.event_lines import EventLine
 from rig.tui.look import PlotView
 from rig.tui.pages.overview import alarm_mark
 from rig.tui.units import clock_text, limit, shown
-from rig.tui.words import run_time
+from rig.tui.words import run_time, time_left
 
 BEFORE = 2.0  # of an alarm's channel shown before its first offending sample [s]
 AFTER = 0.5  # and after it [s]
@@ -109,7 +109,7 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
         holder = f"read-only: {snapshot.holder} is in command; t takes the controls"
     else:
         holder = "nobody is in command; t takes the controls"
-    left = f"{clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))} left"
+    left = f"{time_left(snapshot)} left"
     head = [
         row((" command ", DIM), (holder, STRONG if view.in_command else "")),
         row((" engine  ", DIM), (snapshot.engine or snapshot.state, STRONG),

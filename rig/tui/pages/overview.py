@@ -6,19 +6,11 @@ from rig.bench.screens.sockets import Snapshot
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.large import ROWS, large, large_width
 from rig.tui.drawing.rows import Row, block, fit, hstack, row
-from rig.tui.drawing.styles import (
-    ALARM,
-    ALARM_TEXT,
-    DIM,
-    LEVELS,
-    STRONG,
-    WARN,
-    WARN_TEXT,
-)
+from rig.tui.drawing.styles import ALARM, ALARM_TEXT, DIM, LEVELS, STRONG, WARN, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import WIDTH, bench_bars, joint_box, joints_in
-from rig.tui.units import clock_text, shown
-from rig.tui.words import Headline, Margin, headline, nearest_margin
+from rig.tui.units import shown
+from rig.tui.words import Headline, Margin, headline, nearest_margin, time_left
 
 NEAR = 0.10  # a margin below this share of its band is yellow
 BIG = (150, 45)  # terminal of this size: letters twice as large
@@ -51,8 +43,7 @@ def _band(
         near = ALARM_TEXT if margin.share < 0 else WARN_TEXT if margin.share < NEAR else STRONG
         tiles.append((f"{max(margin.share, 0.0):.0%}", "to nearest limit", near))
     if snapshot.total_s > 0 and not view.newest.over:
-        left = clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))
-        tiles.append((left, "left", STRONG))
+        tiles.append((time_left(snapshot), "left", STRONG))
     sizes = [max(large_width(text, scale), len(caption)) + 2 for text, caption, _ in tiles]
     room = width - sum(sizes) - len(tiles)
     if room < min(large_width(headline.word), width) and headline.level == "alarm":

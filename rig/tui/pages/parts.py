@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
+from itertools import groupby
 from typing import Final
 
-from rig.bench.screens.sockets import Snapshot
+from rig.bench.screens.sockets import ChannelView, Snapshot
 from rig.model import channels as ch
+from rig.tui.drawing.braille import scale_around
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
-from rig.tui.drawing.rows import Row, box, fit, row
-from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
+from rig.tui.drawing.rows import Row, box, fit, row, width_of
+from rig.tui.drawing.styles import DIM, STRONG, TRIP_LINE, WARN_LINE, WARN_TEXT
 from rig.tui.look import PlotView
-from rig.tui.pages.gauge import gauge
 from rig.tui.units import limit, shown
 from rig.tui.words import Freshness, value
 
@@ -24,6 +26,12 @@ GAUGES: Final = (ch.CAP, ch.ROD, ch.PISTON, ch.SPOOL, ch.COMMAND, ch.POSITION, c
 CURVE_HEIGHT: Final = 4  # least rows of a curve with its words
 WIDTH: Final = 38  # least columns of a joint
 ROLES: Final = {"locked": "▣ locked", "excited": "≈ excited", "free": "○ free"}
+
+
+LABEL: Final = 8  # characters of a gauge's name
+NUMBER: Final = 9  # of its value and unit
+LIMIT: Final = 3  # of a limit
+MARKS: Final = {"├": TRIP_LINE, "┤": TRIP_LINE, "╎": WARN_LINE, "─": DIM, "━": DIM}
 
 
 def joints_in(channels: Iterable[str]) -> dict[int, list[str]]:
@@ -50,6 +58,73 @@ def freshness_label(view: PlotView) -> str:
         Freshness.STALE: "STALE",
         Freshness.DISCONNECTED: "DISCONNECTED",
     }[view.fresh]
+
+
+def bar(
+    at: float,
+    limits: tuple[float | None, float | None],
+    travel: tuple[float, float] | None,
+    reach: tuple[float, float],
+    width: int,
+    warnings: tuple[float | None, float | None] = (None, None),
+) -> str:
+    """Return a bar of `width` characters: ├ ┤ limits, ╎ warnings, ━ the travel, ● the value.
+
+    The scale is slightly wider than `reach`. A value off the scale is drawn as ◀ or ▶ at its end;
+    NaN is not drawn.
+    """
+    if width < 3:
+        return " " * max(width, 0)
+    scale = scale_around(reach)
+
+    def cell(x: float) -> int:
+        return width - 1 - int(scale.row(x, width))  # rows count from the top, cells from the left
+
+    cells = ["─"] * width
+    if travel is not None:
+        for i in range(cell(travel[0]), cell(travel[1]) + 1):
+            cells[i] = "━"
+    for level in warnings:
+        if level is not None and scale.low <= level <= scale.high:
+            cells[cell(level)] = "╎"
+    for level, mark in zip(limits, "├┤", strict=True):
+        if level is not None:
+            cells[cell(level)] = mark
+    if not math.isnan(at):
+        cells[cell(at)] = "◀" if at < scale.low else "▶" if at > scale.high else "●"
+    return "".join(cells)
+
+
+def gauge(
+    label: str,
+    view: ChannelView,
+    travel: tuple[float, float] | None,
+    reach: tuple[float, float] | None,
+    width: int,
+    fresh: Freshness,
+) -> Row:
+    """Return a row of `width` characters: name, value, lower limit, bar, upper limit.
+
+    The bar covers `reach`; without it the line ends in the travel as numbers.
+    """
+    how = shown(view.unit)
+    limits = (limit(view.low), limit(view.high))
+    number = value(view, fresh, sign=how.signed)
+    space = (" " * max(NUMBER - width_of(number), 0), "")
+    line: Row = ((f"{label:<{LABEL}}", DIM), space, *number)
+    if reach is None:
+        # The range of a bar is unknown: show the travel in numbers.
+        numbers = [how.number(end, sign=how.signed) for end in travel or ()]
+        return fit((*line, (f"  {' … '.join(numbers)}", DIM)), width)
+    low, high = (f"{how.short(level):>{LIMIT}}" for level in limits)
+    line = (*line, (f" {low} ", DIM))
+    room = width - width_of(line) - max(LIMIT, len(high.strip())) - 1
+    warnings = (limit(view.warn_low), limit(view.warn_high))
+    drawn = bar(view.last, limits, travel, reach, room, warnings)
+    live = fresh is Freshness.LIVE
+    styled = groupby(drawn, lambda mark: MARKS.get(mark, STRONG) if live else DIM)
+    marks = tuple(("".join(group), style) for style, group in styled)
+    return fit((*line, *marks, (f" {high.strip():<{LIMIT}}", DIM)), width)
 
 
 def bar_of(view: PlotView, name: str, label: str, width: int) -> Row:

@@ -14,7 +14,7 @@ from rig.tui.drawing.plot import GUTTER, PlotTrace, draw
 from rig.tui.drawing.rows import Part, Row, block, columns, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
-from rig.tui.run_trace import StoredCurves, StoredEffect, StoredEstimate, StoredTrace
+from rig.tui.recorded_run import StoredCurves, StoredEffect, StoredEstimate, StoredTrace
 from rig.tui.units import shown
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from rig.tui.following.link import LinkStage
 from rig.tui.look import OF_A_RECORDED_RUN, PAGES, PlotView
 from rig.tui.pages import estimates, levels, manual, operation, overview, runs, trace
 from rig.tui.units import age_text, clock_text
-from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
+from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time, time_left
 
 REMARK_ROWS: Final = 3  # at most, of the result of an action
 LEAST: Final = (60, 16)  # a smaller terminal shows only the state and the stop key
@@ -128,7 +128,7 @@ def _where(view: PlotView, width: int) -> Row:
     share = min(max(snapshot.done_s / snapshot.total_s, 0.0), 1.0)
     room = max(min(width - 70, 40), 0)
     full = round(share * room)
-    left = f"left {clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))}"
+    left = f"left {time_left(snapshot)}"
     left = "ended" if view.newest.over else left
     progress = row(("━" * full, ""), ("─" * (room - full), DIM), f" {share:.0%}  {left}", lost)
     return ends(line, (*progress, (" ", "")), width)

@@ -2,6 +2,11 @@
 
 The server has no connection to a run: display and commands go through the page's own screen, a
 process that attaches like one in a terminal. No page, script, style or font is external.
+
+Other users of this machine can reach a loopback port too, and a foreign page in the operator's
+browser can send requests to it: a request needs this machine's loopback name and the token. The
+token is in the query of every address, not in a cookie: cookies are shared by all ports of a host,
+so that another user's server would receive it.
 """
 
 from __future__ import annotations
@@ -9,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import secrets
 import signal
 import socket
 from collections.abc import Awaitable, Callable, Sequence
@@ -16,17 +22,18 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
+from urllib.parse import urlsplit
 
 import jinja2
 import matplotlib as mpl
 from aiohttp import WSCloseCode, WSMsgType, web
 from textual_serve.server import Server
 
-from rig.tui.web.access import LOOPBACK, new_token, refusal
 from rig.tui.web.attached_screen import AttachedScreen
 
 log = logging.getLogger(__name__)
-
+LOOPBACK: Final = "127.0.0.1"
+NAMES: Final = frozenset({LOOPBACK, "localhost", "::1"})
 MOST_SCREENS: Final = 4  # pages at a time: each is a process on the acquisition's computer
 HEARTBEAT: Final = 5.0  # a page that does not answer within half of it counts as closed [s]
 LARGEST: Final = 1 << 16  # message of a page [bytes]
@@ -59,6 +66,36 @@ class _InOneLine(logging.Filter):
         if not log.isEnabledFor(logging.DEBUG):
             record.exc_info = None
         return True
+
+
+def refusal(
+    hosts: Sequence[str], origins: Sequence[str], tokens: Sequence[str], token: str
+) -> str | None:
+    """Return in one line why a request is refused, None if it is accepted.
+
+    hosts, origins, tokens: the values of its headers `Host` and `Origin` and of its query, for
+    every occurrence. The port of `Host` may differ (a forwarded one); the name must be a loopback
+    name, because a foreign name that resolves to loopback is a foreign page (DNS rebinding).
+    """
+    host = hosts[0] if len(hosts) == 1 else ""
+    if host_name(host) not in NAMES:
+        return f"the address names the host {host!r}, expected {LOOPBACK} or localhost"
+    if any(origin != f"http://{host}" for origin in origins):
+        return f"it comes from a page of {origins[0]!r}, expected http://{host}"
+    sent = [text.encode(errors="surrogateescape") for text in tokens]  # any bytes may arrive
+    if len(sent) != 1 or not secrets.compare_digest(sent[0], token.encode()):
+        return "the address holds no valid token; open the one that `bramah monitor --web` printed"
+    return None
+
+
+def host_name(host: str) -> str:
+    """Return the name in a `Host` header without its port, '' for an invalid header."""
+    try:
+        parts = urlsplit(f"//{host}")
+        whole = parts.netloc == host and "@" not in host and (parts.port or 0) >= 0
+    except ValueError:
+        return ""
+    return parts.hostname or "" if whole else ""
 
 
 class PageServer(Server):
@@ -233,7 +270,7 @@ async def _serve(
     # Another program's requests must not cause tracebacks in the operator's terminal.
     logging.getLogger("aiohttp.server").addFilter(_InOneLine())
     logging.getLogger("textual-serve").setLevel(logging.CRITICAL)  # a screen states why it ended
-    token = new_token()
+    token = secrets.token_urlsafe(32)  # 256 random bits
     app = await PageServer(words, token).make_app()
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN)
     await runner.setup()

@@ -23,7 +23,7 @@ from rig.model.records import Record, Run
 from rig.runs.archive import write_run
 from rig.runs.rigs import load_rig
 from rig.tui.pages.trace import errors_of
-from rig.tui.run_trace import read_trace
+from rig.tui.recorded_run import read_trace
 from tests.analysis.carriage import Carriage, moves, record
 from tests.studies.machines import emps as study
 
