@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from keyword import iskeyword
 from pathlib import Path
 from types import FrameType
@@ -25,35 +24,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 NAME: Final = "bramah"
 COMPLETING: Final = "_BRAMAH_COMPLETE"  # set by the shell's completion, which Typer installs
-# Verb and module with the function or group of that name, in the order of `bramah --help`.
-VERBS: Final = {
-    "demo": "rig.cli.verbs.demo",
-    "sim": "rig.cli.verbs.sim",
-    "check": "rig.cli.verbs.check",
-    "run": "rig.cli.verbs.run",
-    "queue": "rig.cli.verbs.queue",
-    "monitor": "rig.cli.verbs.monitor",
-    "runs": "rig.cli.verbs.runs",
-    "recover": "rig.cli.verbs.recover",
-    "probe": "rig.cli.verbs.probe",
-    "stop": "rig.cli.verbs.stop",
-    "depressurise": "rig.cli.verbs.depressurise",
-    "reset": "rig.cli.verbs.reset",
-    "plan": "rig.cli.verbs.plan",
-    "design": "rig.cli.verbs.design",
-    "import": "rig.cli.verbs.import_",
-    "export": "rig.cli.verbs.export",
-    "identify": "rig.cli.verbs.identify",
-    "validate": "rig.cli.verbs.validate",
-    "simulate": "rig.cli.verbs.simulate",
-    "trace": "rig.cli.verbs.trace",
-    "loop": "rig.cli.verbs.loop",
-    "manual": "rig.cli.verbs.manual",
-    "conformance": "rig.cli.verbs.conformance",
-    "dbc": "rig.cli.verbs.dbc",
-    "schema": "rig.cli.verbs.schema",
-    "bench": "rig.cli.bench.command",
-}
+# In the order of `bramah --help`; each a module of `rig.cli.verbs` with a function or group of its
+# name (a keyword of Python with an underscore behind it).
+VERBS: Final = (
+    "demo", "sim", "check", "run", "queue", "monitor", "runs", "recover", "probe", "stop",
+    "depressurise", "reset", "plan", "design", "import", "export", "identify", "validate",
+    "simulate", "trace", "loop", "manual", "conformance", "dbc", "schema", "bench",
+)  # fmt: skip
 GUIDE: Final = """Run a hydraulic robot's test bench, identify its model, find what the model lacks.
 
 Begin with `bramah demo`, which needs no hardware. At a bench: `bramah probe` reads it and moves
@@ -71,15 +48,16 @@ def command_line(verbs: Sequence[str]) -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_bramah)
-    for verb, module in VERBS.items():
+    for verb in VERBS:
+        name = f"{verb}_" if iskeyword(verb) else verb
         if verb in verbs:
-            work = getattr(importlib.import_module(module), f"{verb}_" if iskeyword(verb) else verb)
+            work = getattr(importlib.import_module(f"rig.cli.verbs.{name}"), name)
             if isinstance(work, typer.Typer):
                 app.add_typer(work, name=verb)
             else:
                 app.command(verb)(work)
         else:
-            app.command(verb, help=_summary(module))(_not_imported)
+            app.command(verb, help=_summary(name))(_not_imported)
     return app
 
 
@@ -106,18 +84,14 @@ def _not_imported() -> None:
     raise AssertionError("the verb called was not passed to command_line()")
 
 
-def _summary(module: str) -> str:
+def _summary(name: str) -> str:
     """Return the first line of a verb's docstring, read from its source without importing it."""
-    parent, _, leaf = module.rpartition(".")
-    spec = find_spec(parent)
-    assert spec is not None
-    assert spec.submodule_search_locations
-    source = Path(spec.submodule_search_locations[0], f"{leaf}.py").read_text(encoding="utf-8")
+    source = Path(__file__).with_name("verbs").joinpath(f"{name}.py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         doc = ast.get_docstring(node) if isinstance(node, ast.FunctionDef) else None
         if doc and "Example: bramah" in doc:
             return doc.splitlines()[0]
-    raise AssertionError(f"{module} has no verb")
+    raise AssertionError(f"rig/cli/verbs/{name}.py has no verb")
 
 
 def _typed(words: Sequence[str]) -> Sequence[str]:

@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from analysis.simulation.simulate import compiled, simulate
-from rig.cli.bench.figure import Figure
+from rig.cli.bench.figure import Figure, processor_times
 from rig.cli.bench.figures import text
 from rig.cli.bench.speed.free_run import both_moving, free_run_times
 from rig.cli.bench.speed.growth import four_joints
-from rig.cli.bench.timing import processor_times
 from rig.runs.rigs import load_rig
 
 

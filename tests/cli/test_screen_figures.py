@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.cli.bench.screen.arrival import age_quantile, ages_on_glass
+from rig.cli.bench.screen.arrival import age_quantile, ages_on_screen
 from rig.cli.bench.screen.runs import RunPlace, RunTimes, played
 from rig.cli.bench.screen.stops import many_stops
 from rig.cli.bench.screen.terminal import Screen
@@ -26,7 +26,7 @@ def runtime() -> Iterator[Path]:
 def test_ages_are_from_the_sample_to_the_text_in_the_terminal() -> None:
     drawn = [(10.10, "time 0.050 s, tick 50 "), (10.20, "tick 150"), (10.21, "no number\n"),
              (10.30, "tick 2"), (10.31, "50 of ")]  # fmt: skip
-    ages, stays = ages_on_glass(drawn, 10.0, 1000.0)
+    ages, stays = ages_on_screen(drawn, 10.0, 1000.0)
     assert ages == pytest.approx([0.05, 0.05])
     assert stays == pytest.approx([0.10, 0.11]), "a number in two pieces counts with its second"
 

@@ -9,6 +9,7 @@ import pytest
 
 from drivers.base import DeviceError, DeviceLost
 from hil_sim.faults.base import Fault
+from hil_sim.link.served import SERVED
 from rig.cli.bench.faults.bench import FaultBench, fault_bench
 from rig.cli.bench.faults.figures import RIG, counted, jobs
 from rig.cli.bench.faults.trials import (
@@ -18,7 +19,6 @@ from rig.cli.bench.faults.trials import (
     example,
     kinds,
     try_fault,
-    wires,
 )
 from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
@@ -94,7 +94,7 @@ def test_every_fault_of_the_scenario_file_has_an_example_and_a_row_in_the_page()
 def test_every_fault_but_a_drifting_clock_is_tried_on_every_wire_and_counted_in_the_page() -> None:
     section = PAGE.partition("<!-- counts -->")[2].partition("<!-- end of counts -->")[0]
     total = 0
-    for wire in wires():
+    for wire in SERVED:
         chosen = list(jobs(wire, 500))
         total += len(chosen)
         assert {name for _, name in chosen} == set(kinds()) - {"clock_drift"}

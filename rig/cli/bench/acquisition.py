@@ -33,7 +33,7 @@ def measure_acquisition(
     wanted = round(seconds * info.sample_rate)
     ends: list[float] = []
     arrivals: list[float] = []
-    lost = disordered = samples = backlog = 0
+    lost = disordered = samples = 0
     driver.start()
     try:
         block = driver.read_block()
@@ -42,7 +42,6 @@ def measure_acquisition(
             arrivals.append(clock())
             ends.append((block.tick + len(block.data)) / info.sample_rate)
             samples += len(block.data)
-            backlog = max(backlog, block.backlog)
             lost += max(block.tick - expected, 0)
             disordered += block.tick < expected
             expected = max(expected, block.tick + len(block.data))
@@ -51,27 +50,15 @@ def measure_acquisition(
             block = driver.read_block()
     finally:
         driver.stop()
+    late, drift = lateness(np.array(ends), np.array(arrivals))
     return {
-        "seconds": (expected - first) / info.sample_rate,
         "blocks": len(ends),
         "samples": samples,
         "lost_samples": lost,
         "out_of_order_blocks": disordered,
-        "backlog_max_blocks": backlog,
-        **timing(np.array(ends), np.array(arrivals)),
-    }
-
-
-def timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
-    """Return lateness, jitter and drift of blocks whose last samples were taken at `ends` [s]."""
-    late, drift = lateness(ends, arrivals)
-    interval = np.diff(arrivals) if len(arrivals) > 1 else np.zeros(1)
-    return {
         "lateness_mean_s": float(late.mean()),
         "lateness_p99_s": float(np.quantile(late, 0.99)),
         "lateness_max_s": float(late.max()),
-        "jitter_rms_s": float(late.std()),
-        "interval_max_s": float(interval.max()),
         "clock_drift_ppm": drift * 1e6,
     }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,11 @@ from scipy.integrate import solve_ivp
 
 from hil_sim.plant import kernel, kernel_loop
 from hil_sim.plant.kernel_data import record
-from hil_sim.plant.plant import STEP, Law, Plant
+from hil_sim.plant.plant import Law, Plant
 from hil_sim.scenario.file import Scenario
-from rig.model.parse import parse_model
 from rig.model.rig import Rig
 from rig.model.wire.codes import Array, decode_output
+from rig.runs.rigs import load_rig
 
 PEAK = 1.6  # amplitude of the command of each joint [V]
 LINES = (1, 3, 5, 7, 9, 13, 19)  # odd multiples of 0.5 Hz
@@ -117,11 +116,6 @@ class Reference:
         return np.concatenate([self.y[:n], [kernel.pressure(v, self.bench) for v in z]])
 
 
-def _shipped() -> Rig:
-    path = resources.files("rig") / "shipped" / "shinshu-2dof.yaml"
-    return parse_model(Rig, path.read_text(encoding="utf-8"), path.name)
-
-
 def spool_targets(rig: Rig, outputs: NDArray[np.int64]) -> Array:
     """Return the spool targets [V] of DA codes, both (ticks, joints)."""
     columns = [
@@ -168,27 +162,25 @@ def errors(states: Array, true: Array, joints: int) -> dict[str, float]:
 def accuracy(seconds: float = 1.0) -> dict[str, float]:
     """Return the plant's errors against scipy (DOP853, rtol 1e-10) under `hard_laws`.
 
-    Keys: angle_error, pressure_error (relative to each signal's range), step [s], seconds.
+    Keys: angle_error, pressure_error (relative to each signal's range).
     """
-    rig = _shipped()
+    rig = load_rig("shinshu-2dof")
     simulated, targets = plant_run(rig, round(seconds * rig.sample_rate))
     true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-10)
-    return {**errors(simulated, true, len(rig.joints)), "step": STEP, "seconds": seconds}
+    return errors(simulated, true, len(rig.joints))
 
 
 def speed(seconds: float = 5.0) -> dict[str, float]:
     """Return the plant's speed on one core as a multiple of real time, with converters and noise.
 
     Keys: real_time_ratio; lsoda_ratio, the time of scipy's LSODA divided by the plant's for the
-    same input; lsoda_rtol, the loosest of several tolerances at which LSODA is as accurate;
-    plant_error and lsoda_error, the largest errors.
+    same input at the loosest of several tolerances at which it is as accurate; plant_error and
+    lsoda_error, the largest errors.
     """
-    rig = _shipped()
+    rig = load_rig("shinshu-2dof")
     laws, ticks = hard_laws(rig), round(seconds * rig.sample_rate)
     taken = math.inf
-    for _ in range(
-        3
-    ):  # the best of three, in processor time, to exclude the load of other programs
+    for _ in range(3):  # the best of three, to exclude the load of other programs
         plant = Plant(rig, Scenario(), 1)
         began = time.process_time()
         plant.advance(ticks, laws)
@@ -205,7 +197,6 @@ def speed(seconds: float = 5.0) -> dict[str, float]:
     return {
         "real_time_ratio": 1.0 / taken,
         "lsoda_ratio": lsoda / part / taken,
-        "lsoda_rtol": rtol,
         "lsoda_error": other,
         "plant_error": own,
     }

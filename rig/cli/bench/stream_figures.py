@@ -13,8 +13,8 @@ from analysis.identify.identify import identify
 from analysis.identify.result import PLAIN
 from analysis.identify.streams.online import Tracker, track
 from drivers.base import SampleBlock
-from rig.cli.bench.analysis import bench_run
 from rig.cli.bench.figure import Figure
+from rig.cli.bench.speed.figures import bench_run
 from rig.cli.bench.stream import cluster_figures, row_figures, spin_figures
 from rig.cli.identification.tracking import Tracking
 from rig.model.records import Record

@@ -11,9 +11,10 @@ from drivers.base import DeviceLost
 from hil_sim.device.server import TCP
 from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
+from hil_sim.link.served import SERVED
 from rig.cli.bench.faults.bench import fault_bench
 from rig.cli.bench.faults.figures import RIG, counted, quiet
-from rig.cli.bench.faults.trials import TrialOutcome, kinds, try_fault, wires
+from rig.cli.bench.faults.trials import TrialOutcome, kinds, try_fault
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
 from rig.runs.rigs import load_rig
@@ -31,7 +32,7 @@ def table_rows() -> list[tuple[str, str]]:
     rows = []
     for name, kind in kinds().items():
         everywhere = issubclass(kind, WireFault | DeviceFault)
-        rows += [(name, wire) for wire in (wires() if everywhere else (TCP,))]
+        rows += [(name, wire) for wire in (SERVED if everywhere else (TCP,))]
     return rows
 
 
@@ -70,7 +71,7 @@ def _by_fault(outcomes: Sequence[TrialOutcome]) -> list[tuple[str, ...]]:
     """Return a row for each fault and wire: how often each diagnosis came, and the slowest end."""
     groups: dict[tuple[str, str], list[TrialOutcome]] = {}
     for fault in dict.fromkeys(outcome.fault for outcome in outcomes):
-        for wire in wires():
+        for wire in SERVED:
             group = [o for o in outcomes if o.fault == fault and o.wire == wire]
             if group:
                 groups[fault, wire] = group

@@ -27,7 +27,6 @@ class FaultBenchState:
     """State of the device, read in its process and not over the wire."""
 
     driven: bool  # an output is not zero, or an active law may change one
-    seconds: float  # of device time since the device was created
     struck: int  # number of frames that faults of the wire have affected
 
 
@@ -138,7 +137,7 @@ class _Child:
         assert served is not None
         device = served.device
         driven = served.inside(lambda: device.laws.armed or bool(device.outputs.any()))
-        return FaultBenchState(driven, self._seconds(), sum(served.link.injected.values()))
+        return FaultBenchState(driven, sum(served.link.injected.values()))
 
     def end(self) -> None:
         served, self._served = self._served, None

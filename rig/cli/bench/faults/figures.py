@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Final
 
 from hil_sim.faults.wire import WireFault
+from hil_sim.link.served import SERVED
 from rig.cli.bench.faults.bench import fault_bench
-from rig.cli.bench.faults.trials import Diagnosis, TrialOutcome, kinds, try_fault, wires
+from rig.cli.bench.faults.trials import Diagnosis, TrialOutcome, kinds, try_fault, with_timeout
 from rig.cli.bench.figure import Figure
-from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
 RIG: Final = "shinshu-2dof"
@@ -27,28 +27,23 @@ _FROZEN: Final = ("sensor_stuck", "valve_stuck", "broken_wire")
 Say = Callable[[str], None]
 
 
-def impatient(rig: Rig) -> Rig:
-    """Return the rig with a short time-out of its device, for virtual time."""
-    return rig.model_copy(update={"wire": rig.wire.model_copy(update={"timeout": TIMEOUT})})
-
-
 def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
     """Yield (seed, fault) for a wire's share of at least `least` trials, every fault in turn."""
     names = [name for name in kinds() if name not in REAL_TIME_ONLY]
-    rounds = -(-least // (len(names) * len(wires())))
+    rounds = -(-least // (len(names) * len(SERVED)))
     for number in range(rounds * len(names)):
-        yield wires().index(wire) + len(wires()) * number, names[number % len(names)]
+        yield SERVED.index(wire) + len(SERVED) * number, names[number % len(names)]
 
 
 def fault_trials(folder: Path, least: int, say: Say) -> list[TrialOutcome]:
     """Run at least `least` trials in virtual time, each with one fault."""
-    with quiet(), ThreadPoolExecutor(len(wires())) as pool:  # trials wait more than they compute
-        outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
+    with quiet(), ThreadPoolExecutor(len(SERVED)) as pool:  # trials wait more than they compute
+        outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), SERVED)
         return [outcome for part in outcomes for outcome in part]
 
 
 def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[TrialOutcome]:
-    rig, trials = impatient(load_rig(RIG)), []
+    rig, trials = with_timeout(load_rig(RIG), TIMEOUT), []
     chosen = list(jobs(wire, least))
     with fault_bench() as bench:
         for seed, name in chosen:
@@ -61,7 +56,7 @@ def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[TrialOutcome
 
 def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:
     """Inject faults on every wire; count outputs left on, samples lost, faults named."""
-    say(f"faults: at least {least} trials on {', '.join(wires())}")
+    say(f"faults: at least {least} trials on {', '.join(SERVED)}")
     return counted(fault_trials(folder, least, say))
 
 

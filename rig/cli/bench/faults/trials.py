@@ -24,7 +24,6 @@ from hil_sim.faults import CLASSES
 from hil_sim.faults.base import Fault
 from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
 from hil_sim.faults.wire import WireFault
-from hil_sim.link.served import SERVED
 from rig.bench.guard import EXCITED, JointRole
 from rig.bench.latch import BenchState
 from rig.bench.session import Bench
@@ -170,7 +169,7 @@ def try_fault(
             except (DeviceError, SafetyTrip):  # before the fault, so caused by a busy computer
                 if not tries_left:
                     raise
-                rig = _more_patient(rig)
+                rig = with_timeout(rig, 2.0 * rig.wire.timeout)
                 endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
                 reached = reached_at(rig, endpoint)
     finally:
@@ -244,8 +243,9 @@ def _session(
     outcome.lost_blocks = _not_in(folder / "run" / ARCHIVE, rig, collector.blocks)
 
 
-def _more_patient(rig: Rig) -> Rig:
-    wire = rig.wire.model_copy(update={"timeout": 2.0 * rig.wire.timeout})
+def with_timeout(rig: Rig, seconds: float) -> Rig:
+    """Return the rig with another time-out of its device [s]."""
+    wire = rig.wire.model_copy(update={"timeout": seconds})
     return rig.model_copy(update={"wire": wire})
 
 
@@ -328,8 +328,3 @@ def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Diagnosis:
     if ch.kind_of(trip.channel)[0] == ch.SUPPLY if trip.channel else False:
         return Diagnosis.NAMED if joint is None else Diagnosis.UNKNOWN
     return Diagnosis.WRONG
-
-
-def wires() -> tuple[str, ...]:
-    """Return the names of the wires that the simulated bench can disturb."""
-    return SERVED

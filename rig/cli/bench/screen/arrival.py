@@ -31,9 +31,8 @@ from rig.runs.rigs import load_rig
 Array = NDArray[np.float64]
 
 AGE_LIMIT: Final = 250.0  # [ms], age of the newest sample on the screen, 99 % of the time
-NOISE: Final = (
-    1.0  # lateness that a screen may add, in standard deviations of the lateness without one
-)
+# Lateness that a screen may add, in standard deviations of the lateness without one.
+NOISE: Final = 1.0
 SLICE: Final = 1.0  # length of the slices of a phase whose medians are compared [s]
 SETTLE: Final = 3.0  # wait after a screen was opened or closed, before a phase is measured [s]
 PAGE: Final = "4"  # key of the page of diagnostics
@@ -51,7 +50,7 @@ class Phase:
     screen: bool
 
 
-def ages_on_glass(
+def ages_on_screen(
     drawn: Iterable[tuple[float, str]], origin: float, rate: float
 ) -> tuple[Array, Array]:
     """Return (age when drawn, time until the next) [s], each (n,), of the ticks in drawn text.
@@ -144,7 +143,7 @@ def _lateness_figures(times: RunTimes, phases: list[Phase]) -> list[Figure]:
 
 def _age_figures(times: RunTimes, drawn: list[list[tuple[float, str]]]) -> list[Figure]:
     rate = load_rig(RIG).sample_rate
-    seen_ages = [ages_on_glass(picture, times.origin, rate) for picture in drawn]
+    seen_ages = [ages_on_screen(picture, times.origin, rate) for picture in drawn]
     ages, stays = (np.concatenate(parts) for parts in zip(*seen_ages, strict=True))
     if not len(ages):
         raise WorkError("bench --only screen: no tick was drawn on the page of diagnostics")

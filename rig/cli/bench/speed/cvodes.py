@@ -56,9 +56,8 @@ def solver(
 
     def at(tolerance: float, start: Array) -> Callable[[], Array]:
         chosen = {**options, "abstol": tolerance, "reltol": tolerance}
-        with (
-            nullcontext() if folder is None else chdir(folder)
-        ):  # CasADi writes into the current folder
+        # CasADi writes into the current folder.
+        with nullcontext() if folder is None else chdir(folder):
             run = ca.integrator("run", "cvodes", equations, 0.0, grid, chosen)
         return lambda: np.asarray(run(x0=start / scale)["xf"]).T * scale
 

@@ -15,19 +15,13 @@ from scipy.integrate import odeint as scipy_odeint
 from analysis.simulation.equations import call_rates
 from analysis.simulation.model import Model, nominal_model
 from analysis.simulation.settings import SIMULATION
-from analysis.simulation.simulate import (
-    Compiled,
-    DrivingInput,
-    State,
-    compiled,
-    simulate,
-)
+from analysis.simulation.simulate import Compiled, DrivingInput, State, compiled, simulate
 from analysis.simulation.synthetic import multisine
 from analysis.simulation.twin import holding_state
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
+from rig.cli.bench.figure import REPEATS, processor_times
 from rig.cli.bench.speed import cvodes, hand_fused
-from rig.cli.bench.timing import REPEATS, processor_times
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -101,10 +95,8 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
         times = processor_times(works, repeats)
     return {
         **times,
-        "simulated_seconds": t[-1],
         "times_real_time": float(t[-1] / times["own"].least),
         "error": exact,
-        "odeint_rtol": rtol,
         **errors,
         "difference_to_hand": float(np.abs(out[:, :2] - simulation.q).max()),
         "failure": simulation.failure,

@@ -10,10 +10,9 @@ from analysis.identify.identify import identify
 from analysis.simulation.simulate import compiled, simulate
 from analysis.terms import known, with_effects
 from analysis.terms.base import Used
-from rig.cli.bench.analysis import bench_run
-from rig.cli.bench.figure import Figure
+from rig.cli.bench.figure import Figure, processor_time
+from rig.cli.bench.speed.figures import bench_run
 from rig.cli.bench.speed.free_run import both_moving
-from rig.cli.bench.timing import processor_time
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
@@ -21,9 +20,8 @@ GROUP: Final = "growth"
 RECORDS: Final = (3, 6, 12, 24)
 SECONDS: Final = (5.0, 10.0, 20.0, 40.0)
 RIGS: Final = ("boom-1dof", "shinshu-2dof", "digger-3dof")
-CANDIDATES: Final = (
-    4  # largest number of effects added to the model, as a trace adds its candidates
-)
+# Largest number of effects added to the model, as a trace adds its candidates.
+CANDIDATES: Final = 4
 Say = Callable[[str], None]
 
 
