@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -146,3 +147,21 @@ def overridden(
     kept = tuple(steps) if steps else None
     values = library.parsed_values(settings or ())
     return Overrides(repeats, duration, amplitude_scale, seed, kept, values)
+
+
+def time_since(text: str | None) -> datetime | None:
+    """Read a date, a time, or a duration before now (12h, 7d, 30m); raises InputError."""
+    if text is None:
+        return None
+    units = {"h": "hours", "d": "days", "m": "minutes"}
+    if text[:-1].isdigit() and text[-1] in units:
+        return datetime.now(UTC) - timedelta(**{units[text[-1]]: int(text[:-1])})
+    try:
+        return datetime.fromisoformat(text).astimezone(UTC)
+    except ValueError:
+        from rig.model.parse import InputError
+
+        raise InputError(
+            f"--since {text!r}: expected a date (2026-03-01), a time (2026-03-01T22:00) or a "
+            "duration (12h or 7d)"
+        ) from None

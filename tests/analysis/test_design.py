@@ -16,7 +16,7 @@ from analysis.design.twin_records import Array, play
 from analysis.simulation.twin import simulate_commands
 from protocols.files.library import load
 from protocols.files.plan import resolve
-from rig.cli.proof.planned import planned_steps
+from rig.cli.proof.predicted_errors import planned_steps
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.analysis.designed_steps import LINES, steps

@@ -76,5 +76,5 @@ def looped(
         "shinshu-2dof", out, protocol=str(path), rounds=rounds, until_visible=until_visible, ask=ask
     )
     experiments = Inside(request, parse_scenario(f"effects: [{effects}]", "hidden"))
-    experiments.close()
+    experiments.run()
     return experiments

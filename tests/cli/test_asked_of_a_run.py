@@ -17,7 +17,7 @@ from protocols.engine.states import TRANSITIONS, EngineState
 from rig.bench.screens.commands import Command
 from rig.bench.screens.sockets import Attachment
 from rig.cli.errors import alarm
-from rig.cli.execution.attended import terminal_lines
+from rig.cli.execution.protocol_run import terminal_lines
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
 from tests.cli.bench import (

@@ -124,7 +124,7 @@ def test_it_stops_where_it_should_and_says_why(
 ) -> None:
     request = LoopRequest(RIG, tmp_path, **({"until_visible": True, **changes}))  # type: ignore[arg-type]
     experiments = Replayed(request, air.rounds[:1], takes)
-    experiments.close()
+    experiments.run()
     assert experiments.stopped == why
     assert len(experiments.rounds) == count
 
@@ -192,5 +192,5 @@ def test_nothing_to_gain_is_a_reason_to_stop(air: Inside, tmp_path: Path) -> Non
     one = air.rounds[0]
     puzzled = replace(one, result=replace(one.result, verdict="unexplained", next_experiment=None))
     experiments = Replayed(LoopRequest(RIG, tmp_path), [puzzled])
-    experiments.close()
+    experiments.run()
     assert experiments.stopped == NOTHING

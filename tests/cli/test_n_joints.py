@@ -21,7 +21,7 @@ from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from protocols.steps.plans import StepPlan
-from rig.cli.proof.step_planning import PlanRequest, plan_steps, predictor
+from rig.cli.proof.step_planning import plan_steps, predictor
 from rig.model.channels import kind_of
 from rig.model.parameters import parameter_names
 from rig.model.parse import InputError
@@ -204,4 +204,4 @@ def test_a_plan_names_the_nominal_value_that_a_rig_lacks(tmp_path: Path) -> None
     mine = tmp_path / "mine.yaml"
     mine.write_text("\n".join(line for line in text.splitlines() if "Fv1:" not in line))
     with pytest.raises(InputError, match=r"has no nominal 'Fv1' \[N\*m\*s/rad\]"):
-        plan_steps(PlanRequest(str(mine)), lambda _: None)
+        plan_steps(str(mine))

@@ -14,8 +14,9 @@ import pytest
 
 from protocols.files.library import read_protocol
 from protocols.files.plan import Overrides, Plan, resolve
+from rig.cli.execution import protocol_run
 from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
-from rig.cli.proof import proofs, space
+from rig.cli.proof import proofs
 from rig.cli.proof.proofs import PlanProof, proved
 from rig.cli.proof.twin_choice import TwinSource
 from rig.model.parse import InputError
@@ -205,12 +206,12 @@ def test_a_disk_that_will_not_hold_the_run_refuses_it_before_anything_moves(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = short(rig)
-    needed = space.needed_bytes(plan, rig)
+    needed = protocol_run.needed_bytes(plan, rig)
     recorded = 8.0 * len(rig.recorded) * rig.sample_rate * plan.seconds
     assert needed >= 2.0 * recorded  # the journal and the archive written from it
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(
-        shutil, "disk_usage", lambda _: usage._replace(free=int(needed + space.SPARE) - 1)
+        shutil, "disk_usage", lambda _: usage._replace(free=int(needed + protocol_run.SPARE) - 1)
     )
     job = ProtocolJob(str(tmp_path / "short.yaml"), RIG, tmp_path / "deep" / "run")
     (tmp_path / "short.yaml").write_text(SHORT)
@@ -220,6 +221,6 @@ def test_a_disk_that_will_not_hold_the_run_refuses_it_before_anything_moves(
     assert not (tmp_path / "deep").exists()
     assert not any("running" in line for line in said)
     monkeypatch.setattr(
-        shutil, "disk_usage", lambda _: usage._replace(free=int(needed + space.SPARE) + 1)
+        shutil, "disk_usage", lambda _: usage._replace(free=int(needed + protocol_run.SPARE) + 1)
     )
-    space.require_space(plan, rig, tmp_path / "deep" / "run")
+    protocol_run.require_space(plan, rig, tmp_path / "deep" / "run")

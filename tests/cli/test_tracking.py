@@ -17,8 +17,7 @@ from analysis.identify.streams.out_of_core import identify_folders
 from drivers.base import SampleBlock
 from rig.bench.observers import Observers
 from rig.bench.session import Bench
-from rig.cli.identification.following import Follower
-from rig.cli.identification.tracking import Tracking, summary
+from rig.cli.execution.tracking import Follower, Tracking, summary
 from rig.model.records import Record, Run, head_of
 from rig.model.rig import Rig
 from rig.runs.recorder import RecordMeta

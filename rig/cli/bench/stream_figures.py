@@ -16,7 +16,7 @@ from drivers.base import SampleBlock
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.speed.figures import bench_run
 from rig.cli.bench.stream import cluster_figures, row_figures, spin_figures
-from rig.cli.identification.tracking import Tracking
+from rig.cli.execution.tracking import Tracking
 from rig.model.records import Record
 from rig.model.rig import Rig
 from rig.runs.archive import write_run

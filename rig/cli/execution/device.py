@@ -52,7 +52,7 @@ def refuse_endpoint_alone(rig: str | None, endpoint: str | None) -> None:
         raise InputError("--endpoint does not say what is there; name the bench: --rig RIG")
 
 
-def the_only(rigs: list[Path], none: str, state: str) -> Path:
+def only_bench(rigs: list[Path], none: str, state: str) -> Path:
     """Return the description of the only bench of this computer in a state (`tripped`, `in use`).
 
     Raises InputError that asks for `--rig`, with the reason `none` where there is none.

@@ -84,7 +84,7 @@ class Loop:
         self.train: list[Run] = []
         self.judge: list[Run] = []
 
-    def close(self) -> None:
+    def run(self) -> None:
         """Run rounds until an ending condition holds; raises the error that ends a run."""
         self._take(1, self.request.protocol, self.request.overrides, HELD_OUT)
         self._trace(1, None)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable
+import select
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,34 +20,32 @@ from protocols.engine import engine
 from protocols.engine.run_inputs import RunInputs
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
+from protocols.files.library import shipped_names
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import known_rigs, reset_bench, tripped_rigs
 from rig.bench.screens.snapshot import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
-from rig.cli.execution.attended import TrackedEstimates, terminal_lines
-from rig.cli.execution.device import (
-    bench_at,
-    device_of,
-    refuse_endpoint_alone,
-    the_only,
-)
+from rig.cli.execution.device import bench_at, device_of, only_bench, refuse_endpoint_alone
 from rig.cli.proof.proofs import proved
-from rig.cli.proof.space import require_space
 from rig.cli.proof.twin_choice import twin_source
-from rig.cli.provenance import provenance_of
-from rig.cli.text.output import Countdown, clock_text
+from rig.cli.text.output import Countdown, clock_text, is_terminal
 from rig.cli.text.sheets import plan_text
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
-from rig.runs.rigs import load_rig
+from rig.runs.rigs import load_rig, rig_text
 from rig.runs.store import refuse_occupied
 
 if TYPE_CHECKING:
-    from rig.cli.identification.tracking import Tracking
+    from rig.cli.execution.tracking import Tracking
 
 Say = Callable[[str], None]
+
+# A sample takes 8 bytes per channel in the journal, the same in records.h5, which is written before
+# the journal is removed, and some more in the journal's write-ahead log.
+COPIES = 2.5
+SPARE = 200e6  # [bytes] to leave free on the disk
 
 
 @dataclass(frozen=True)
@@ -62,11 +66,6 @@ class ProtocolJob:
     attended: bool | None = False
     model: Path | None = None
     nominal: bool = False
-
-
-def _plan(job: ProtocolJob) -> tuple[Rig, Plan]:
-    bench, how = bench_at(job.rig, job.endpoint), job.overrides
-    return bench, resolve(library.load(job.protocol, how.parameters), bench, how)
 
 
 class _PhaseReport:
@@ -119,14 +118,111 @@ def _tracking(
 ) -> Tracking | None:
     if not job.track and not plan.estimates:
         return None
-    from rig.cli.identification.tracking import Tracking
+    from rig.cli.execution.tracking import Tracking
 
     return stack.enter_context(Tracking(rig, job.out, say, job.memory))
 
 
+def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:
+    """Return a function that reads a typed line without waiting; None for an unattended run.
+
+    By default a run is attended if its standard input and standard error are terminals.
+    """
+    if attended is None:
+        attended = is_terminal(sys.stdin) and is_terminal(sys.stderr)
+    return _read_answer if attended else None
+
+
+def _read_answer() -> str | None:
+    ready, _, _ = select.select([sys.stdin], [], [], 0.0)
+    if not ready:
+        return None
+    line = sys.stdin.readline()
+    return line.rstrip("\n") if line else None
+
+
+class TrackedEstimates:
+    """The tracker's estimates for a protocol's conditions (see `run_inputs.Estimates`)."""
+
+    def __init__(self, tracking: Tracking) -> None:
+        self._tracking = tracking
+
+    def values(self) -> Mapping[str, float]:
+        """Return each finite estimate [SI] and its relative standard deviation, as NAME.rsd."""
+        entered: dict[str, float] = {}
+        for name, estimate in self._tracking.parameters.items():
+            value, std = estimate["value"], estimate["std"]
+            if value is None:
+                continue
+            entered[name] = float(value)
+            if std is not None and value:
+                entered[f"{name}.rsd"] = abs(float(std) / float(value))
+        return {name: value for name, value in entered.items() if math.isfinite(value)}
+
+    def complete(self, record: str) -> bool:
+        """Return whether the estimates include a record; True if the tracker has ended."""
+        return not self._tracking.alive or record in self._tracking.recorded
+
+
+def needed_bytes(plan: Plan, rig: Rig) -> float:
+    """Return the largest size [bytes] of a run, if every condition reaches its time-out."""
+    return COPIES * 8.0 * len(rig.recorded) * rig.sample_rate * plan.longest
+
+
+def require_space(plan: Plan, rig: Rig, out: Path) -> None:
+    """Raise InputError if the disk of `out` has too little free space for the run."""
+    folder = out.absolute()
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
+    needed = needed_bytes(plan, rig)
+    if needed + SPARE > free:
+        raise InputError(
+            f"{out}: the run needs up to {needed / 1e6:.0f} MB ({plan.longest:.0f} s at "
+            f"{rig.sample_rate:g} Hz) and {SPARE / 1e6:.0f} MB to spare, "
+            f"the disk has {free / 1e6:.0f} MB; free space, or choose a folder on another disk"
+        )
+
+
+def _file(text: str, source: str) -> dict[str, str]:
+    return {"source": source, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def _protocol_text(name: str) -> tuple[str, str]:
+    if name in shipped_names():
+        entry = resources.files("protocols") / "shipped" / f"{name}.yaml"
+        return entry.read_text("utf-8"), f"{name}.yaml (shipped)"
+    path = Path(name).absolute()
+    return path.read_text("utf-8"), str(path)
+
+
+def _seeds(plan: Plan) -> dict[str, int]:
+    """Return the seeds of the played signals by step and joint."""
+    return {
+        f"{step.name} joint {excited.joint}": int(seed)
+        for step in plan.protocol.excitations
+        for excited in step.excite
+        if (seed := getattr(excited.signal, "seed", None)) is not None
+    }
+
+
+def _provenance(job: ProtocolJob, plan: Plan) -> dict[str, Any]:
+    """Return the provenance of a run for its run.yaml: what is needed to repeat it."""
+    text, source = rig_text(job.rig)
+    usual = asdict(Overrides())
+    changed = {k: v for k, v in asdict(job.overrides).items() if v != usual[k]}
+    return {
+        "command": shlex.join(["bramah", *sys.argv[1:]]),
+        "files": {"protocol": _file(*_protocol_text(job.protocol)), "rig": _file(text, source)},
+        "overrides": {k: list(v) if isinstance(v, tuple) else v for k, v in changed.items()},
+        "seeds": _seeds(plan),
+    }
+
+
 def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol and return its run folder; raises the error that ended it, outputs at zero."""
-    rig, plan = _plan(job)
+    rig, how = bench_at(job.rig, job.endpoint), job.overrides
+    plan = resolve(library.load(job.protocol, how.parameters), rig, how)
     refuse_occupied(job.out)
     run_machine = StateMachine()
     run_machine.to(EngineState.CHECKING, plan.protocol.name)
@@ -148,7 +244,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         rig,
         protocol=plan.protocol.model_dump(mode="json"),
         operator=job.operator,
-        provenance=provenance_of(job.protocol, job.rig, job.overrides, plan),
+        provenance=_provenance(job, plan),
     )
     with ExitStack() as stack:
         tracking = _tracking(job, plan, rig, say, stack)
@@ -176,7 +272,7 @@ def reset_device(rig: str | None, endpoint: str | None, reason: str) -> str:
     """
     refuse_endpoint_alone(rig, endpoint)
     if rig is None:
-        rig = str(the_only(tripped_rigs(), "no trip is stored on this computer", "tripped"))
+        rig = str(only_bench(tripped_rigs(), "no trip is stored on this computer", "tripped"))
     try:
         described, driver = device_of(rig, endpoint)
     except InputError:

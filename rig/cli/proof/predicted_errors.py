@@ -1,4 +1,4 @@
-"""Predicted errors of a protocol's estimates, for the verbs `check` and `design`."""
+"""Predicted errors of a protocol's estimates from its plan, for the verbs `check` and `design`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,14 @@ from drivers.registry import driver_class
 from protocols.design.check import Twin, check
 from protocols.design.check_report import CheckReport
 from protocols.files import library
-from protocols.files.plan import Plan, resolve
+from protocols.files.plan import Plan, mapped, resolve
+from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
-from rig.cli.proof.planned import designed_protocol, designed_step, empty_lines, planned_steps
+from protocols.language.waveforms import Waveform
+from protocols.signals.lines import chosen_lines
+from protocols.steps.excite import Step
+from protocols.steps.parts import CLOSED
+from protocols.steps.plans import StepPlan
 from rig.cli.proof.twin_choice import TwinParameters
 from rig.cli.text.output import condition_text, progress, table
 from rig.model.parse import InputError
@@ -30,8 +35,73 @@ from rig.model.parts import Wire
 from rig.model.rig import Rig
 
 _ROUNDING = 1e-12  # below it a relative figure is a rounding error
-
 CHECKED = 0.4  # share of the total time that the check of the limits takes
+
+
+def planned_steps(
+    plan: Plan, biases: Mapping[str, Mapping[int, float]] | None = None
+) -> list[TwinStep]:
+    """Return a plan's steps for the twin; `biases` [V] by step and 1-based joint, if known."""
+    return [planned_step(step, (biases or {}).get(step.name, {})) for step in plan.steps]
+
+
+def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
+    """Return one step, its waveforms repeated to the step's common period."""
+    return TwinStep(
+        name=step.name,
+        waves={e.joint: np.resize(e.wave.samples, step.period) for e in step.excite},
+        lines=step.lines,
+        held={k.joint: k.piston for k in step.locks if k.at != CLOSED},
+        closed={k.joint: k.piston for k in step.locks if k.at == CLOSED},
+        centres={e.joint: e.centre for e in step.excite},
+        biases={joint - 1: bias for joint, bias in biases.items()},
+        samples=step.record,
+        repeats=step.repeats,
+        yields={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
+        offsets={e.joint: e.settings.centring.offset for e in step.excite},
+        where=step.where,
+    )
+
+
+def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
+    """Return the detection lines of each step and joint, at the step's common period."""
+    return {
+        (step.name, e.joint): tuple(
+            k * (step.period // e.wave.period) for k in e.wave.detection_lines
+        )
+        for step in plan.steps
+        for e in step.excite
+    }
+
+
+def designed_step(plan: Plan, planned: TwinStep, tones: Mapping[int, Tone]) -> Step:
+    """Return a protocol's step with the designed spectral lines instead of its signals."""
+    step = next(s for s in plan.steps if s.name == planned.name)
+    source = next(s for s in plan.protocol.excitations if s.name == planned.name)
+    excite = []
+    for part in source.excite:
+        tone = tones[part.joint - 1]
+        wave = Waveform(planned.waves[part.joint - 1], tone.chosen, tone.empty)
+        signal = chosen_lines(wave, plan.sample_rate / step.period)
+        excite.append(part.model_copy(update={"signal": signal}))
+    # A record of one or several common periods keeps that length.
+    seconds = step.record / plan.sample_rate
+    return source.model_copy(update={"excite": tuple(excite), "duration": seconds})
+
+
+def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
+    """Return the plan's protocol with all its steps as designed."""
+    better = {
+        planned.name: designed_step(plan, planned, tones)
+        for planned, tones in zip(design.steps, design.tones, strict=True)
+    }
+    steps = mapped(plan.protocol.steps, lambda step: better.get(step.name or "", step))
+    update = {
+        "name": f"{plan.protocol.name}-{criterion.lower().replace('_', '-')}",
+        "description": f"{plan.protocol.description}; designed for {criterion}",
+        "steps": steps,
+    }
+    return plan.protocol.model_copy(update=update)
 
 
 @dataclass(frozen=True)
@@ -42,25 +112,6 @@ class CheckedForecast:
     prediction: Prediction | None
     why: str = ""
     stated: Wire | None = None
-
-
-@dataclass(frozen=True)
-class ForecastText:
-    """A forecast as plain data and as text."""
-
-    limits: CheckReport
-    plain: Mapping[str, Any]
-    text: str
-
-
-def forecast_text(
-    plan: Plan, parameters: TwinParameters, report: Callable[[float], None] | None = None
-) -> ForecastText:
-    """Check a plan and predict its errors; raises InputError if the twin cannot follow it."""
-    forecast = of_plan(plan, parameters.rig, report, parameters.twin, parameters.draws)
-    return ForecastText(
-        forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
-    )
 
 
 def jitter_of(rig: Rig) -> float | None:
@@ -121,12 +172,11 @@ def of_plan(
         return CheckedForecast(limits, None, str(error))
 
 
-def as_dict(forecast: CheckedForecast) -> dict[str, Any]:
-    """Return the check and the prediction, or the reason for its absence, as plain data."""
-    document: dict[str, Any] = {"impossible": forecast.why}
-    if forecast.prediction is not None:
-        document = to_json(forecast.prediction)
-    return {**forecast.limits.as_dict(), "identification": document}
+def prediction_json(forecast: CheckedForecast) -> dict[str, Any]:
+    """Return the prediction, or the reason for its absence, as plain data."""
+    if forecast.prediction is None:
+        return {"impossible": forecast.why}
+    return to_json(forecast.prediction)
 
 
 def percent(value: float) -> str:
@@ -163,7 +213,6 @@ class DesignedProtocol:
     """A designed protocol: its file's text, the design, and the predictions before and after."""
 
     text: str
-    plan: Plan
     design: Design
     before: CheckedForecast
     after: CheckedForecast
@@ -201,16 +250,13 @@ def design_protocol(
         np.random.default_rng(seed), progress, _checker(plan, parameters),
     )  # fmt: skip
     better = designed_protocol(plan, design, criterion)
-    after_plan = resolve(better, bench)
-    after = of_plan(after_plan, bench, None, parameters.twin, parameters.draws)
+    after = of_plan(resolve(better, bench), bench, None, parameters.twin, parameters.draws)
     after.limits.require()
     command = (
         f"bramah design {protocol} --rig {rig} --criterion {criterion} --budget {budget} "
         f"--seed {seed}"
     )
-    return DesignedProtocol(
-        protocol_text(better, f"Made by: {command}"), after_plan, design, before, after
-    )
+    return DesignedProtocol(protocol_text(better, f"Made by: {command}"), design, before, after)
 
 
 def design_text(designed: DesignedProtocol, out: Path | None) -> str:

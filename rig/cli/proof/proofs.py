@@ -20,13 +20,7 @@ from typing import Any
 from protocols.design.check_report import CheckReport
 from protocols.files.plan import Plan
 from protocols.steps.plans import StepPlan
-from rig.cli.proof.twin_choice import (
-    TwinParameters,
-    TwinSource,
-    load_twin,
-    twin_source,
-    twin_text,
-)
+from rig.cli.proof.twin_choice import TwinParameters, TwinSource, load_twin, twin_source, twin_text
 from rig.cli.text.output import write_json
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -40,8 +34,7 @@ _SOURCES = (
     "analysis/signals", "analysis/simulation", "analysis/terms", "analysis/regression",
     "analysis/identify", "analysis/design", "protocols/design", "protocols/files",
     "protocols/language", "protocols/signals", "protocols/steps", "protocols/engine/centring.py",
-    "rig/model", "rig/cli/proof/predicted_errors.py", "rig/cli/proof/planned.py",
-    "rig/cli/proof/twin_choice.py",
+    "rig/model", "rig/cli/proof/predicted_errors.py", "rig/cli/proof/twin_choice.py",
     "analysis/effects",
 )  # fmt: skip
 _LIBRARIES = ("numpy", "scipy", "numba")
@@ -130,10 +123,10 @@ def _checked(
     plan: Plan, parameters: TwinParameters, predict: bool, progress: Progress | None
 ) -> tuple[CheckReport, Mapping[str, Any] | None, str]:
     if predict:
-        from rig.cli.proof.predicted_errors import forecast_text
+        from rig.cli.proof.predicted_errors import of_plan, prediction_json, prediction_text
 
-        made = forecast_text(plan, parameters, progress)
-        return made.limits, made.plain, made.text
+        forecast = of_plan(plan, parameters.rig, progress, parameters.twin, parameters.draws)
+        return forecast.limits, prediction_json(forecast), prediction_text(forecast)
     from protocols.design.check import check
 
     report = check(plan, parameters.rig, parameters.twin, progress, parameters.draws)

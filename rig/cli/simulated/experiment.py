@@ -15,25 +15,24 @@ from analysis.identify.result import Identification
 from analysis.identify.result import to_json as identification_json
 from analysis.report.identification.report import render_report
 from analysis.report.page import write
+from analysis.report.trace import write_trace_report
 from analysis.simulation.model import save_model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.simulation.validate import to_json as validation_json
 from analysis.trace.engine import trace
 from analysis.trace.result import to_json as trace_json
 from protocols.files.plan import Overrides
+from rig.cli.execution.experiment_loop import HELD_OUT, PROTOCOL
 from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
-from rig.cli.simulated.simulated_bench import simulated_bench
-from rig.cli.simulated.truth_file import read_truth
+from rig.cli.simulated.simulated_bench import read_truth, simulated_bench
 from rig.cli.text.output import Countdown, progress, write_json
 from rig.cli.text.render import identification_text, parameter_table, validation_text
 from rig.cli.text.reports import provenance
 from rig.model.records import Run
 from rig.runs.store import load_run, refuse_occupied
 
-IDENTIFY = "lock-and-excite-multisine"
 VALIDATE = "validate"
 RIG = "shinshu-2dof"
-HELD_OUT = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
 HIDDEN = "worn-seal"  # effects of the demo's bench, unknown to the analysis
 Say = Callable[[str], None]
 
@@ -68,12 +67,12 @@ def experiment(
     with simulated_bench(RIG, seed=seed, truth=truth, scenario=scenario) as endpoint:
         say(f"the simulated bench listens on {endpoint}")
         first = run_protocol(
-            ProtocolJob(IDENTIFY, RIG, folder / "identify", endpoint, overrides), say
+            ProtocolJob(PROTOCOL, RIG, folder / "identify", endpoint, overrides), say
         )
         second = run_protocol(ProtocolJob(VALIDATE, RIG, folder / "validate", endpoint), say)
         unseen: tuple[Path, ...] = ()
         if scenario is not None:
-            third = ProtocolJob(IDENTIFY, RIG, folder / "other-wave", endpoint, HELD_OUT)
+            third = ProtocolJob(PROTOCOL, RIG, folder / "other-wave", endpoint, HELD_OUT)
             unseen = (run_protocol(third, say),)
     runs, judged = (load_run(first),), (load_run(second),)
     say("identifying the parameters from the first run")
@@ -87,8 +86,6 @@ def experiment(
 
 def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     """Run the demo into a new folder of `out`, print its results and write its reports."""
-    from rig.cli.text.reports import write_trace
-
     started = time.monotonic()
     folder = out / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
     done = experiment(folder, seed, Overrides(repeats=repeats), progress, HIDDEN)
@@ -101,7 +98,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
     write_experiment(folder / "report.html", done, command, seed)
-    write_trace(folder / "trace.html", held_out, traced)
+    write_trace_report(folder / "trace.html", held_out, traced, provenance())
     for name in ("report.html", "trace.html"):
         shutil.copyfile(folder / name, out / name)
     print(identification_text(done.identification, done.truth))

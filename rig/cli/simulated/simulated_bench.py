@@ -1,20 +1,27 @@
-"""A simulated bench as a child process."""
+"""A simulated bench as a child process, and the file of its true parameters (`sim --truth`)."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Final
 
 from rig.bench.latch import STATE_VARIABLE
 from rig.cli.errors import WorkError
+from rig.cli.text.output import write_json
+from rig.model.parse import InputError
 from rig.runs.files import scratch_folder
 
 _START = "from rig.cli.main import run; run()"
 _END_SECONDS = 10.0
+
+
+SCENARIO: Final = "scenario"  # key beside the parameters' names
 
 
 @contextmanager
@@ -77,3 +84,20 @@ def simulated_bench(
                 child.wait(_END_SECONDS)
             except subprocess.TimeoutExpired:
                 child.kill()
+
+
+def write_truth(path: Path | None, parameters: Mapping[str, float], scenario: Any) -> None:
+    """Write true parameters [SI] by name and, under `scenario`, the hidden effects."""
+    write_json(path, {**parameters, SCENARIO: scenario})
+
+
+def read_truth(path: Path) -> dict[str, float]:
+    """Read the parameters that `bramah sim --truth` wrote; raises InputError for other files."""
+    try:
+        truth = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): float(value) for name, value in truth.items() if name != SCENARIO}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path} cannot be read as true parameters ({error}); expected the JSON file that "
+            "`bramah sim --truth` writes"
+        ) from error

@@ -15,24 +15,18 @@ from hil_sim.link.link import FaultyLink
 from hil_sim.link.wires import faulty_link
 from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.plant.plant import Plant
-from hil_sim.scenario.file import (
-    Scenario,
-    load_shipped,
-    parse_scenario,
-    shipped_scenarios,
-)
+from hil_sim.scenario.file import Scenario, load_shipped, parse_scenario, shipped_scenarios
 from hil_sim.scenario.random_draw import RANDOM, draw
 from rig.cli.errors import WorkError
-from rig.cli.simulated.truth_file import write_truth
+from rig.cli.simulated.simulated_bench import write_truth
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.rigs import load_bench
 
 USUAL_SHARE: Final = 0.01  # share of the frames that a fault given by its name affects
-VALVES_RATE: Final = (
-    1000.0  # [Hz], rate of the plant behind valves that the host samples at any time
-)
+# Rate of the plant behind valves that the host samples at any time [Hz].
+VALVES_RATE: Final = 1000.0
 
 
 @dataclass(frozen=True)
@@ -53,11 +47,6 @@ class BenchRequest:
     parent: int | None = None
     wire: str = TCP
     wire_faults: str | None = None
-
-
-def _endpoint_first(endpoint: str) -> None:
-    # A script that starts the bench reads its endpoint from this line.
-    print(endpoint, flush=True)
 
 
 def hidden(what: BenchRequest, rig: Rig) -> Scenario:
@@ -124,7 +113,7 @@ def serve_bench(what: BenchRequest) -> None:
                 )
             )
             endpoint = links[0].endpoint
-        _endpoint_first(endpoint)
+        print(endpoint, flush=True)  # a script that starts the bench reads this line
 
     try:
         serve(

@@ -12,6 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TextIO
 
+import typer
+
+from rig.model.units import clock
+
 LINE_SECONDS: Final = 3.0  # [s] between the lines of a countdown, and before the first
 
 
@@ -47,9 +51,7 @@ def condition_text(condition: float) -> str:
 
 def clock_text(seconds: float) -> str:
     """Return a time as 0:07, 12:30 or 3:05:00."""
-    minutes, rest = divmod(round(max(0.0, seconds)), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return clock(round(max(0.0, seconds)))
 
 
 class Countdown:
@@ -101,6 +103,13 @@ def write_json(path: Path | None, data: Any) -> None:
     from rig.runs.files import write_text
 
     write_text(path, text)
+
+
+def print_result(json_file: Path | None, data: Any, text: str) -> None:
+    """Write a result as JSON and print its text, except where the JSON is printed."""
+    write_json(json_file, data)
+    if json_file != Path("-"):
+        typer.echo(text)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from analysis.identify.result import Identification
 from analysis.report.format import MINUS, column_percent
@@ -12,6 +12,9 @@ from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.cli.text.output import condition_text, table
 from rig.model.units import RESIDUALS, RESULTS, DisplayUnit, typeset
+
+if TYPE_CHECKING:
+    from analysis.identify.physical import Physical
 
 
 def _shown(estimate: Estimate) -> tuple[float, str]:
@@ -80,6 +83,22 @@ def shapes_text(shapes: Mapping[str, Estimate]) -> str:
         half = f" ± {shape.half:.2g}" if math.isfinite(shape.half) else ""
         lines.append(f"\nshape: {name} = {shape.value:.4g}{half} {shape.unit}".rstrip())
     return "".join(lines)
+
+
+def physical_text(physical: Physical) -> str:
+    """Return every parameter, unconstrained and at each level, and the level of the result."""
+    header = ["parameter [SI]", "free", *(f"{level.name}" for level in physical.levels)]
+    rows = []
+    for name, free in physical.free.items():
+        cells = [name, f"{free.value:.5g}"]
+        for level in physical.levels:
+            value = level.estimates[name].value
+            cells.append(f"{value:.5g} ({100 * (value / free.value - 1):+.2f} %)")
+        rows.append(cells)
+    level = physical.levels[physical.returned]
+    more = physical.levels[physical.returned + 1 :]
+    why = f"; '{more[0].name}' is rejected by the data" if more else ""
+    return f"{table(header, rows)}\nresult: '{level.name}'{why}"
 
 
 def validation_text(results: Sequence[RecordValidation]) -> str:

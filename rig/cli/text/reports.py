@@ -10,11 +10,7 @@ from pathlib import Path
 
 from analysis.identify.result import Identification
 from analysis.report.identification.report import Provenance, render_report
-from analysis.report.loop import write_loop_report
 from analysis.report.page import write
-from analysis.report.trace import write_trace_report
-from analysis.trace.loop_rounds import Round
-from analysis.trace.result import Trace
 from rig.model.records import Run
 from rig.runs.store import versions
 
@@ -37,15 +33,3 @@ def write_identification(path: Path, runs: Sequence[Run], result: Identification
         provenance=provenance(),
     )
     write(path, text)
-
-
-def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:
-    """Write the report of a trace."""
-    write_trace_report(path, holdout, result, provenance())
-
-
-def write_loop(
-    path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str
-) -> None:
-    """Write the report of a loop."""
-    write_loop_report(path, train, holdout, rounds, stopped, provenance())

@@ -8,12 +8,7 @@ from collections.abc import Sequence
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.loop_rounds import Round
 from analysis.trace.result import JudgedEffect, Trace
-from analysis.trace.words import (
-    free_run_row,
-    numbers_in_words,
-    shot_in_words,
-    unit_of_equation,
-)
+from analysis.trace.words import free_run_row, numbers_in_words, shot_in_words, unit_of_equation
 from rig.cli.text.output import table
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
 from rig.cli.options import (
     DurationOption,
     JsonOption,
@@ -20,7 +18,7 @@ from rig.cli.options import (
     WaveSeedOption,
     overridden,
 )
-from rig.cli.text.output import Countdown, progress, write_json
+from rig.cli.text.output import Countdown, print_result, progress
 
 
 def check(
@@ -54,14 +52,14 @@ def check(
     proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)
     if proof.warning or json == Path("-"):
         progress(proof.twin_text)
-    document = proof.report.as_dict()
-    used = {"model": proof.source.as_dict(), "warning": proof.warning}
-    write_json(json, {**document, **used, "identification": proof.prediction})
-    if json != Path("-"):
-        known = (
-            "\n\nnothing has changed since the last proof; it is shown again"
-            if proof.reused
-            else ""
-        )
-        typer.echo(f"{check_text(proof.report)}\n\n{proof.twin_text}\n\n{proof.text}{known}")
+    document = {
+        **proof.report.as_dict(),
+        "model": proof.source.as_dict(),
+        "warning": proof.warning,
+        "identification": proof.prediction,
+    }
+    parts = [check_text(proof.report), proof.twin_text, proof.text]
+    if proof.reused:
+        parts.append("nothing has changed since the last proof; it is shown again")
+    print_result(json, document, "\n\n".join(parts))
     proof.report.require()

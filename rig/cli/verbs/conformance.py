@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rig.cli.execution.device import bench_at
 from rig.cli.options import EndpointOption, JsonOption, RigOption
-from rig.cli.text.output import progress, table, write_json
+from rig.cli.text.output import print_result, progress, table
 
 
 def conformance(
@@ -44,10 +43,8 @@ def conformance(
         report = run(subject, only=only or (), outputs=outputs)
     except ValueError as error:
         raise InputError(f"--only: {error}") from error
-    write_json(json, asdict(report))
-    if json != Path("-"):
-        rows = [(result.check, result.verdict.value, result.reason) for result in report.results]
-        typer.echo(table(("check", "verdict", "why"), rows))
+    rows = [(result.check, result.verdict.value, result.reason) for result in report.results]
+    print_result(json, asdict(report), table(("check", "verdict", "why"), rows))
     failed = [failure.check for failure in report.of(CheckVerdict.FAILED)]
     if failed:
         raise WorkError(f"{driver} fails {len(failed)} checks: {', '.join(failed)}")

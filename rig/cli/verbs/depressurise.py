@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rig.cli.execution.device import device_of, the_only
+from rig.cli.execution.device import device_of, only_bench
 from rig.cli.options import EndpointOption, KnownRigOption
 from rig.cli.verbs.stop import NOT_IN_USE, stop
 
@@ -19,7 +19,7 @@ def depressurise(rig: KnownRigOption = None, endpoint: EndpointOption = None) ->
     driven = rigs_in_use()  # before their runs are ended
     stop(rig, endpoint)
     if rig is None:
-        rig = str(the_only(driven, NOT_IN_USE, "in use"))
+        rig = str(only_bench(driven, NOT_IN_USE, "in use"))
     described, driver = device_of(rig, endpoint)
     pressurised = bench.pressurised(bench.probe(driver, described))
     if pressurised:

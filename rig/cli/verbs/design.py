@@ -42,7 +42,7 @@ def design(
     """
     from rig.cli.proof.predicted_errors import design_json, design_protocol, design_text
     from rig.cli.proof.twin_choice import load_twin, twin_source, twin_text
-    from rig.cli.text.output import progress, write_json
+    from rig.cli.text.output import print_result, progress
     from rig.runs.files import write_text
     from rig.runs.rigs import load_bench
 
@@ -53,8 +53,5 @@ def design(
     designed = design_protocol(protocol, rig, criterion, budget, seed, parameters)
     if out is not None:
         write_text(out, designed.text)
-    write_json(json, design_json(designed))
-    if json != Path("-"):
-        typer.echo(
-            f"{design_text(designed, out)}\nlimits and errors predicted on: {parameters.text}"
-        )
+    text = f"{design_text(designed, out)}\nlimits and errors predicted on: {parameters.text}"
+    print_result(json, design_json(designed), text)

@@ -9,14 +9,13 @@ import typer
 
 from rig.cli.errors import WorkError
 from rig.cli.text.output import progress
-from rig.cli.verbs.simulate import channel_simulator
+from rig.cli.verbs.simulate import RunArgument, channel_simulator
 
 if TYPE_CHECKING:
     from analysis.simulation.model import Model
 
 UNITS: Final = "fmu"
 CRATE: Final = "ro-crate"
-RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 ModelOption = Annotated[
     Path | None,
     typer.Option(

@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import (
-    JsonOption,
-    RunsArgument,
-    writable_file,
-)
+from rig.cli.options import JsonOption, RunsArgument, writable_file
 from rig.cli.text.output import Countdown, printed_at_end, progress, write_json
 
 if TYPE_CHECKING:
@@ -199,8 +195,8 @@ def identify(
     from analysis.identify.result import to_json
     from analysis.regression.rows import FILTERINGS
     from rig.cli.proof.twin_choice import save_identified
-    from rig.cli.simulated.truth_file import read_truth
-    from rig.cli.text.render import identification_text, method_text, shapes_text
+    from rig.cli.simulated.simulated_bench import read_truth
+    from rig.cli.text.render import identification_text, method_text, physical_text, shapes_text
     from rig.model.parse import InputError
 
     if filtering not in FILTERINGS:
@@ -234,10 +230,14 @@ def identify(
     if shapes:
         document["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
     if physical:
-        from rig.cli.identification.physical import make_physical
+        from analysis.identify.physical import physical as projected
+        from analysis.identify.physical import to_json as physical_json
+        from analysis.identify.physical import with_physics
 
-        result, document, consistent = make_physical(result)
-        more += consistent
+        projection = projected(result)
+        result = with_physics(result, projection)
+        document = {**to_json(result), "physical": physical_json(projection)}
+        more += f"\n\n{physical_text(projection)}"
     with printed_at_end(json, lambda: identification_text(result, known) + more):
         if model is not None:
             save_identified(result.model, model, progress)

@@ -9,7 +9,7 @@ import typer
 
 from rig.cli.errors import WorkError
 from rig.cli.options import JsonOption, RigOption, writable_file
-from rig.cli.text.output import progress, write_json
+from rig.cli.text.output import print_result
 
 
 def plan(
@@ -33,14 +33,11 @@ def plan(
 
     Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
     """
-    from rig.cli.proof.step_planning import PlanRequest, plan_steps
+    from rig.cli.proof.step_planning import plan_steps
     from rig.cli.text.sheets import proof_text
 
-    request = PlanRequest(rig, out, validation, prove)
-    proof = plan_steps(request, progress)
-    write_json(json, proof.as_dict())
-    if json != Path("-"):
-        typer.echo(proof_text(proof))
+    proof = plan_steps(rig, out, validation, prove)
+    print_result(json, proof.as_dict(), proof_text(proof))
     if not proof.complete:
         lost = [n for v in proof.verdicts.values() for n in v.lost]
         raise WorkError(f"{proof.protocol}: does not determine {' '.join(lost)}")

@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.execution.device import device_of, print_pressure
 from rig.cli.options import EndpointOption, JsonOption, RigOption
-from rig.cli.text.output import table, write_json
+from rig.cli.text.output import print_result, table
 from rig.model.units import READINGS, display_unit
 
 if TYPE_CHECKING:
@@ -37,25 +37,25 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
             readings, timing, cause = bench.probe_timed(driver, described)
         except DeviceBusy as error:
             raise state.in_use(error) from error
-    write_json(json, [asdict(reading) for reading in readings])
-    if json != Path("-"):
-        header = ("channel", "mean", "least", "most", "unit", "codes", "")
-        typer.echo(table(header, [_row(reading) for reading in readings]))
+    header = ("channel", "mean", "least", "most", "unit", "codes", "")
+    rows = [_row(reading) for reading in readings]
+    print_result(json, [asdict(reading) for reading in readings], table(header, rows))
+    aside = json == Path("-")
     if timing is not None:
         typer.echo(
             f"host-timed: {timing.samples} samples taken {1e3 * timing.mean:.3g} ms late, standard "
             f"deviation {1e3 * timing.jitter:.3g} ms; in the rig file: wire: jitter: "
             f"{1e3 * timing.jitter:.3g} ms",
-            err=json == Path("-"),
+            err=aside,
         )
     latched = state.read_trip()
     trips = [text for text in (latched and latched.trip, cause) if text]
     if trips:
         typer.echo(
             f"tripped: {'; '.join(trips)}; clear it with `{reset_command(described)}`",
-            err=json == Path("-"),
+            err=aside,
         )
-    print_pressure(bench.pressurised(readings), aside=json == Path("-"))
+    print_pressure(bench.pressurised(readings), aside=aside)
     odd = [reading.channel for reading in readings if reading.mark != bench.GOOD]
     if odd:
         raise WorkError(f"not plausible: {', '.join(odd)}; the last column says why")

@@ -23,18 +23,20 @@ from rig.cli.options import (
     StepOption,
     WaveSeedOption,
     one_line,
+    time_since,
     writable_file,
 )
-from rig.cli.text.output import progress, table, write_json
+from rig.cli.text.output import print_result, progress, table, write_json
 
 if TYPE_CHECKING:
-    from rig.queue.items import Item
+    from rig.queue.items import Item, QueueJob
     from rig.queue.store import QueueStore
 
 QueueOption = Annotated[
     Path | None,
     typer.Option("--queue", help="The queue's file.  [default: queue.sqlite in BRAMAH_STATE]"),
 ]
+KEPT = ("protocol", "rig", "seconds", "ok", "twin", "model", "warning")  # keys of a proof
 WAIT_HOURS = 12  # longest wait [h] for --when without --not-after
 ItemArgument = Annotated[int, typer.Argument(help="The item's number.")]
 
@@ -60,9 +62,7 @@ def _opened(queue: Path | None, *, create: bool = False) -> Iterator[QueueStore]
 
 
 def _show(item: Item, json: Path | None, said: str) -> None:
-    write_json(json, item.as_dict())
-    if json != Path("-"):
-        typer.echo(f"item {item.id} {item.job.name}: {said}")
+    print_result(json, item.as_dict(), f"item {item.id} {item.job.name}: {said}")
 
 
 def _absolute(name: str, shipped: tuple[str, ...]) -> str:
@@ -140,7 +140,6 @@ def add(
     Example: bramah queue add lock-and-excite --rig shinshu-2dof --repeats 2 --not-before 22:00
     """
     from protocols.files.library import shipped_names
-    from rig.cli.execution.queue_add import prove
     from rig.model.parse import InputError
     from rig.queue.items import DONE, QueueJob, channel_condition
     from rig.runs.rigs import shipped_rigs
@@ -181,7 +180,7 @@ def add(
         if after is not None:
             _refuse_wanted(store.item(after), wanted or DONE)
         progress(f"checking {title} on the twin")
-        item = store.add(job, priority, prove(job))
+        item = store.add(job, priority, _proof(job))
     seconds = item.proof.get("seconds")
     length = "" if seconds is None else f", about {seconds / 60.0:.1f} min of the device's time"
     if item.proof.get("warning"):
@@ -189,6 +188,22 @@ def add(
     elif "twin" in item.proof:
         progress(f"the twin uses {item.proof['twin']}")
     _show(item, json, f"queued{length}; it will run into {item.job.out}")
+
+
+def _proof(job: QueueJob) -> dict[str, Any]:
+    """Return what the queue keeps of `bramah check` on an item; raises InputError, WorkError."""
+    from rig.cli.errors import BAD_INPUT, WorkError
+    from rig.model.parse import InputError
+    from rig.queue.processes import BRAMAH, call
+    from rig.queue.runner import QueueSettings
+
+    answer = call(BRAMAH, job.check_words(), QueueSettings().check_seconds)
+    if answer.code == BAD_INPUT:
+        raise InputError(f"not queued: {answer.reason}")
+    if answer.code != 0:
+        raise WorkError(f"not queued: {answer.reason}")
+    proof = answer.as_json()
+    return {key: proof[key] for key in KEPT if isinstance(proof, dict) and key in proof}
 
 
 def _times(
@@ -380,10 +395,8 @@ def run(
         "reason": report.reason,
         "ended": [item.as_dict() for item in report.ended],
     }
-    write_json(json, document)
-    if json != Path("-"):
-        done = sum(item.state == "done" for item in report.ended)
-        typer.echo(f"{done} of {len(report.ended)} items done; {report.reason}")
+    done = sum(item.state == "done" for item in report.ended)
+    print_result(json, document, f"{done} of {len(report.ended)} items done; {report.reason}")
     if report.code > 1:
         progress(f"bramah: {report.reason}")
     raise typer.Exit(report.code)
@@ -403,9 +416,8 @@ def write_night_page(
     Example: bramah queue page --out night.html --since 12h
     """
     from rig.cli.text.night import write_page
-    from rig.cli.text.times import since as parse_since
 
-    begin = None if since is None else parse_since(since, datetime.now(UTC))
+    begin = time_since(since)
     with _opened(queue) as store:
         write_page(out, store, begin)
     typer.echo(str(out))
@@ -426,10 +438,9 @@ def pause(
         else:
             store.pause(_who())
         active = [item.id for item in store.items() if item.state in ("checking", "running")]
-    write_json(json, {"paused": not off, "active": active})
-    if json != Path("-"):
-        still = f"; item {active[0]} runs to its end" if active and not off else ""
-        typer.echo("the queue continues" if off else f"paused{still}")
+    still = f"; item {active[0]} runs to its end" if active and not off else ""
+    text = "the queue continues" if off else f"paused{still}"
+    print_result(json, {"paused": not off, "active": active}, text)
 
 
 def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:

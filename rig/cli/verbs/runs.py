@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from datetime import UTC, datetime
+from datetime import datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import (
-    JsonOption,
-)
+from rig.cli.options import JsonOption, time_since
 from rig.cli.text.output import progress, table, write_json
 
 if TYPE_CHECKING:
@@ -45,7 +43,6 @@ def runs(
 
     Example: bramah runs runs/ --state interrupted --since 12h
     """
-    from rig.cli.text.times import since as parse_since
     from rig.model.parse import InputError
     from rig.runs.listing.index import indexed_runs
     from rig.runs.listing.index import rebuild as rebuild_index
@@ -57,7 +54,7 @@ def runs(
             raise InputError(
                 f"--state {wanted}: expected one of: {', '.join((*STATES, UNREADABLE))}"
             )
-    begun = None if since is None else parse_since(since, datetime.now(UTC))
+    begun = time_since(since)
     if rebuild:
         progress(f"{rebuild_index(folder)} runs in the index of {folder}")
     listed = indexed_runs(folder)

@@ -8,10 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import (
-    RigOption,
-    writable_file,
-)
+from rig.cli.options import RigOption, writable_file
 
 
 def sim(

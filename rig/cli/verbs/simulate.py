@@ -17,10 +17,6 @@ if TYPE_CHECKING:
     from rig.model.rig import Rig
 
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
-ModelOption = Annotated[
-    Path | None,
-    typer.Option(help="A model file: adds its simulated channels beside the measured ones."),
-]
 
 
 def simulate(

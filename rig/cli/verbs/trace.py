@@ -87,6 +87,7 @@ def trace(
         if model is not None:
             save_identified(result.model_after, model, progress)
         if report is not None:
-            from rig.cli.text.reports import write_trace
+            from analysis.report.trace import write_trace_report
+            from rig.cli.text.reports import provenance
 
-            write_trace(report, unseen, result)
+            write_trace_report(report, unseen, result, provenance())

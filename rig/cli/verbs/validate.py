@@ -7,10 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import (
-    JsonOption,
-    RunsArgument,
-)
+from rig.cli.options import JsonOption, RunsArgument
 from rig.cli.text.output import printed_at_end, write_json
 
 

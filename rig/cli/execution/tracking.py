@@ -13,6 +13,7 @@ import math
 import os
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -23,12 +24,12 @@ from typing import Any, Self
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from analysis.identify.streams.online import Tracker
 from analysis.simulation.model import Estimate, estimate_json
 from analysis.workers.pool import environment
 from drivers.base import SampleBlock
-from rig.cli.identification.following import Follower
 from rig.cli.text.output import write_json
 from rig.model.parse import InputError
 from rig.model.records import RecordHead
@@ -40,12 +41,71 @@ from rig.runs.runstate import EventLog
 
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
+Array = NDArray[np.float64]
 
+KEPT = 5.0  # [s] of samples kept from before a record is announced
 NAME = "tracked.json"
 WAITING = 30_000  # length of the tracker's queue in messages: five minutes of blocks, about 40 MB
 SAY_EVERY = 2.0  # [s] of wall time
 FINISH = 20.0  # [s] allowed for the tracker to finish after the run
 NICE = 5
+
+
+class Follower:
+    """Feeds a tracker with the samples of every record; gaps between blocks become NaN."""
+
+    def __init__(self, rig: Rig, tracker: Tracker) -> None:
+        self._tracker = tracker
+        self._names = rig.recorded
+        self._kept = round(KEPT * rig.sample_rate)
+        self._recent: deque[tuple[int, Array]] = deque()
+        self._next: int | None = None  # first tick of the current record not yet fed
+        self._last: int | None = None  # end of the current record, exclusive, if known
+
+    def block(self, tick: int, data: Array) -> bool:
+        """Take a block (n, channels) from `tick` on; return whether the estimates have changed."""
+        self._recent.append((tick, data))
+        newest = tick + len(data)
+        while self._recent[0][0] + len(self._recent[0][1]) < newest - self._kept:
+            self._recent.popleft()
+        return self._next is not None and self._feed(newest)
+
+    def begins(self, head: RecordHead, start: int, ticks: int | None = None) -> None:
+        """Begin a record at tick `start`; feed its samples that have arrived already.
+
+        Give the length `ticks` if it is fixed in advance, because blocks may reach beyond the end.
+        """
+        self._tracker.begin(head)
+        self._next, self._last = start, None if ticks is None else start + ticks
+        if self._recent:
+            tick, data = self._recent[-1]
+            self._feed(tick + len(data))
+
+    def ends(self, start: int, ticks: int, complete: bool) -> None:
+        """End the current record after `ticks` samples; discard it if it is not complete."""
+        if self._next is None:
+            return
+        self._last = start + ticks
+        if complete and self._next <= self._last:
+            self._feed(self._last)
+            self._tracker.end()
+        else:
+            self._tracker.discard()
+        self._next = None
+
+    def _feed(self, last: int) -> bool:
+        """Feed the samples from the next tick up to `last`; NaN for missing samples."""
+        first = self._next
+        last = last if self._last is None else min(last, self._last)
+        if first is None or last <= first:
+            return False
+        part = np.full((last - first, len(self._names)), np.nan)
+        for tick, data in self._recent:
+            low, high = max(first, tick), min(last, tick + len(data))
+            if low < high:
+                part[low - first : high - first] = data[low - tick : high - tick]
+        self._next = last
+        return self._tracker.feed({name: part[:, k] for k, name in enumerate(self._names)})
 
 
 @dataclass(frozen=True)
@@ -81,9 +141,8 @@ class Tracking:
         if not memory > 0.0:
             raise InputError(f"--memory {memory:g}: expected more than 0 s")
         self.parameters: dict[str, Any] = {}
-        self.residuals: dict[
-            str, list[float]
-        ] = {}  # by family: rms of the residual of new rows, and of their right side
+        # By family: rms of the residual of new rows, and of their right side.
+        self.residuals: dict[str, list[float]] = {}
         self.worst_handover = 0.0
         self._rig, self._out, self._say, self._memory = rig, out, say, memory
         self._history: list[dict[str, Any]] = []

@@ -1,1 +1,0 @@
-"""Identification beside a run, and physically consistent parameters."""
