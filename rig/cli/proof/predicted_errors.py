@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,8 @@ from analysis.design.optimise import Design, improve
 from analysis.design.predict import Prediction, predict, to_json
 from analysis.design.settings import DESIGN
 from analysis.design.twin_records import TwinStep
-from analysis.simulation.twin import simulate_commands
 from drivers.registry import driver_class
-from protocols.design.check import Twin, check
+from protocols.design.check import check
 from protocols.design.check_report import CheckReport
 from protocols.files import library
 from protocols.files.plan import Plan, mapped, resolve
@@ -146,11 +145,7 @@ def lateness_text(forecast: CheckedForecast) -> str:
 
 
 def of_plan(
-    plan: Plan,
-    rig: Rig,
-    report: Callable[[float], None] | None = None,
-    twin: Twin = simulate_commands,
-    draws: Sequence[Twin] = (),
+    plan: Plan, parameters: TwinParameters, report: Callable[[float], None] | None = None
 ) -> CheckedForecast:
     """Check a plan's limits and predict its errors, or state why they cannot be predicted.
 
@@ -160,7 +155,8 @@ def of_plan(
     def part(begin: float, end: float) -> Callable[[float], None] | None:
         return None if report is None else lambda share: report(begin + (end - begin) * share)
 
-    limits = check(plan, rig, twin, part(0.0, CHECKED), draws)
+    rig = parameters.rig
+    limits = check(plan, rig, parameters.twin, part(0.0, CHECKED), parameters.draws)
     biases = {step.step: step.biases for step in limits.steps}
     if not plan.steps:
         return CheckedForecast(limits, None, "it takes no records of excited joints")
@@ -214,8 +210,8 @@ class DesignedProtocol:
 
     text: str
     design: Design
-    before: CheckedForecast
-    after: CheckedForecast
+    before: Prediction
+    after: Prediction
 
 
 def _checker(
@@ -243,30 +239,30 @@ def design_protocol(
     """
     bench = parameters.rig
     plan = resolve(library.load(protocol), bench)
-    before = of_plan(plan, bench, None, parameters.twin, parameters.draws)
+    before = of_plan(plan, parameters)
     biases = {step.step: step.biases for step in before.limits.steps}
     design = improve(
         bench, planned_steps(plan, biases), empty_lines(plan), criterion, budget,
         np.random.default_rng(seed), progress, _checker(plan, parameters),
     )  # fmt: skip
     better = designed_protocol(plan, design, criterion)
-    after = of_plan(resolve(better, bench), bench, None, parameters.twin, parameters.draws)
+    after = of_plan(resolve(better, bench), parameters)
     after.limits.require()
+    assert before.prediction is not None  # the design needed the predictions, so they exist
+    assert after.prediction is not None
     command = (
         f"bramah design {protocol} --rig {rig} --criterion {criterion} --budget {budget} "
         f"--seed {seed}"
     )
-    return DesignedProtocol(protocol_text(better, f"Made by: {command}"), design, before, after)
+    text = protocol_text(better, f"Made by: {command}")
+    return DesignedProtocol(text, design, before.prediction, after.prediction)
 
 
 def design_text(designed: DesignedProtocol, out: Path | None) -> str:
     """Return the predicted errors before and after, and each step's share of its limits."""
-    before, after = designed.before.prediction, designed.after.prediction
-    assert before is not None  # the design needed the prediction, so it exists
-    assert after is not None
     rows = []
-    for name, e in before.parameters.items():
-        later = after.parameters[name]
+    for name, e in designed.before.parameters.items():
+        later = designed.after.parameters[name]
         ratio = f"{later.std / e.std:.2f}" if e.std > 0 else "—"
         rows.append([name, percent(e.std), percent(later.std), ratio])
     lines = [table(["parameter", "before %", "after %", "ratio"], rows), ""]
@@ -282,13 +278,11 @@ def design_text(designed: DesignedProtocol, out: Path | None) -> str:
 
 def design_json(designed: DesignedProtocol) -> dict[str, Any]:
     """Return predicted relative standard errors before and after, and the shares of limits."""
-    before, after = designed.before.prediction, designed.after.prediction
-    assert before is not None
-    assert after is not None
+    after = designed.after.parameters
     return {
         "parameters": {
-            name: {"before": e.std, "after": after.parameters[name].std}
-            for name, e in before.parameters.items()
+            name: {"before": e.std, "after": after[name].std}
+            for name, e in designed.before.parameters.items()
         },
         "limits": {
             step: {"limit": limit, "share": share}

@@ -125,7 +125,7 @@ def _checked(
     if predict:
         from rig.cli.proof.predicted_errors import of_plan, prediction_json, prediction_text
 
-        forecast = of_plan(plan, parameters.rig, progress, parameters.twin, parameters.draws)
+        forecast = of_plan(plan, parameters, progress)
         return forecast.limits, prediction_json(forecast), prediction_text(forecast)
     from protocols.design.check import check
 

@@ -20,6 +20,7 @@ from analysis.identify.result import PLAIN
 from protocols.files import library
 from protocols.files.plan import resolve
 from rig.cli.proof.predicted_errors import of_plan, percent
+from rig.cli.proof.twin_choice import TwinSource, load_twin
 from rig.cli.text.output import table
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -61,15 +62,15 @@ def study(protocols: Sequence[str], rig: str, first: int, seeds: int, say: Say) 
     still = bench.model_copy(update={"oil": oil})
     out = []
     for name in protocols:
-        forecast_text = of_plan(resolve(library.load(name), bench), bench)
-        if forecast_text.prediction is None:
-            raise InputError(f"{name}: {forecast_text.why}")
+        forecast = of_plan(resolve(library.load(name), bench), load_twin(TwinSource(), bench))
+        if forecast.prediction is None:
+            raise InputError(f"{name}: {forecast.why}")
         benches = range(first, first + seeds)
         found = [
             _found(name, still, benches, PLAIN, say),
             _found(name, bench, benches, DEFAULT, say),
         ]
-        out.append(Studied(name, seeds, forecast_text.prediction.parameters, *found))
+        out.append(Studied(name, seeds, forecast.prediction.parameters, *found))
     return out
 
 
