@@ -181,10 +181,6 @@ class QueueJob:
     when: str = ""
     identify: bool = True
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the job as plain data."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> QueueJob:
         """Return a job from plain data; keys of later versions are ignored."""
@@ -240,7 +236,7 @@ class Item:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the item as plain data for JSON."""
-        plain = {**asdict(self), "job": self.job.as_dict()}
+        plain = asdict(self)
         return {**plain, "found": plain.pop("results")}
 
     def next_folder(self) -> str:

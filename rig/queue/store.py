@@ -6,9 +6,8 @@ import json
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 from rig.model.parse import InputError
@@ -129,12 +128,7 @@ class QueueStore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._db.close()
 
     # Reading
@@ -187,7 +181,7 @@ class QueueStore:
             number = self._db.execute(
                 "INSERT INTO item (priority, place, state, reason, job, added, proof) "
                 "VALUES (?, ?, ?, '', ?, ?, ?)",
-                (priority, place, QUEUED, json.dumps(job.as_dict()), utc_now(), json.dumps(proof)),
+                (priority, place, QUEUED, json.dumps(asdict(job)), utc_now(), json.dumps(proof)),
             ).lastrowid
             assert number is not None
             self._note(number, 0, QUEUED, "added")

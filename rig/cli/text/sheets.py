@@ -17,14 +17,13 @@ _PICTURE = 30  # width between the two limits [characters]
 def _cells(step: str, line: MotionPrediction) -> list[str]:
     shown = display_unit(line.unit, LIMITS)
     scale, unit = shown.scale, shown.text
-    place = "bench" if line.joint is None else f"joint {line.joint}"
     low, high, least, most, margin = (
         f"{scale * value:.3g}"
         for value in (line.low, line.high, line.allowed_low, line.allowed_high, line.margin)
     )
     verdict = "ok" if line.ok else ("REFUSED" if line.binding else "note")
     return [
-        f"{step} {place} {line.quantity}",
+        f"{step} {_place(line)} {line.quantity}",
         f"{low} .. {high}",
         f"{least} .. {most}",
         margin,

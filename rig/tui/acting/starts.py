@@ -55,9 +55,17 @@ class Starts(Commands):
                 now, protocols=browsed.protocols, runs=browsed.runs, queue=browsed.queue,
                 paused=browsed.paused, trouble=browsed.trouble, reading=False,
             )  # fmt: skip
+
+        self._in_background(read)
+
+    def _in_background(self, read: Callable[[], None]) -> None:
+        """Read from the disk in a thread, then draw."""
+
+        def work() -> None:
+            read()
             self.redraw()
 
-        threading.Thread(target=read, name="bramah-browse", daemon=True).start()
+        threading.Thread(target=work, name="bramah-read", daemon=True).start()
 
     def act_tab(self, step: int) -> None:
         """Open the next tab."""
@@ -134,9 +142,8 @@ class Starts(Commands):
 
         def read() -> None:
             self.browsed = replace(self.browsed, log=read_log(folder))
-            self.redraw()
 
-        threading.Thread(target=read, name="bramah-log", daemon=True).start()
+        self._in_background(read)
 
     def _open_trace(self, folder: Path) -> None:
         """Show the stored trace of a run."""
@@ -146,9 +153,8 @@ class Starts(Commands):
 
         def read() -> None:
             self.browsed = replace(self.browsed, trace=read_trace(folder))
-            self.redraw()
 
-        threading.Thread(target=read, name="bramah-trace", daemon=True).start()
+        self._in_background(read)
 
     def _reset_run(self, run: RunSummary) -> None:
         """Reset the bench that a run tripped, with a reason."""
