@@ -24,8 +24,8 @@ from rig.bench.checks.catalogue import catalogue
 from rig.bench.checks.plausibility import Plausibility
 from rig.bench.checks.rates import rate_window, rates
 from rig.bench.checks.recent import Recent
-from rig.bench.checks.settings import GuardSettings
 from rig.bench.checks.single_sensor import Frozen, Saturation
+from rig.bench.settings import GuardSettings
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.trips import DEVICE, FINITE, FROZEN, GAP, STALE, Violation

@@ -15,9 +15,9 @@ from protocols.engine import engine
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
 from rig.bench.checks.pressure_sensors import ROW_SECONDS, drifting, swing_ratio
-from rig.bench.checks.settings import GuardSettings
 from rig.bench.guard import EXCITED, FREE, Guard, JointRole
 from rig.bench.session import Bench
+from rig.bench.settings import GuardSettings
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.model.trips import Violation

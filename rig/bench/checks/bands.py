@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.checks.settings import GuardSettings
+from rig.bench.settings import GuardSettings
 from rig.model import channels as ch
 from rig.model.alarms.bands import AlarmBand, Range, ends
 from rig.model.rig import Rig

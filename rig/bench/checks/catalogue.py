@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rig.bench.checks.settings import GuardSettings
+from rig.bench.settings import GuardSettings
 from rig.model import trips
 
 

@@ -20,8 +20,8 @@ from rig.bench.checks.active_warnings import Key, key_of
 from rig.bench.checks.bands import JointRole
 from rig.bench.checks.expected_spool import ExpectedSpool
 from rig.bench.checks.pressure_sensors import PressureFinding, SlowRows
-from rig.bench.checks.settings import GuardSettings
 from rig.bench.checks.single_sensor import SWING
+from rig.bench.settings import GuardSettings
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.trips import (

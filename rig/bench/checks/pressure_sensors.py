@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.checks.settings import GuardSettings
+from rig.bench.settings import GuardSettings
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
 from rig.bench.checks.bands import Counts, first_of, run_lengths
-from rig.bench.checks.settings import GuardSettings
+from rig.bench.settings import GuardSettings
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.trips import SATURATED, Violation

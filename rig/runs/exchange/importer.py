@@ -228,25 +228,19 @@ def _part(entry: ManifestRecord, file: Path, rate: float, first: int, last: int)
 def _read_columns(
     source: _Source, file: Path, channels: tuple[str, ...], needed: list[str]
 ) -> dict[str, Array]:
-    if TIME in needed and source.manifest.sample_rate is None:
-        try:
-            return _by_channel(source, file, channels, needed)
-        except InputError as error:
-            if f"has no column {source.column(TIME)!r}" not in str(error):
-                raise
-            raise InputError(
-                f"{file}: has no column {source.column(TIME)!r}, and the manifest "
-                f"{source.path} gives no sample_rate; give one of the two"
-            ) from error
-    return _by_channel(source, file, channels, needed)
-
-
-def _by_channel(
-    source: _Source, file: Path, channels: tuple[str, ...], needed: list[str]
-) -> dict[str, Array]:
+    """Return a file's columns (n,) by channel; raises InputError if a needed one is missing."""
     names = {channel: source.column(channel) for channel in channels}
     wanted = list(dict.fromkeys(names.values()))
-    table = read_table(file, wanted, [names[channel] for channel in needed])
+    try:
+        table = read_table(file, wanted, [names[channel] for channel in needed])
+    except InputError as error:
+        no_time = f"has no column {names[TIME]!r}"
+        if source.manifest.sample_rate is not None or no_time not in str(error):
+            raise
+        raise InputError(
+            f"{file}: {no_time}, and the manifest {source.path} gives no sample_rate; give one of "
+            "the two"
+        ) from error
     return {channel: table[name] for channel, name in names.items() if name in table}
 
 
