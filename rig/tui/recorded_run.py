@@ -19,7 +19,6 @@ STORED: Final = "trace.json"  # the output of `bramah trace --json`, in the run'
 
 Numbers = Mapping[str, float | None]
 
-
 MOST: Final = 20_000  # newest lines that are kept
 LONGEST: Final = 400  # characters of a line
 

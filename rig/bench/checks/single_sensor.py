@@ -29,7 +29,6 @@ SWING: Final = 0.05  # share of the command's limit, peak to peak, that moves a 
 HELD: Final = 0.01  # share of the command's limit that, kept up in a jog, moves a joint
 _MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
 
-
 _VACUUM = -90e3  # no gauge pressure is far below this, so such a range cannot be exceeded
 
 

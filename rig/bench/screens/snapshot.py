@@ -24,7 +24,6 @@ Band = tuple[float | None, float | None]
 
 BUCKETS = 25  # per snapshot; at 20 snapshots per second, 500 columns of a plot
 
-
 KEPT: Final = 1200  # buckets: one minute of wall time at twenty snapshots a second
 
 

@@ -33,7 +33,7 @@ from rig.cli.bench.stream_figures import stream_figures
 from rig.cli.bench.wire_figures import wire_figures
 from rig.cli.simulated.experiment import HIDDEN, RIG, Experiment, experiment
 from rig.cli.simulated.simulated_bench import simulated_bench
-from rig.cli.text.output import clock_text, table
+from rig.cli.text.output import Say, clock_text, table
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.runs.rigs import load_rig
@@ -49,7 +49,6 @@ SECONDS: Final = {
 LONG: Final = ("wires", "faults", "screen")  # measured only with --only
 STOPS, QUICK_STOPS = 200, 10  # by key at the screen
 QUICK_SECONDS: Final = 4.0  # of a part of the screen's figures
-Say = Callable[[str], None]
 
 
 def plant_figures(_: Path, say: Say) -> list[Figure]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from rig.cli.bench.figure import Figure
 from rig.cli.bench.speed.figures import bench_run
 from rig.cli.bench.stream import cluster_figures, row_figures, spin_figures
 from rig.cli.execution.tracking import Tracking
+from rig.cli.text.output import Say
 from rig.model.records import Record
 from rig.model.rig import Rig
 from rig.runs.archive import write_run
@@ -27,7 +27,6 @@ RIG = "shinshu-2dof"
 BLOCK = 10  # samples: 10 ms
 RUNS, RECORD_SECONDS = 8, 20.0  # length of the archive: 144 records
 GROUP = "stream"
-Say = Callable[[str], None]
 
 
 def stream_figures(folder: Path, say: Say) -> list[Figure]:

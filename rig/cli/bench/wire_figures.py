@@ -29,6 +29,7 @@ from rig.cli.bench.acquisition import lateness, waited_seconds
 from rig.cli.bench.figure import Figure
 from rig.cli.execution.device import reached_at
 from rig.cli.simulated.simulated_bench import simulated_bench
+from rig.cli.text.output import Say
 from rig.model.parts import WATCHDOG_RANGE, Wire
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
@@ -42,7 +43,6 @@ RIG: Final = "digger-3dof"  # 14 measured channels and 3 commands at 1 kHz
 GROUP: Final = "wires"
 BLOCKS, ROUNDS = 200, 7
 _SESSION: Final = 0x0BA2E11B
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from rig.bench.session import Bench
 from rig.cli.execution.device import bench_at, device_of, only_bench, refuse_endpoint_alone
 from rig.cli.proof.proofs import proved
 from rig.cli.proof.twin_choice import twin_source
-from rig.cli.text.output import Countdown, clock_text, is_terminal
+from rig.cli.text.output import Countdown, Say, clock_text, is_terminal
 from rig.cli.text.sheets import plan_text
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -40,7 +40,6 @@ from rig.runs.store import refuse_occupied
 if TYPE_CHECKING:
     from rig.cli.execution.tracking import Tracking
 
-Say = Callable[[str], None]
 
 # A sample takes 8 bytes per channel in the journal, the same in records.h5, which is written before
 # the journal is removed, and some more in the journal's write-ahead log.

@@ -30,7 +30,7 @@ from analysis.identify.streams.online import Tracker
 from analysis.simulation.model import Estimate, estimate_json
 from analysis.workers.pool import environment
 from drivers.base import SampleBlock
-from rig.cli.text.output import write_json
+from rig.cli.text.output import Say, write_json
 from rig.model.parse import InputError
 from rig.model.records import RecordHead
 from rig.model.rig import Rig
@@ -40,7 +40,6 @@ from rig.runs.recorder import RecordMeta
 from rig.runs.runstate import EventLog
 
 log = logging.getLogger(__name__)
-Say = Callable[[str], None]
 Array = NDArray[np.float64]
 
 KEPT = 5.0  # [s] of samples kept from before a record is announced

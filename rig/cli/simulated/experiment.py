@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -25,7 +25,7 @@ from protocols.files.plan import Overrides
 from rig.cli.execution.experiment_loop import HELD_OUT, PROTOCOL
 from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
 from rig.cli.simulated.simulated_bench import read_truth, simulated_bench
-from rig.cli.text.output import Countdown, progress, write_json
+from rig.cli.text.output import Countdown, Say, progress, write_json
 from rig.cli.text.render import identification_text, parameter_table, validation_text
 from rig.cli.text.reports import provenance
 from rig.model.records import Run
@@ -34,7 +34,6 @@ from rig.runs.store import load_run, refuse_occupied
 VALIDATE = "validate"
 RIG = "shinshu-2dof"
 HIDDEN = "worn-seal"  # effects of the demo's bench, unknown to the analysis
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from rig.runs.files import scratch_folder
 _START = "from rig.cli.main import run; run()"
 _END_SECONDS = 10.0
 
-
 SCENARIO: Final = "scenario"  # key beside the parameters' names
 
 

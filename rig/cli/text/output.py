@@ -16,6 +16,7 @@ import typer
 
 from rig.model.units import clock
 
+Say = Callable[[str], None]  # tells a person how far the work is
 LINE_SECONDS: Final = 3.0  # [s] between the lines of a countdown, and before the first
 
 

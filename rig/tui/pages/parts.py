@@ -27,7 +27,6 @@ CURVE_HEIGHT: Final = 4  # least rows of a curve with its words
 WIDTH: Final = 38  # least columns of a joint
 ROLES: Final = {"locked": "▣ locked", "excited": "≈ excited", "free": "○ free"}
 
-
 LABEL: Final = 8  # characters of a gauge's name
 NUMBER: Final = 9  # of its value and unit
 LIMIT: Final = 3  # of a limit

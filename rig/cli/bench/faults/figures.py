@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +15,7 @@ from hil_sim.link.served import SERVED
 from rig.cli.bench.faults.bench import fault_bench
 from rig.cli.bench.faults.trials import Diagnosis, TrialOutcome, kinds, try_fault, with_timeout
 from rig.cli.bench.figure import Figure
+from rig.cli.text.output import Say
 from rig.runs.rigs import load_rig
 
 RIG: Final = "shinshu-2dof"
@@ -24,7 +25,6 @@ TIMEOUT: Final = 0.1  # [s]: a device in virtual time may take ten times as long
 REAL_TIME_ONLY: Final = frozenset({"clock_drift"})
 _WITHIN: Final = 2.0  # [s] of excitation within which a frozen or stuck signal must be detected
 _FROZEN: Final = ("sensor_stuck", "valve_stuck", "broken_wire")
-Say = Callable[[str], None]
 
 
 def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:

@@ -13,6 +13,7 @@ from analysis.terms.base import Used
 from rig.cli.bench.figure import Figure, processor_time
 from rig.cli.bench.speed.figures import bench_run
 from rig.cli.bench.speed.free_run import both_moving
+from rig.cli.text.output import Say
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
@@ -22,7 +23,6 @@ SECONDS: Final = (5.0, 10.0, 20.0, 40.0)
 RIGS: Final = ("boom-1dof", "shinshu-2dof", "digger-3dof")
 # Largest number of effects added to the model, as a trace adds its candidates.
 CANDIDATES: Final = 4
-Say = Callable[[str], None]
 
 
 def growth_figures(say: Say) -> list[Figure]:

@@ -34,6 +34,7 @@ from rig.cli.bench.figure import Figure
 from rig.cli.bench.wire_figures import bare_modbus
 from rig.cli.execution.device import reached_at
 from rig.cli.simulated.simulated_bench import simulated_bench
+from rig.cli.text.output import Say
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.runs.journal import Journal
@@ -44,7 +45,6 @@ GROUP: Final = "run"
 RIG, PROTOCOL, STEP = "shinshu-2dof", "lock-and-excite", "step1"
 ROUNDS: Final = 5
 JOURNAL_BLOCK, JOURNAL_BLOCKS = 0.1, 1000  # [s], number
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
