@@ -44,6 +44,10 @@ LEAST_FLOW: Final = 0.05
 BULK: Final = "b"  # the parameter's name
 BULK_MODULUS: Final = 1e9  # [Pa] with hoses and some air (Jelali and Kroll 2003, section 2.3)
 WHOLE: Final = 0.5  # of the pump's flow: records that reach it need no remark on the drop there
+# Share of the pump's flow at which a line becomes turbulent: below the least one no flow of a
+# record is laminar, and a line without one (0) is laminar throughout, as with `LAMINAR`.
+LEAST_SHARE: Final = 1e-3
+LAMINAR: Final = 100.0
 NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
 
 
@@ -96,7 +100,7 @@ def line_drop(name: str, rig: Rig, shares: tuple[float, ...]) -> Shape:
 
 def turning(name: str, first: tuple[float, ...]) -> Shape:
     """Return the share of the pump's flow at which a line's flow becomes turbulent."""
-    return Shape(name, "", 0.0, 3.0, first, resolution=True, saturates=True)
+    return Shape(name, "", LEAST_SHARE, 3.0, first, resolution=True, saturates=True)
 
 
 def packed_line(rig: Rig, dp: float, share: float) -> tuple[float, float]:
@@ -156,11 +160,27 @@ class LineDrop(PortEffect):
         ]
         return tuple(itertools.product(*axes))
 
+    def line(self, rig: Rig, shape: Sequence[float]) -> tuple[float, float]:
+        """Return the drop at the pump's whole flow [Pa], and r_t.
+
+        A shape without r_t is turbulent throughout, one with an r_t of 0 laminar throughout.
+        """
+        dp, *share = self.shape_of(rig, shape)[:2]
+        return dp, (share[0] or LAMINAR) if share else 0.0
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the line laminar throughout, or one with an r_t, of equal drop at small flow."""
+        dp, share = self.line(rig, shape)
+        if share != LAMINAR:
+            return ((turbulent_part(dp, share) * (share or 0.5), 0.0, *shape[2:]),)
+        share = self.shapes(rig)[1].middle
+        return ((dp / turbulent_part(share, share), share, *shape[2:]),)
+
     def _at_largest_flow(
         self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
     ) -> tuple[float, float]:
         """Return the largest flow of records over the pump's, and the drop [Pa] there."""
-        dp, share, *_ = self.whole(rig, shape)
+        dp, share = self.line(rig, shape)
         ratio = largest_flow(rig, signals, self.drawn) / rig.supply.flow
         return ratio, drop_and_slope(ratio, turbulent_part(dp, share), share)[0]
 
@@ -203,7 +223,8 @@ class SupplySag(LineDrop):
     does not, the pressure of pump or relief valve falls nearly in proportion to the flow. A sudden
     demand is first met by the oil V_supply between sensor and valves, or by an accumulator of equal
     capacity: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation leaves that out. dp, r_t
-    and V_supply are shapes; a line that is laminar throughout has any large r_t.
+    and V_supply are shapes; a line that no record shows turbulent is laminar throughout, without
+    r_t.
     """
 
     mechanism: ClassVar[str] = "supply_curve"
@@ -211,7 +232,7 @@ class SupplySag(LineDrop):
     name: ClassVar[str] = "supply_sag"
     drawn: ClassVar[bool] = True
     powers: ClassVar[tuple[int, ...]] = (2, -1, -1)
-    least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
+    least_shape: ClassVar[tuple[float, ...]] = (0.2e6, LEAST_SHARE, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
     quantity: ClassVar[str] = "flow drawn"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
@@ -239,7 +260,8 @@ class SupplySag(LineDrop):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the drop from the supply pressure."""
-        dp, share, volume = self.shape_of(rig, shape)
+        dp, share = self.line(rig, shape)
+        volume = self.shape_of(rig, shape)[2]
         turbulent = turbulent_part(dp, share)
         ratio = np.ascontiguousarray(port_flow(rig, signals, self.drawn) / rig.supply.flow)
         capacity = volume / (bulk_modulus(rig) * rig.supply.flow)
@@ -248,8 +270,9 @@ class SupplySag(LineDrop):
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return the line (`packed_line`), C_pp and C_mm of each joint."""
-        dp, share, _ = self.shape_of(rig, shape)
-        return np.array([*packed_line(rig, dp, share), *edge_gains(rig, values, (0, 3))])
+        return np.array(
+            [*packed_line(rig, *self.line(rig, shape)), *edge_gains(rig, values, (0, 3))]
+        )
 
 
 @dataclass(frozen=True)
@@ -358,14 +381,14 @@ class ReturnLine(LineDrop):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""
-        dp, share = self.whole(rig, shape)
+        dp, share = self.line(rig, shape)
         ratio = port_flow(rig, signals, self.drawn) / rig.supply.flow
         drop = turbulent_part(dp, share) * ratio * np.cbrt(ratio**3 + share**3)
         return replace(signals, p_tank=signals.p_tank + drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return the line (`packed_line`), C_mp and C_pm of each joint."""
-        line = packed_line(rig, *self.whole(rig, shape))
+        line = packed_line(rig, *self.line(rig, shape))
         return np.array([*line, *edge_gains(rig, values, (2, 1))])
 
 

@@ -259,6 +259,8 @@ def consistent(rig: Rig, signals: Signals, e: Effect, shape: tuple[float, ...]) 
 
 def joined(ratio: float, drop: float, turning: float) -> float:
     """Laminar and turbulent asymptote, joined; `drop` is that at the whole flow."""
+    if turning == 0.0:  # laminar throughout
+        return float(drop * ratio)
     whole = (1.0 + turning**3) ** (1 / 3)
     return float(drop / whole * ratio * np.cbrt(ratio**3 + turning**3))
 
