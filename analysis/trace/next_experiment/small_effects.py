@@ -35,17 +35,17 @@ def sets_with_small_effect(
     Each is returned with the parameter that it moves most, and its relative change.
 
     There are several where one effect fits as well as another. The effect is one of `absorbed`,
-    exceeds `TRACE.visible_deviations` of its noise, is possible, reduces the held-out residual by
-    more than noise and changes a parameter by more than its interval.
+    exceeds `TRACE.suggested_deviations` of its noise, to first order and fitted, is possible,
+    reduces the held-out residual by more than noise and changes a parameter by more than its
+    interval.
     """
     if absorbed is None:
         return []
     left, found = held_out_residual(holdout_data, winner.fit), []
     for effects in _clearest(absorbed, winner):
         larger = hypotheses.refined([*winner.effects, *effects])
-        price = SEARCH.number_price * (larger.size[1] - winner.size[1])
         if (
-            winner.fit.energy - larger.fit.energy > price
+            winner.fit.energy - larger.fit.energy > TRACE.suggested_deviations**2
             and not hypotheses.physical_problem(larger)
             and loses_by_restriction(left, held_out_residual(holdout_data, larger.fit))
             and (moved := moved_parameter(hypotheses.train_data, winner, larger, least=0.0))
@@ -63,18 +63,21 @@ def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[tuple[Used,
     size = np.linalg.norm(absorbed.shown, axis=0)
     along = np.abs(absorbed.shown.T @ winner.fit.residual)
     deviations = np.divide(along, size, out=np.zeros_like(along), where=size > 0)
-    order = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.visible_deviations]
+    order = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.suggested_deviations]
     effects = [absorbed.explanations[k].effects for k in order]
     single, both = ([e for e in effects if len(e) == count] for count in (1, 2))
     return [*single[: TRACE.most_rivals], *both[: TRACE.most_rivals]]
 
 
 def small_effect_notes(winner: Hypothesis, larger: Sequence[tuple[Hypothesis, Moved]]) -> list[str]:
-    """Name the further effects of larger sets that change a parameter by `TRACE.noted_shift`."""
+    """Name the further effects of larger sets that change a parameter by `TRACE.noted_shift`.
+
+    Where none does, the clearest is named: it widens intervals too.
+    """
     out = []
-    for hypothesis, (parameter, change) in larger:
-        if abs(change) < TRACE.noted_shift:
-            continue
+    for hypothesis, (parameter, change) in (
+        [(o, moved) for o, moved in larger if abs(moved[1]) >= TRACE.noted_shift] or larger[:1]
+    ):
         terms = (u.term for u in hypothesis.effects)
         fresh = [term for term in terms if (term.name, term.where) not in winner.keys]
         places = " and ".join(place_in_words(term.where) for term in fresh)
