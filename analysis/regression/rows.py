@@ -35,6 +35,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 WAVES = (np.sin, np.cos)
+Line = tuple[int, float]  # joint (0-based) and frequency [Hz]
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Filtering:
     step: int = 1
     in_motion: tuple[int, ...] = ()
     full_weight: float = 1.0
-    lines: tuple[tuple[int, float], ...] = ()
+    lines: tuple[Line, ...] = ()
 
 
 @dataclass(frozen=True)

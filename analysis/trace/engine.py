@@ -23,8 +23,9 @@ from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.set_aside import refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import temperature_terms
+from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
 from analysis.trace.data.unrepeated import unrepeated_notes
-from analysis.trace.finding import Finding, TraceRows, TraceRuns, trace_rows, unstated_noise
+from analysis.trace.finding import Finding, unstated_noise
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
     find,

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
-from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import Filtering
 from analysis.terms.base import Used
-from analysis.trace.data.cache import RowCache
-from analysis.trace.data.conditioned_record import (
-    conditioned_records,
-    trace_filtering,
-)
 from analysis.trace.data.noise_floor import STATED
-from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.sample_paths import path_terms
-from analysis.trace.data.set_aside import UnseenRows, set_aside
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
 from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
 from analysis.trace.judge.rivals import best_tied_set
 from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
-from analysis.trace.judge.unlocked import Line
 from analysis.trace.judgement import Judgement, has_tied_rival
-from analysis.trace.notes import WHY_MASKED
 from analysis.trace.remaining import Remainder, clues_to, remainders
 from analysis.trace.result import (
     CLEAN,
@@ -41,9 +31,7 @@ from analysis.trace.result import (
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.hypothesis import Hypothesis, effect_of, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import DATA, SEARCH, TRACE
-from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from analysis.trace.settings import DATA, SEARCH
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -53,47 +41,6 @@ ONLY_HELD_OUT_MISSED = (
     "records with as much excitation as the held-out ones; if these have it, the machine has "
     "changed between the runs: train on records taken after the change to trace it"
 )
-
-
-@dataclass(frozen=True)
-class TraceRuns:
-    """Runs by their task, and the families of equations that are traced.
-
-    Sines at `lines` (joint, 0-based, and frequency [Hz]) are taken out of the torque balances;
-    `noise_ratio` is by equation that of the noise to the stated noise where nothing repeats.
-    """
-
-    train: tuple[Run, ...]
-    holdout: tuple[Run, ...]
-    judge: tuple[Run, ...]
-    families: tuple[str, ...]
-    lines: tuple[Line, ...] = ()
-    noise_ratio: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class TraceRows:
-    """Rows that are fitted (`train`), and rows that no parameter is fitted to (`unseen`)."""
-
-    train: RegressionData
-    unseen: UnseenRows
-
-    @property
-    def in_motion(self) -> tuple[int, ...]:
-        """The joints (0-based) whose torque rows are weighted by speed, by 0 at rest."""
-        return self.train.records[0].filtering.in_motion
-
-    @property
-    def lines(self) -> tuple[Line, ...]:
-        """The sines that are taken out of torque rows: joint (0-based) and frequency [Hz]."""
-        return self.train.records[0].filtering.lines
-
-    def filters_like(self, filtering: Filtering) -> Filtering:
-        """Return filters with the weights of these torque rows and the sines taken out of them."""
-        own = self.train.records[0].filtering
-        return replace(
-            filtering, in_motion=own.in_motion, full_weight=own.full_weight, lines=own.lines
-        )
 
 
 @dataclass(frozen=True)
@@ -134,55 +81,6 @@ def _is_named(effect: JudgedEffect, verdict: str) -> bool:
     return gates.passes_gates(effect) and not (verdict == UNEXPLAINED and has_tied_rival((effect,)))
 
 
-def trace_rows(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns,
-    filtering: Callable[[Record], Filtering] = trace_filtering, cache: RowCache | None = None,
-) -> TraceRows:  # fmt: skip
-    """Return the whitened rows of all runs under a model of `terms`.
-
-    `filtering` gives the row filter of each record; `cache` may hold training rows under the same
-    filters. Coefficients are fitted to the training rows.
-    Raises InputError where a step leaves too few rows of an equation (`_without_masked_steps`).
-    """
-
-    def filters(record: Record) -> Filtering:
-        return replace(filtering(record), lines=records.lines)
-
-    def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
-        return conditioned_records(rig, runs, filters, records.families)
-
-    train_data = _training_rows(rig, terms, conditioned(records.train), cache, records.noise_ratio)
-
-    def unseen(members: Sequence[ConditionedRecord]) -> RegressionData:
-        beta, floors = train_data.beta, train_data.floors
-        return regression_data(
-            rig, train_data.terms, members, beta, others=floors, noise_ratio=records.noise_ratio
-        )
-
-    members = conditioned(records.holdout)
-    data = unseen(members)
-    if not records.judge:
-        return TraceRows(train_data, set_aside(data, members, records.holdout))
-    members = conditioned(records.judge)
-    judging = unseen(members)
-    return TraceRows(train_data, UnseenRows(data, judging, tuple(members), records.holdout))
-
-
-def _training_rows(
-    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord], cache: RowCache | None,
-    noise_ratio: Mapping[str, float],
-) -> RegressionData:  # fmt: skip
-    """Return the training rows, with the columns of the spools' paths between samples."""
-
-    def rows(terms: tuple[Used, ...]) -> RegressionData:
-        data = regression_data(rig, terms, train, cache=cache, noise_ratio=noise_ratio)
-        return _without_masked_steps(data)
-
-    data = rows(terms)
-    paths = path_terms(data)
-    return rows((*terms, *paths)) if paths else data
-
-
 def unstated_noise(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, finding: Finding
 ) -> tuple[TraceRuns, TraceRows] | None:
@@ -221,36 +119,6 @@ def _with_tied_effects(finding: Finding) -> Hypothesis:
         return finding.winner
     rig = finding.rows.train.rig
     return finding.hypotheses.refined([Used(e, e.shape_of(rig, ())) for e in passing])
-
-
-def _without_masked_steps(train_data: RegressionData) -> RegressionData:
-    """Return the rows without equations of a step of which nearly all rows are masked.
-
-    Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation and is
-    too short, or is the only one with rows of that equation.
-    """
-    least = TRACE.least_rows
-    short = [s for s in train_data.segments if s.where.stop - s.where.start < least]
-    elsewhere = {s.equation for s in train_data.segments if s not in short}
-    kept = np.ones(train_data.base.shape[0], dtype=bool)
-    for s in short:
-        count = s.where.stop - s.where.start
-        conditioned, rows = train_data.source(s)
-        record, masked = conditioned.record, rows.masked
-        if masked > count and s.equation in elsewhere:
-            kept[s.where] = False
-            continue
-        remedy = "take longer records"
-        if masked > count:
-            remedy = (
-                f"{masked} others are masked, since {WHY_MASKED}: move less, or check the "
-                "sensors' ranges"
-            )
-        raise InputError(
-            f"step {s.group[1]!r}: records of {record.samples / record.sample_rate:.3g} s "
-            f"leave {count} rows of {s.equation}; the trace needs {least}: {remedy}"
-        )
-    return train_data if kept.all() else train_data.at(kept)
 
 
 def search_and_judge(

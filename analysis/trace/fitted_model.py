@@ -14,7 +14,8 @@ from analysis.regression.rows import Filtering, default_filtering, parameters_of
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature
-from analysis.trace.finding import Finding, TraceRows, TraceRuns
+from analysis.trace.data.trace_rows import TraceRows, TraceRuns
+from analysis.trace.finding import Finding
 from analysis.trace.in_motion import equations_above_noise
 from analysis.trace.judge.inference import with_form_error
 from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives

@@ -13,12 +13,10 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.terms.base import Used, equation
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
 from analysis.trace.finding import (
     Finding,
-    TraceRows,
-    TraceRuns,
     search_and_judge,
-    trace_rows,
     with_free_form,
     without_unnamed_effects,
 )

@@ -18,6 +18,7 @@ from analysis.trace.data.noise_floor import (
     UNSTATED,
 )
 from analysis.trace.data.regression_data import RegressionData, signals_of
+from analysis.trace.data.trace_rows import WHY_MASKED
 from analysis.trace.judge.held_out import refitted_names
 from analysis.trace.remaining import Remainder
 from analysis.trace.result import JudgedEffect
@@ -29,7 +30,6 @@ from rig.model.units import plain
 
 # Begins what a note says of a torque whose rests are not judged; the sentence refers to it.
 WITHOUT_RESTS: Final = "judged without the samples at which the joint rests"
-WHY_MASKED: Final = "a pressure lies outside 0 to the supply's, or samples were clipped or lost"
 
 
 def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:

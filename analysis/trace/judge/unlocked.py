@@ -18,7 +18,7 @@ from analysis.effects.disturbance import FREQUENCY, PeriodicDisturbance
 from analysis.effects.mechanics import torque_limit
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import WAVES, sines_at, without_sines
+from analysis.regression.rows import WAVES, Line, sines_at, without_sines
 from analysis.simulation.model import Estimate
 from analysis.terms.base import equation
 from analysis.trace.data.conditioned_record import model_rows, row_residual
@@ -34,7 +34,6 @@ from rig.model.rig import Rig
 from rig.model.units import plain
 
 Array = NDArray[np.float64]
-Line = tuple[int, float]  # joint (0-based) and frequency [Hz]
 
 
 def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
