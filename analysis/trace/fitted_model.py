@@ -25,8 +25,8 @@ from analysis.trace.next_experiment.detection_limits import AbsorbedEffects, abs
 from analysis.trace.next_experiment.small_effects import sets_with_small_effect, small_effect_notes
 from analysis.trace.notes import shared_parameters
 from analysis.trace.result import UNEXPLAINED, JudgedEffect
+from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
-from analysis.trace.search.refinement import fit_coefficients
 from rig.model.records import Record, Run
 
 # Other estimators replace columns where noise in them matters; the trace compares residuals of

@@ -25,9 +25,9 @@ from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.unlocked import judged_line
 from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
+from analysis.trace.search.exact_fit import design_matrix
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import design_matrix
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 

@@ -22,8 +22,8 @@ from analysis.trace.data.trace_rows import WHY_MASKED
 from analysis.trace.judge.held_out import refitted_names
 from analysis.trace.remaining import Remainder
 from analysis.trace.result import JudgedEffect
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.search.hypothesis import Hypothesis
-from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from rig.model.records import Run
 from rig.model.units import plain

@@ -17,9 +17,9 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.judge import gates, held_out
 from analysis.trace.result import Dependence, Formula
+from analysis.trace.search.exact_fit import rebased
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import rebased
 from analysis.trace.settings import TRACE
 from rig.model.units import plain
 

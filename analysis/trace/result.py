@@ -15,7 +15,7 @@ from analysis.identify.output_error.hidden_states import ShootingEstimate
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.spectral_lines import SpectralLines
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.settings import CLUES, TRACE
 from rig.model.channels import place_in_words
 from rig.model.units import plain

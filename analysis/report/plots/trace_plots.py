@@ -46,7 +46,7 @@ from analysis.trace.data.conditioned_record import (
 from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, lines_by_kind
 from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
 from analysis.trace.result import JudgedEffect, Rival, Trace
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.settings import TRACE
 from analysis.trace.words import equation_of_largest_reduction
 from rig.model import channels as ch

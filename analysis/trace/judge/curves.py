@@ -15,7 +15,7 @@ from analysis.regression.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Curve
-from analysis.trace.search.refinement import ExactFit, tangent
+from analysis.trace.search.exact_fit import ExactFit, tangent
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 from rig.model.units import plain

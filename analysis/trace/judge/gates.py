@@ -23,6 +23,7 @@ from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.invariance import Difference, invariance
 from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -32,7 +33,6 @@ from analysis.trace.search.hypothesis import (
     parameter_values,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 from rig.model.units import plain, with_interval

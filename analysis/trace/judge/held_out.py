@@ -25,7 +25,7 @@ from analysis.trace.data.set_aside import judging_rows
 from analysis.trace.data.temperature_nuisance import within_plausible_slope
 from analysis.trace.judge.curves import rows_within
 from analysis.trace.result import FreeCurves
-from analysis.trace.search.refinement import DesignMatrix, ExactFit, design_matrix
+from analysis.trace.search.exact_fit import DesignMatrix, ExactFit, design_matrix
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.records import Run

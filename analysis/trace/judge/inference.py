@@ -23,9 +23,9 @@ from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.scatter import form_shift, parameter_covariance, with_form_errors
+from analysis.trace.search.exact_fit import ExactFit, jacobian, tangent
 from analysis.trace.search.hypothesis import of_one_law, parameter_values
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
-from analysis.trace.search.refinement import ExactFit, jacobian, tangent
 from analysis.trace.search.shapes import ShapeFit
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig

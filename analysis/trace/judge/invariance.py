@@ -16,8 +16,8 @@ from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, basis_of_others, flip_blocks
+from analysis.trace.search.exact_fit import ExactFit, contribution, design_matrix, jacobian
 from analysis.trace.search.linear_fit import orthonormal
-from analysis.trace.search.refinement import ExactFit, contribution, design_matrix, jacobian
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]

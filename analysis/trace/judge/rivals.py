@@ -21,9 +21,9 @@ from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
 from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search import confounders
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 

@@ -22,14 +22,9 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
+from analysis.trace.search.exact_fit import ExactFit, contribution, design_matrix, tangent
 from analysis.trace.search.hypothesis import parameter_values
-from analysis.trace.search.refinement import (
-    ExactFit,
-    contribution,
-    design_matrix,
-    fits_in_other_forms,
-    tangent,
-)
+from analysis.trace.search.refinement import fits_in_other_forms
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 

@@ -27,8 +27,8 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import rms_of
 from analysis.trace.result import JudgedEffect
+from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
-from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.settings import TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -17,9 +17,9 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.gates import NO_RIVAL, REMOVES
 from analysis.trace.judge.rivals import rivals_in_words
 from analysis.trace.result import Gate, JudgedEffect
+from analysis.trace.search.exact_fit import design_matrix, jacobian
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import design_matrix, jacobian
 from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]

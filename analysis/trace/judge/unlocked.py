@@ -28,7 +28,7 @@ from analysis.trace.data.set_aside import in_judging_block
 from analysis.trace.data.unrepeated import dominant_frequency, scatter
 from analysis.trace.judge.gates import INVARIANT, NO_RIVAL, PHYSICAL, REMOVES, SIGNIFICANT
 from analysis.trace.result import Gate, JudgedEffect
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.settings import DATA, TRACE
 from rig.model.rig import Rig
 from rig.model.units import plain

@@ -31,6 +31,7 @@ from analysis.trace.next_experiment.discrimination import (
     smallest_effect,
 )
 from analysis.trace.result import DetectionLimit
+from analysis.trace.search.exact_fit import rebased, tangent
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     is_special_case,
@@ -38,7 +39,6 @@ from analysis.trace.search.hypothesis import (
     parameter_values,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import rebased, tangent
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig

@@ -75,9 +75,8 @@ def small_effect_notes(winner: Hypothesis, larger: Sequence[tuple[Hypothesis, Mo
     Where none does, the clearest is named: it widens intervals too.
     """
     out = []
-    for hypothesis, (parameter, change) in [
-        (o, moved) for o, moved in larger if abs(moved[1]) >= TRACE.noted_shift
-    ] or larger[:1]:
+    noted = [(o, moved) for o, moved in larger if abs(moved[1]) >= TRACE.noted_shift]
+    for hypothesis, (parameter, change) in noted or larger[:1]:
         terms = (u.term for u in hypothesis.effects)
         fresh = [term for term in terms if (term.name, term.where) not in winner.keys]
         places = " and ".join(place_in_words(term.where) for term in fresh)

@@ -10,9 +10,9 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 
 from analysis.terms.base import Used
+from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.hypothesis import Hypothesis, Key, may_grow, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.settings import SEARCH
 
 _Trial = tuple[float, tuple[Used, ...]]  # the energy that a set leaves at a point of a shape grid

@@ -12,7 +12,7 @@ from analysis.effects.base import Effect
 from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 

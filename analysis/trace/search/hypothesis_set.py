@@ -29,6 +29,7 @@ from analysis.trace.data.regression_data import (
 )
 from analysis.trace.search import linear_fit
 from analysis.trace.search.confounders import BENCH, confusable_sets
+from analysis.trace.search.exact_fit import ExactFit, fit_coefficients, jacobian, rebased
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -43,7 +44,7 @@ from analysis.trace.search.hypothesis import (
     parameter_values,
     within_band,
 )
-from analysis.trace.search.refinement import ExactFit, fit_coefficients, jacobian, rebased, refine
+from analysis.trace.search.refinement import refine
 from analysis.trace.search.starts import at_best_size
 from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words

@@ -10,183 +10,30 @@ with noise in the rows as they are.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shape_values, shapes_of
-from analysis.regression.rows import in_common, matrix_of, parameters_of
-from analysis.terms.base import Used, family_of
-from analysis.trace.data.conditioned_record import acting_on, shared_rows
+from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.search.exact_fit import (
+    ExactFit,
+    design_matrix,
+    fit_coefficients,
+    is_logarithmic,
+    jacobian,
+    rescale,
+    tangent,
+    with_term,
+)
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import SEARCH, TRACE
-from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class DesignMatrix:
-    """Whitened rows of a model on regression data: matrix (M, k) of `names`, right side (M,).
-
-    `cavitating` are, for each equation with such rows, the rows (numbers) at which the oil does
-    not cavitate under the model and those at which it does.
-    """
-
-    names: tuple[str, ...]
-    matrix: Array
-    rhs: Array
-    cavitating: tuple[tuple[Indices, Indices], ...] = ()
-
-    def residual(self, beta: Mapping[str, float]) -> Array:
-        """Return the residual (M,) under coefficients of the rows.
-
-        Where the oil cavitates no flow can be compared. Up to `TRACE.cavitating_share` of an
-        equation's rows such instants keep at most the rms of the others, so that they count
-        neither for nor against the model: a true gain of a sensor puts some pressures below zero.
-        """
-        out = self.rhs - self.matrix @ np.array([beta.get(n, 0.0) for n in self.names])
-        for others, outside in self.cavitating:
-            if len(outside) <= TRACE.cavitating_share * (len(outside) + len(others)):
-                limit = np.sqrt(np.mean(out[others] ** 2))
-                out[outside] = np.clip(out[outside], -limit, limit)
-        return np.asarray(out)
-
-
-@dataclass(frozen=True)
-class ExactFit:
-    """A fitted model: terms with shapes, coefficients of the rows, whitened residual (M,).
-
-    `information` (k, k) of the coefficients, in the order of `beta`, is the inverse of their
-    covariance from noise.
-    """
-
-    terms: tuple[Used, ...]
-    beta: Mapping[str, float]
-    residual: Array
-    information: Array
-
-    @property
-    def energy(self) -> float:
-        """Energy of the whitened residual."""
-        return float(self.residual @ self.residual)
-
-
-def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
-    """Return the whitened rows of a model at the instants of the averaged records.
-
-    Instants that the model masks have the residual of the data's own model, so that no effect
-    removes a residual by moving signals to where the equations do not hold (but see
-    `DesignMatrix.residual`).
-    """
-    names = _coefficient_names(data.rig, terms)
-    X, y = np.zeros((data.base.shape[0], len(names))), np.zeros(data.base.shape[0])
-    cavitating: list[tuple[Indices, Indices]] = []
-    for family, rows in data.family_rows.items():
-        own = _family_design(data, family, acting_on(data.rig, terms, family, data.cache))
-        columns = np.array([names.index(n) for n in own.names], dtype=np.int64)
-        X[np.ix_(rows, columns)] = own.matrix
-        y[rows] = own.rhs
-        cavitating += [(rows[others], rows[outside]) for others, outside in own.cavitating]
-    return DesignMatrix(names, X, y, tuple(cavitating))
-
-
-def _coefficient_names(rig: Rig, terms: Sequence[Used]) -> tuple[str, ...]:
-    """Return the coefficients of terms, each once, in the terms' order."""
-    return tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(rig)))
-
-
-def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> DesignMatrix:
-    """Return `design_matrix` of one family's rows (`RegressionData.family_rows`) and terms."""
-    names = parameters_of(data.rig, terms, family)
-    built = {
-        record.group: (
-            rows,
-            shared_rows(data.rig, terms, replace(record, families=(family,)), data.cache),
-        )
-        for record, rows in zip(data.records, data.rows, strict=True)
-    }
-    own_rows = data.family_rows[family]
-    rescaled = data.relative and _rescale(data, terms)
-    X, y = np.zeros((len(own_rows), len(names))), data.mean_residual[own_rows]
-    kept: dict[str, list[Indices]] = {}
-    every: dict[str, list[Indices]] = {}
-    start = 0
-    for segment in data.segments:
-        if family_of(segment.equation) != family:
-            continue
-        before, rows = (side[segment.equation] for side in built[segment.group])
-        here, there = in_common(before, rows)
-        size = 1.0
-        if rescaled and rows.rhs[there].size:  # about the mean, a difference of two large forces
-            size = float(np.std(before.rhs[here])) / max(float(np.std(rows.rhs[there])), 1e-300)
-        weight = np.sqrt(segment.repeats) / segment.noise * size
-        own = np.arange(start, start + len(before.rhs))
-        inside = slice(start, start + len(own))
-        X[inside][here] = matrix_of(rows, names)[there] * weight
-        y[inside][here] = rows.rhs[there] * weight
-        kept.setdefault(segment.equation, []).append(own[here])
-        every.setdefault(segment.equation, []).append(own)
-        start += len(own)
-    return DesignMatrix(names, X, y, _cavitating(kept, every))
-
-
-def _cavitating(
-    kept: Mapping[str, Sequence[Indices]], every: Mapping[str, Sequence[Indices]]
-) -> tuple[tuple[Indices, Indices], ...]:
-    """Return the rows `kept` by a model and the others of all, of equations that have others."""
-    out = []
-    for equation, parts in kept.items():
-        if sum(map(len, parts)) < sum(map(len, every[equation])):  # seldom
-            here = np.concatenate(parts)
-            out.append((here, np.setdiff1d(np.concatenate(every[equation]), here)))
-    return tuple(out)
-
-
-@dataclass(frozen=True)
-class _FamilyFit:
-    """Coefficients `values` (k,), residual (m,) and information (k, k) of one family's rows."""
-
-    names: tuple[str, ...]
-    values: Array
-    residual: Array
-    information: Array
-
-
-def _family_fit(data: RegressionData, family: str, terms: Sequence[Used]) -> _FamilyFit:
-    rows = _family_design(data, family, terms)
-    scale = np.linalg.norm(rows.matrix, axis=0)
-    scale[scale == 0] = 1.0
-    Q, R = np.linalg.qr(rows.matrix / scale)
-    values = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
-    residual = rows.residual(dict(zip(rows.names, values, strict=True)))
-    return _FamilyFit(rows.names, values, residual, (R * scale).T @ (R * scale))
-
-
-def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
-    """Return the least-squares fit of a model's coefficients, with its shapes as given.
-
-    No coefficient is shared between families of rows, so that each family is fitted by itself, and
-    one in which no shape acts is not fitted again.
-    """
-    names = _coefficient_names(data.rig, terms)
-    values, information = np.zeros(len(names)), np.zeros((len(names), len(names)))
-    residual = np.zeros(data.base.shape[0])
-    for family, rows in data.family_rows.items():
-        acting = acting_on(data.rig, terms, family, data.cache)
-        own: _FamilyFit = data.cache.fits.get(
-            (family, data.terms, acting, data.relative), partial(_family_fit, data, family, acting)
-        )
-        at = [names.index(n) for n in own.names]
-        values[at], residual[rows] = own.values, own.residual
-        information[np.ix_(at, at)] = own.information
-    return ExactFit(tuple(terms), dict(zip(names, values, strict=True)), residual, information)
 
 
 def refine(
@@ -209,17 +56,10 @@ def refine(
     Shapes of effects that rescale signals are searched in rows of unchanged size
     (`RegressionData.relative`). The fit returned is of rows over their noise.
     """
-    if not _rescale(data, terms):
+    if not rescale(data, terms):
         return _refined(data, terms, instead_of, steps)
     found = _refined(replace(data, relative=True), terms, instead_of, steps)
     return fit_coefficients(data, found.terms)
-
-
-def _rescale(data: RegressionData, terms: Sequence[Used]) -> bool:
-    """Return whether a term that is not the data's own multiplies signals."""
-    return any(
-        isinstance(u.term, Effect) and u.term.rescales and u not in data.terms for u in terms
-    )
 
 
 def _refined(
@@ -259,7 +99,7 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -
     asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
     # Half, since the linear prediction is less than what a detail removes.
     promising = [
-        fit_coefficients(data, _with_term(fit.terms, used, start))
+        fit_coefficients(data, with_term(fit.terms, used, start))
         for start in opened
         if _predicted_gain(data, fit, used, start) >= 0.5 * asked
     ]
@@ -327,7 +167,7 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         used = fit.terms[place]
         assert isinstance(used.term, Effect)
         others = [
-            _with_searched_shapes(data, _with_term(fit.terms, used, Used(used.term, shape)), steps)
+            _with_searched_shapes(data, with_term(fit.terms, used, Used(used.term, shape)), steps)
             for shape in used.term.other_forms(data.rig, used.shape)
         ]
         best = min(others, key=priced, default=fit)
@@ -339,18 +179,13 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
 def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
     """Return the energy that the details of a term would remove, to first order."""
     column = (
-        design_matrix(data, _with_term(fit.terms, used, opened)).residual(fit.beta) - fit.residual
+        design_matrix(data, with_term(fit.terms, used, opened)).residual(fit.beta) - fit.residual
     )
     absorbed = np.hstack((design_matrix(data, fit.terms).matrix, jacobian(data, fit, used)[1]))
     basis = orthonormal(absorbed)
     column = column - basis @ (basis.T @ column)
     size = float(column @ column)
     return float(column @ fit.residual) ** 2 / size if size > 0 else 0.0
-
-
-def _with_term(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
-    """Return the terms with `other` in place of `used`."""
-    return tuple(other if u is used else u for u in terms)
 
 
 def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
@@ -414,72 +249,17 @@ def _on_better_side(
     return terms
 
 
-def _logarithmic(shape: Shape) -> bool:
-    return shape.low > 0 and shape.high / shape.low > 20
-
-
 def _to_unit(value: float, shape: Shape) -> float:
     """Return a shape value mapped to 0..1 between its bounds, by logarithm if far apart."""
-    if _logarithmic(shape):
+    if is_logarithmic(shape):
         return float(np.log(value / shape.low) / np.log(shape.high / shape.low))
     return (value - shape.low) / (shape.high - shape.low)
 
 
 def _from_unit(x: float, shape: Shape) -> float:
-    if _logarithmic(shape):
+    if is_logarithmic(shape):
         return float(shape.low * (shape.high / shape.low) ** x)
     return shape.low + x * (shape.high - shape.low)
-
-
-def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[str, ...], Array]:
-    """Return names and whitened columns (M, p) of an effect's coefficients and shapes.
-
-    A column is the derivative of the model's side of the rows with respect to the parameter.
-    """
-    rows = design_matrix(data, model.terms)
-    own = [c.parameter for c in used.term.coefficients(data.rig)]
-    names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
-    for j, shape in enumerate(shapes_of(data.rig, used)):
-        if shape.fixed or not shape.given(used.shape[j]):
-            continue
-        step = 1e-3 * (shape.high - shape.low)
-        if _logarithmic(shape):
-            step = 1e-2 * used.shape[j]
-        up = min(used.shape[j] + step, shape.high)
-        down = max(used.shape[j] - step, shape.low)
-        ends = []
-        for value in (up, down):
-            changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
-            ends.append(
-                design_matrix(data, _with_term(model.terms, used, changed)).residual(model.beta)
-            )
-        names.append(shape.parameter)
-        columns.append(-(ends[0] - ends[1]) / (up - down))
-    stack = np.column_stack(columns) if columns else np.zeros((len(model.residual), 0))
-    return tuple(names), stack
-
-
-def tangent(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
-    """Return names and whitened derivatives (M, p) of all coefficients and shapes of a model."""
-    rows = design_matrix(data, model.terms)
-    names, columns = list(rows.names), [rows.matrix]
-    for used in model.terms:
-        if used.shape and isinstance(used.term, Effect):
-            own, J = jacobian(data, model, used)
-            fresh = [k for k, n in enumerate(own) if n not in names]
-            names += [own[k] for k in fresh]
-            columns.append(J[:, fresh])
-    return tuple(names), np.column_stack(columns)
-
-
-def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
-    """Return what an effect adds to the whitened rows (M,): its derivatives times its values."""
-    _, J = jacobian(data, model, used)
-    amounts = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(data.rig)]
-    for shape, value in zip(shapes_of(data.rig, used), used.shape, strict=True):
-        if not shape.fixed and shape.given(value):
-            amounts.append(value if shape.neutral is not None else 0.0)
-    return np.asarray(J @ np.array(amounts))
 
 
 def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
@@ -489,26 +269,6 @@ def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
-            terms = _with_term(fit.terms, used, Used(used.term, shape))
+            terms = with_term(fit.terms, used, Used(used.term, shape))
             out.append(_with_searched_shapes(data, terms, SEARCH.steps))
     return out
-
-
-def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
-    """Return regression data whose own model is a fitted model."""
-    rows = design_matrix(data, model.terms)
-    built = []
-    for conditioned, before in zip(data.records, data.rows, strict=True):
-        now = shared_rows(data.rig, model.terms, conditioned, data.cache)
-        kept = {}
-        for equation, old in before.items():
-            here, there = in_common(old, now[equation])
-            matrix = np.zeros((len(old.rhs), len(now[equation].names)))
-            rhs = np.zeros(len(old.rhs))
-            matrix[here], rhs[here] = now[equation].matrix[there], now[equation].rhs[there]
-            kept[equation] = replace(now[equation], matrix=matrix, rhs=rhs, time=old.time)
-        built.append(kept)
-    return replace(
-        data, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
-        rows=tuple(built),
-    )  # fmt: skip

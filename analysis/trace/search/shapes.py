@@ -14,7 +14,8 @@ from analysis.trace.data.candidates import shape_grid
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
 from analysis.trace.data.temperature_nuisance import temperature_terms
-from analysis.trace.search.refinement import ExactFit, fit_coefficients, refine
+from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
+from analysis.trace.search.refinement import refine
 from analysis.trace.settings import SEARCH
 from rig.model.records import Run, with_common_bandwidth
 from rig.model.rig import Rig

@@ -8,7 +8,7 @@ from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import shape_grid
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.search.refinement import fit_coefficients
+from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.settings import SEARCH
 
 

@@ -27,7 +27,7 @@ from analysis.trace.data.conditioned_record import ConditionedRecord, conditione
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.judge import gates, held_out, inference
 from analysis.trace.result import Trace
-from analysis.trace.search.refinement import fit_coefficients, jacobian
+from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -19,7 +19,7 @@ from analysis.trace.data.temperature_nuisance import (
     within_plausible_slope,
 )
 from analysis.trace.judge import held_out
-from analysis.trace.search.refinement import fit_coefficients
+from analysis.trace.search.exact_fit import fit_coefficients
 from rig.model.records import Run
 from rig.model.rig import Rig
 

@@ -20,8 +20,8 @@ from analysis.trace.fitted_model import with_effect_values
 from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
 from analysis.trace.judge.gates import held_out_above_band
 from analysis.trace.result import JudgedEffect
+from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.refinement import ExactFit, fit_coefficients
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from analysis.trace.free_forms import _explains_what_it_alters
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.search.hypothesis import Hypothesis
-from analysis.trace.search.refinement import ExactFit
 
 
 class Tolerant:

@@ -9,13 +9,13 @@ import pytest
 
 from analysis.terms import make
 from analysis.terms.base import Used
+from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     energy_above_noise,
     may_grow,
     negative_body,
 )
-from analysis.trace.search.refinement import ExactFit, fit_coefficients
 from rig.model.rig import Rig
 from tests.analysis.trace.gate_cases import LEAK, searched
 from tests.analysis.trace.hidden import pair_of_runs

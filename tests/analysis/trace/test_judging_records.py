@@ -19,7 +19,7 @@ from analysis.trace.engine import trace
 from analysis.trace.judge import held_out
 from analysis.trace.notes import masked_row_notes
 from analysis.trace.result import Trace
-from analysis.trace.search.refinement import design_matrix, fit_coefficients
+from analysis.trace.search.exact_fit import design_matrix, fit_coefficients
 from analysis.trace.settings import TRACE
 from rig.cli.main import app
 from rig.model.parse import InputError

@@ -14,7 +14,7 @@ from analysis.terms import baseline, make
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.search import refinement
+from analysis.trace.search import exact_fit, refinement
 from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
@@ -40,11 +40,11 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
 ) -> None:
     """Below one the residual falls towards the bound, as it did on a bench moved by a sine."""
 
-    def fit(train_data: Any, terms: Sequence[Used]) -> refinement.ExactFit:
+    def fit(train_data: Any, terms: Sequence[Used]) -> exact_fit.ExactFit:
         gain = terms[-1].shape[0]
         residual = 50.0 * (gain - 1.01) if gain >= 1.0 else 9.0 / (1.6 - gain)
         left = np.array([residual, 0.1])
-        return refinement.ExactFit(tuple(terms), {}, left, np.zeros((0, 0)))
+        return exact_fit.ExactFit(tuple(terms), {}, left, np.zeros((0, 0)))
 
     monkeypatch.setattr(refinement, "fit_coefficients", fit)
     train_data: Any = FewRows(rig)
@@ -62,7 +62,7 @@ def test_what_a_gain_leaves_is_noise_although_the_corrected_forces_are_smaller(r
     found = refinement.refine(train_data, (*terms, used))
     assert found.terms[-1].shape[0] == pytest.approx(1.3, abs=1e-3)
     left = energy_above_noise(train_data, found.residual)["torque_2"]
-    scaled = refinement.fit_coefficients(replace(train_data, relative=True), found.terms)
+    scaled = exact_fit.fit_coefficients(replace(train_data, relative=True), found.terms)
     rows = train_data.row_counts["torque_2"]
     assert left < 0.0  # the noise of the reading was magnified too
     assert energy_above_noise(train_data, scaled.residual)["torque_2"] - left > 0.3 * rows
@@ -95,8 +95,8 @@ def test_the_search_of_a_set_that_leaves_too_much_ends_where_it_leads_nowhere(
         return whole(*arguments, max_nfev=max_nfev, **named)
 
     def refined(
-        edge: float, instead_of: refinement.ExactFit | None = None
-    ) -> tuple[refinement.ExactFit, list[int]]:
+        edge: float, instead_of: exact_fit.ExactFit | None = None
+    ) -> tuple[exact_fit.ExactFit, list[int]]:
         searches.clear()
         band = Used(make("valve_deadband", "joint 2"), (edge, edge, 0.0028))
         fit = refinement.refine(train_data, (*train_data.terms, band), instead_of)
@@ -117,7 +117,7 @@ def test_a_crosstalk_that_leaves_no_row_has_an_energy_all_the_same(rig: Rig) -> 
     records = conditioned_records(rig, [bench.run(rig, bench.Wrong.of(), 0.03, 1)])
     train_data = regression_data(rig, tuple(map(Used, baseline())), records)
     wild = Used(make("sensor_crosstalk", "joint 2 rod"), (3.0,))
-    fit = refinement.fit_coefficients(train_data, (*train_data.terms, wild))
+    fit = exact_fit.fit_coefficients(train_data, (*train_data.terms, wild))
     assert np.isfinite(fit.energy)
 
 
@@ -138,7 +138,7 @@ def test_an_effect_explains_nothing_by_moving_pressures_beyond_the_supplys(rig: 
     records = conditioned_records(rig, [bench.run(rig, bench.Wrong.of(Fc=80), 0.03, 1)])
     train_data = regression_data(rig, tuple(map(Used, baseline())), records)
     outside = Used(make("sensor_offset", "joint 2 cap"), (-8e6,))
-    found = refinement.fit_coefficients(train_data, (*train_data.terms, outside))
+    found = exact_fit.fit_coefficients(train_data, (*train_data.terms, outside))
     (flow,) = [s.where for s in train_data.segments if s.equation == "flow_cap_2"]
     assert np.linalg.norm(found.residual[flow]) > 10 * np.linalg.norm(
         train_data.mean_residual[flow]
@@ -159,8 +159,8 @@ def test_a_few_instants_at_which_an_effect_makes_the_oil_cavitate_count_like_the
         """
         high = float(np.quantile(run.records[0].channels["cap_pressure_2"], share))
         terms = (*train_data.terms, leak, Used(make("sensor_offset", "joint 2 cap"), (high,)))
-        ((kept, outside),) = refinement.design_matrix(train_data, terms).cavitating
-        residual = refinement.fit_coefficients(train_data, terms).residual
+        ((kept, outside),) = exact_fit.design_matrix(train_data, terms).cavitating
+        residual = exact_fit.fit_coefficients(train_data, terms).residual
         return residual[outside], residual[kept], train_data.mean_residual[outside]
 
     few, others, before = fitted(0.003)
@@ -192,7 +192,7 @@ def test_a_detail_at_its_bound_or_one_that_leaves_the_shape_open_is_no_form(rig:
 
     def shaped(*shape: float, before: float = 1e-6) -> bool:
         used = Used(friction, shape)
-        fit = refinement.fit_coefficients(train_data, (*train_data.terms, used))
+        fit = exact_fit.fit_coefficients(train_data, (*train_data.terms, used))
         return refinement._determines_shapes(train_data, fit, used, Used(friction, (before,)))
 
     assert shaped(100e-6, 30.0)
@@ -211,7 +211,7 @@ def test_shapes_are_searched_again_from_those_of_a_larger_set(rig: Rig) -> None:
     both = s.set_of("coulomb_friction", "torque_offset")
     (friction,) = alone.effects
     far = Used(friction.term, tuple(10.0 * value for value in friction.shape))
-    fit = refinement.fit_coefficients(sets.train_data, (*sets.base, far))
+    fit = exact_fit.fit_coefficients(sets.train_data, (*sets.base, far))
     energy = energy_above_noise(sets.train_data, fit.residual)
     poor = sets.fitted[alone.keys] = replace(alone, effects=(far,), fit=fit, excess_energy=energy)
     assert poor.total > 2.0 * alone.total

@@ -14,7 +14,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import with_shape_errors
 from analysis.trace.search import shapes
-from analysis.trace.search.refinement import ExactFit, fit_coefficients
+from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
 from analysis.trace.search.shapes import ShapeFit, fit_shapes, shapes_in
 from analysis.trace.settings import SEARCH
 from rig.model.records import BANDWIDTH, Run

@@ -17,7 +17,7 @@ from analysis.trace.judge.unknown_cause import tied_in_held_out
 from analysis.trace.notes import not_judged_notes, undetermined_notes
 from analysis.trace.remaining import Remainder, tolerance_words
 from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.words import quantity, sentence, tolerated_error_notes
 from rig.model.rig import Rig
 

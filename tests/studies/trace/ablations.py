@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from typing import Any, Final
 
-from analysis.trace import engine, finding, fitted_model
+from analysis.trace import engine, fitted_model
+from analysis.trace.data import trace_rows
 from analysis.trace.judge import held_out
 from analysis.trace.judge.shooting import ShootingResult
 from analysis.trace.result import Trace
@@ -86,11 +87,11 @@ def decisions_only(kept: Kept) -> Iterator[None]:
     """Trace up to the verdict, columns and fits out of what was `kept`."""
     remembered: tuple[tuple[Any, str, Callable[..., Any]], ...] = (
         (
-            finding,
+            trace_rows,
             "conditioned_records",
             lambda _, runs, filtering, *__: (tuple(map(id, runs)), filtering),
         ),
-        (finding, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
+        (trace_rows, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
         (engine, "with_identified_bulk_modulus", lambda runs, *_: tuple(map(id, runs))),
         (fitted_model, "coupled", lambda runs, *_, **k: tuple(map(id, runs))),
         (hypothesis_set, "refine", lambda data, terms, *_: (id(data), terms)),

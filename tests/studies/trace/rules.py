@@ -20,7 +20,7 @@ from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, fitted_model, in_motion, remaining
-from analysis.trace.data import noise_floor, regression_data
+from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import gates, held_out, inference, removal, rivals
 from analysis.trace.search import confounders, hypothesis_set, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -212,7 +212,7 @@ FAULTS: Final = (
     Rule("least floor", "the floor may lie anywhere below the stated noise",
          ((DATA, "least_noise", 0.0),), refits=True),
     Rule("fit records judge", "the records that were fitted are those that judge",
-         ((finding, "regression_data", _same_records()),), True),
+         ((trace_rows, "regression_data", _same_records()),), True),
     Rule("same records pass", "a held-out record may be a training record",
          ((engine, "refuse_repeated_records", lambda *_: None),)),
     Rule("first repeat alone", "the average is the first repeat",
