@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.effects.base import Effect, shapes_of
 from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
@@ -21,6 +22,7 @@ from analysis.trace.search.exact_fit import design_matrix, jacobian
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -34,8 +36,9 @@ def judged_beside_unknown_cause(
     """Return the effects of the set `winner` with the gates that hold beside an unknown cause.
 
     `unexplained` are the equations that keep too much. An effect is refused that removes less than
-    `TRACE.least_removed_beside` of the energy in its own equations, or that the other equations
-    alone do not show. Rivals that held-out records alone do not separate from an effect are tied.
+    `TRACE.least_removed_beside` of the energy in its own equations, that the other equations alone
+    do not show, or whose size may be nothing. Rivals that held-out records alone do not separate
+    from an effect are tied.
     """
     data = hypotheses.train_data
     rows = _rows_outside(data, unexplained)
@@ -65,10 +68,30 @@ def judged_beside_unknown_cause(
     # Of two effects that make up for one bent parameter, each seems needed beside the other.
     together = problem(winner.effects) if len(winner.effects) > 1 else ""
     used = {(u.term.name, u.term.where): u for u in winner.effects}
-    return tuple(
-        _refused(tied_in_held_out(effect), together or problem([used[effect.name, effect.at]]))
-        for effect in effects
-    )
+
+    def refused(effect: JudgedEffect) -> JudgedEffect:
+        own = used[effect.name, effect.at]
+        why = together or problem([own]) or _may_be_nothing(data.rig, own, effect)
+        return _refused(tied_in_held_out(effect), why)
+
+    return tuple(map(refused, effects))
+
+
+def _may_be_nothing(rig: Rig, used: Used, effect: JudgedEffect) -> str:
+    """Return in words that the intervals of all sizes hold no effect ('' if one does not).
+
+    A size is a coefficient, or a shape with a value at which the effect vanishes. What an unknown
+    cause leaves widens the intervals.
+    """
+    assert isinstance(used.term, Effect)
+    sizes = {c.parameter: 0.0 for c in used.term.coefficients(rig)}
+    sizes |= {s.parameter: s.neutral for s in shapes_of(rig, used) if s.neutral is not None}
+    found = {name: effect.parameters[name] for name in sizes if name in effect.parameters}
+    if used.term.free or not found:
+        return ""
+    if not all(e.ci95[0] <= sizes[name] <= e.ci95[1] for name, e in found.items()):
+        return ""
+    return f"{', '.join(found)} may be nothing within the interval beside a cause that is not known"
 
 
 def _refused(effect: JudgedEffect, problem: str) -> JudgedEffect:

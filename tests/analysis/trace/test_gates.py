@@ -13,6 +13,7 @@ import pytest
 
 from analysis.trace import finding
 from analysis.trace.judge import removal
+from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
 from analysis.trace.remaining import remainders
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import SEARCH
@@ -147,3 +148,19 @@ def test_both_parts_of_a_law_are_judged_where_one_does_not_explain(
         assert {e.name for e in judged(found).effects} == set(names)
     monkeypatch.setattr(finding, "_under_other_names", lambda *_: None)
     assert judged(level).verdict == "unexplained"
+
+
+def test_a_size_that_may_be_nothing_is_no_name_beside_an_unknown_cause(benches: Benches) -> None:
+    """What an unknown cause leaves may widen the interval of a leak beyond zero."""
+    runs = benches.runs(c_internal=LEAK)
+    sets = benches.searched(runs, "internal_leakage")
+    winner = sets.set_of("internal_leakage")
+    (leak,) = benches.traced(runs, "internal_leakage").effects
+    ((name, size),) = leak.parameters.items()
+    known = replace(leak, parameters={name: replace(size, ci95=(0.1 * LEAK, 3.0 * LEAK))})
+    open_size = replace(leak, parameters={name: replace(size, ci95=(-LEAK, 3.0 * LEAK))})
+    passed, refused = judged_beside_unknown_cause(sets.hypotheses, winner, (known, open_size), ())
+    assert all(gate.ok for gate in passed.gates)
+    assert [g.detail for g in refused.gates if not g.ok] == [
+        f"{name} may be nothing within the interval beside a cause that is not known"
+    ]
