@@ -14,16 +14,18 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
+from urllib.parse import SplitResult, parse_qsl
 
 import can
 from can.interfaces.slcan import slcanBus
 from can.interfaces.socketcand import SocketCanDaemonBus
+from pydantic import AfterValidator, Field
 
-from drivers.base import DeviceError, DeviceLost
+from drivers.base import DeviceError, DeviceLost, WireSettings
 from drivers.serial_transport import PortInUse, port_in_use
 from drivers.settings import DRIVER
 from rig.model.wire.can_frames import CanFrame
@@ -71,6 +73,26 @@ class BusPlace:
         if interface == SLCAN and "/" in channel:
             channel = f"/{channel.lstrip('/')}"  # a device file; COM3 has no slash
         return cls(text, interface, channel)
+
+
+def _bus(text: str) -> str:
+    """Return the text of a bus; raises ValueError as `BusPlace.of`."""
+    return BusPlace.of(text).text
+
+
+class BusSettings(WireSettings):
+    """The keys of every wire on a CAN bus: the bus, as `BusPlace.of` reads it, and its rate."""
+
+    bus: Annotated[str, AfterValidator(_bus)] = Field(
+        description="INTERFACE/CHANNEL: socketcan/can0, slcan/dev/ttyACM0, "
+        "socketcand/HOST:PORT/can0, pcan/PCAN_USBBUS1, virtual/NAME"
+    )
+    bitrate: int = Field(default=1_000_000, ge=10_000, le=1_000_000, description="[bit/s]")
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return the bus and the keys behind ``?``; ValueError where the bus has another form."""
+        return {"bus": _bus(url.netloc + url.path), **dict(parse_qsl(url.query))}
 
 
 class CanPort:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Final
-from urllib.parse import SplitResult, parse_qs
+from typing import ClassVar, Final
 
 from pydantic import Field, ValidationInfo, field_validator
 
 from drivers.base import WireSettings
 from drivers.can_link import CanLine
-from drivers.can_port import SLCAN, SOCKETCAND, BusPlace, CanPort
+from drivers.can_port import SLCAN, SOCKETCAND, BusPlace, BusSettings, CanPort
 from drivers.message_stream import MessageStreamDriver
 from drivers.settings import DRIVER
 from rig.model.parse import InputError
@@ -26,26 +25,15 @@ from rig.model.wire.can_layout import CanLayout, read_layout
 _SLCAN_DATA_RATES: Final = (2_000_000, 5_000_000)
 
 
-class CanSettings(WireSettings):
+class CanSettings(BusSettings):
     """The bus: python-can's interface and channel, its rates, and its messages."""
 
     example: ClassVar = "can://socketcan/can0?bitrate=1000000"
 
-    bus: str = Field(
-        description="INTERFACE/CHANNEL: socketcan/can0, slcan/dev/ttyACM0, "
-        "socketcand/HOST:PORT/can0, pcan/PCAN_USBBUS1, virtual/NAME"
-    )
-    bitrate: int = Field(default=1_000_000, ge=10_000, le=1_000_000, description="[bit/s]")
     data_bitrate: int | None = Field(
         default=None, ge=10_000, le=12_000_000, description="of CAN FD's data phase [bit/s]"
     )
     dbc: str | None = Field(default=None, description="a DBC file; default: made for the rig")
-
-    @field_validator("bus")
-    @classmethod
-    def _is_a_place(cls, value: str) -> str:
-        BusPlace.of(value)
-        return value
 
     @field_validator("data_bitrate")
     @classmethod
@@ -56,14 +44,6 @@ class CanSettings(WireSettings):
         if value is not None and interface == SLCAN and value not in _SLCAN_DATA_RATES:
             raise ValueError("slcan has 2000000 and 5000000 bit/s")
         return value
-
-    @classmethod
-    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Return bus, rates and DBC file; raises ValueError where the bus has another form."""
-        bus = url.netloc + url.path
-        BusPlace.of(bus)
-        query = {key: values[-1] for key, values in parse_qs(url.query).items()}
-        return {"bus": bus, **query}
 
 
 class CanStreamDriver(MessageStreamDriver):

@@ -12,14 +12,13 @@ import io
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Final
-from urllib.parse import SplitResult, parse_qs
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from drivers.base import (
     Array,
@@ -30,7 +29,7 @@ from drivers.base import (
     OutputLaw,
     WireSettings,
 )
-from drivers.can_port import BusPlace, CanPort
+from drivers.can_port import BusPlace, BusSettings, CanPort
 from drivers.polled import PolledDriver
 from drivers.settings import DRIVER
 from rig.model import channels as ch
@@ -49,29 +48,14 @@ _COMMON: Final = frozenset({ch.SUPPLY, ch.TEMPERATURE})
 _PRE_OPERATIONAL: Final = 0x80  # NMT command
 
 
-class ValveBusSettings(WireSettings):
+class ValveBusSettings(BusSettings):
     """The bus, the valves' node numbers by joint, and their EDS file."""
 
     example: ClassVar = "canopen-408://socketcan/can0?bitrate=500000"
 
-    bus: str = Field(description="INTERFACE/CHANNEL, as of wire can")
-    bitrate: int = Field(default=1_000_000, ge=10_000, le=1_000_000, description="[bit/s]")
     nodes: tuple[int, ...] | None = Field(default=None, description="default: 1, 2 ...")
     host: int = Field(default=127, ge=1, le=127, description="the node number of this program")
     eds: str | None = Field(default=None, description="an EDS file; default: the shipped valve's")
-
-    @field_validator("bus")
-    @classmethod
-    def _is_a_place(cls, value: str) -> str:
-        BusPlace.of(value)
-        return value
-
-    @classmethod
-    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Return bus and rate; raises ValueError where the bus has another form."""
-        bus = url.netloc + url.path
-        BusPlace.of(bus)
-        return {"bus": bus, **{key: values[-1] for key, values in parse_qs(url.query).items()}}
 
 
 class CanOpenValves:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final
-from urllib.parse import SplitResult, parse_qs
+from urllib.parse import SplitResult, parse_qsl
 
 from pydantic import Field
 
@@ -40,8 +40,7 @@ class RtuSettings(WireSettings):
         """Return device and speed; raises ValueError where the device is missing."""
         if not url.path:
             raise ValueError("no device")
-        query = {key: values[-1] for key, values in parse_qs(url.query).items()}
-        return {"device": url.path, **query}
+        return {"device": url.path, **dict(parse_qsl(url.query))}
 
 
 class RtuConnection(ModbusConnection):

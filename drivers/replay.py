@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
-from urllib.parse import SplitResult, parse_qs
+from urllib.parse import SplitResult, parse_qsl
 
 import h5py
 import numpy as np
@@ -61,8 +61,7 @@ class ReplaySettings(WireSettings):
         """Return the path and the options behind ``?``; raises ValueError without a path."""
         if not url.path:
             raise ValueError("no run")
-        query = {key: values[-1] for key, values in parse_qs(url.query).items()}
-        return {"run": f"{url.netloc}{url.path}", **query}
+        return {"run": f"{url.netloc}{url.path}", **dict(parse_qsl(url.query))}
 
 
 class ReplayDriver:

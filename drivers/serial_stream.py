@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
-from urllib.parse import SplitResult, parse_qs
+from urllib.parse import SplitResult, parse_qsl
 
 from pydantic import Field
 
@@ -33,8 +33,7 @@ class SerialSettings(WireSettings):
         device = url.netloc + url.path  # serial://COM3 has no path
         if not device:
             raise ValueError("no device")
-        query = {key: values[-1] for key, values in parse_qs(url.query).items()}
-        return {"device": device, **query}
+        return {"device": device, **dict(parse_qsl(url.query))}
 
 
 class SerialStreamDriver(MessageStreamDriver):
