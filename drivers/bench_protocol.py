@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost
-from drivers.law_checks import possible_wave
+from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost, possible_wave
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
 from rig.model.wire.codes import encode_output

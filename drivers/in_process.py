@@ -31,8 +31,9 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
     WireSettings,
+    possible_laws,
+    possible_wave,
 )
-from drivers.law_checks import possible_laws, possible_wave
 from rig.model import channels as ch
 from rig.model.parts import Wire
 from rig.model.rig import Rig

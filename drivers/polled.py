@@ -34,8 +34,9 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
     WireSettings,
+    possible_laws,
+    possible_wave,
 )
-from drivers.law_checks import possible_laws, possible_wave
 from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.parse import InputError

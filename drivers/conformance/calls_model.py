@@ -8,9 +8,8 @@ from dataclasses import replace
 from typing import Final
 
 from drivers.base import Array, DeviceError, OutputLaw, SampleBlock
-from drivers.conformance.law import Playing, require_law
 from drivers.conformance.subject import HEALTHY, Subject
-from drivers.conformance.trial import SETTLING, Trial
+from drivers.conformance.trial import SETTLING, Playing, Trial, require_law
 from drivers.conformance.watched import Watched, follows, require, rows_of
 
 _PENDING: Final = -1  # a waveform's first tick is that of the next stream

@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 from drivers.base import DeviceError, SampleBlock
 from drivers.conformance.catalogue import FAULTS, PROBE, check
-from drivers.conformance.law import Playing, require_law
 from drivers.conformance.subject import HEALTHY
-from drivers.conformance.trial import Trial
+from drivers.conformance.trial import Playing, Trial, require_law
 from drivers.conformance.watched import Watched, follows
 
 

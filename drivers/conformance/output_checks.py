@@ -8,8 +8,7 @@ import numpy as np
 
 from drivers.base import OutputLaw
 from drivers.conformance.catalogue import PROBE, SATURATION, TWO_JOINTS, check
-from drivers.conformance.law import require_law, steps
-from drivers.conformance.trial import Trial
+from drivers.conformance.trial import Trial, require_law, steps
 from drivers.conformance.watched import require
 
 _BLOCKS = 12
