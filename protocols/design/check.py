@@ -1,5 +1,7 @@
 """Proves a plan against the rig's limits on a twin, before anything moves.
 
+For a step that is refused it finds a smaller amplitude with which it would pass.
+
 The twin simulates commands; it is an argument, so that protocols and analysis stay independent.
 Further twins, with parameters within their intervals, widen each predicted range (`widened`), and
 limits are judged at the ends of these ranges. Centring is idealised: the bias is adjusted on the
@@ -109,29 +111,23 @@ def _timeline(plan: Plan) -> tuple[Moment, ...]:
 
 def check_step(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> StepCheck:
     """Predict one step; raises InputError where the twin, or one of its draws, cannot follow it."""
-    centring = _centred(step, rig, twin)
-    central = judge_motion(step, rig, centring.biases, centring.moved)
-    others = []
-    for draw in draws:
-        # The bench centres any machine, from the estimate's biases in one or two trials.
-        other = _centred(step, rig, draw, centring)
-        others.append(judge_motion(step, rig, other.biases, other.moved))
-    return widened(central, others)
+    centring = centred(step, rig, twin)
+    # The bench centres any machine, from the estimate's biases in one or two trials.
+    others = [judge_motion(step, rig, centred(step, rig, draw, centring)) for draw in draws]
+    return widened(judge_motion(step, rig, centring), others)
 
 
-def judge_motion(
-    step: StepPlan, rig: Rig, biases: Mapping[int, float], moved: Mapping[str, Array]
-) -> StepCheck:
-    """Compare a step's motion on the twin (see `centred`) with the rig's limits."""
+def judge_motion(step: StepPlan, rig: Rig, centring: CentredMotion) -> StepCheck:
+    """Compare a step's motion on the twin with the rig's limits."""
     lines: list[MotionPrediction] = []
     for part in step.excite:
-        lines += _joint_lines(part, rig, biases[part.joint], moved)
-    lines.append(_flow_line(step, rig, moved))
-    return StepCheck(step.name, tuple(lines), {j + 1: v for j, v in biases.items()})
+        lines += _joint_lines(part, rig, centring.biases[part.joint], centring.moved)
+    lines.append(_flow_line(step, rig, centring.moved))
+    return StepCheck(step.name, tuple(lines), {j + 1: v for j, v in centring.biases.items()})
 
 
 @dataclass(frozen=True)
-class _Centred:
+class CentredMotion:
     """Biases [V] that keep the pistons centred, and the simulation with `tried` from `start`.
 
     `moved` is the last period's motion; `start` (joints,) are the pistons [m] at its beginning.
@@ -144,18 +140,12 @@ class _Centred:
 
 
 def centred(
-    step: StepPlan, rig: Rig, twin: Twin
-) -> tuple[dict[int, float], Mapping[str, Array]]:  # fmt: skip
-    """Find biases that keep the pistons centred; return them and the last period's motion.
+    step: StepPlan, rig: Rig, twin: Twin, near: CentredMotion | None = None
+) -> CentredMotion:
+    """Find biases that keep the pistons centred, starting with those of `near` if given.
 
     Raises InputError where the twin cannot follow, NotCentred where another amplitude may help.
     """
-    centring = _centred(step, rig, twin)
-    return centring.biases, centring.moved
-
-
-def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None) -> _Centred:
-    """Find biases as `centred` does, starting with those of `near` if given."""
     rate, joints = rig.sample_rate, len(rig.joints)
     locked = {part.joint: part.piston for part in step.locks}
     biases = {part.joint: 0.0 for part in step.excite}
@@ -176,7 +166,7 @@ def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None)
             steady &= _improve(part, step, rate, commands, moved, biases, start)
         if steady and samples == whole:
             last = {name: values[-step.period :] for name, values in moved.items()}
-            return _Centred(biases, tried, began, last)
+            return CentredMotion(biases, tried, began, last)
     which = ", ".join(str(part.joint + 1) for part in step.excite)
     raise NotCentred(
         f"{step.located}: on the twin joint {which} cannot be centred: after {DESIGN.bias_tries} "
@@ -283,3 +273,32 @@ def _flow_line(step: StepPlan, rig: Rig, moved: Mapping[str, Array]) -> MotionPr
     return MotionPrediction(
         "pump flow", None, 0.0, peak, 0.0, rig.supply.flow, "m^3/s", binding=False
     )
+
+
+PERCENT = 100  # factors are tried in hundredths, so that the factor written is the one tried
+
+
+def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> float | None:
+    """Return the largest factor found by which a step's amplitudes keep every limit; None if none.
+
+    Found by bisection in hundredths below 1; the factor was proved on the twin and its `draws`.
+    """
+    passes, fails = 0, PERCENT
+    while fails - passes > 1:
+        trial = (passes + fails) // 2
+        try:
+            kept = check_step(_resized(step, trial / PERCENT), rig, twin, draws).ok
+        except InputError:
+            kept = False
+        if kept:
+            passes = trial
+        else:
+            fails = trial
+    return passes / PERCENT if passes else None
+
+
+def _resized(step: StepPlan, factor: float) -> StepPlan:
+    """Return a step with every waveform multiplied."""
+    waves = (replace(part.wave, samples=factor * part.wave.samples) for part in step.excite)
+    excite = (replace(part, wave=wave) for part, wave in zip(step.excite, waves, strict=True))
+    return replace(step, excite=tuple(excite))

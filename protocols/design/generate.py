@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from protocols.design.candidates import candidates, described
 from protocols.design.check import Twin, centred
-from protocols.design.proof import Proof, Reason, Triangles, Verdicts
-from protocols.design.selection import Judge, SizedStep, complete, extended, smallest
+from protocols.design.proof import Proof, Reason, Triangles, Verdicts, complete
+from protocols.design.selection import Judge, SizedStep, extended, smallest
 from protocols.design.settings import DESIGN
 from protocols.design.sizing import sized
 from protocols.engine.centring import Array
@@ -84,7 +84,7 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
     reasons: list[Reason] = []
     before = judge([])
     for step, planned in zip(plan.protocol.excitations, plan.steps, strict=True):
-        _, moved = centred(planned, rig, predictor.twin)
+        moved = centred(planned, rig, predictor.twin).moved
         rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
         done.append(SizedStep(step, rows))
         after = judge([proof.rows for proof in done])

@@ -53,6 +53,11 @@ Verdicts = Mapping[str, Verdict]
 Triangles = Mapping[str, Array]  # family -> triangle of a step's rows
 
 
+def complete(verdicts: Verdicts) -> bool:
+    """Return whether every parameter of every family is determined."""
+    return all(verdict.complete for verdict in verdicts.values())
+
+
 @dataclass(frozen=True)
 class Reason:
     """Why a step is in the set: its contribution in words, and the verdicts once it is added."""
@@ -79,7 +84,7 @@ class Proof:
     @property
     def complete(self) -> bool:
         """Whether every parameter of every family is determined."""
-        return all(verdict.complete for verdict in self.verdicts.values())
+        return complete(self.verdicts)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data for JSON."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocols.design.proof import Triangles, Verdicts
+from protocols.design.proof import Triangles, Verdicts, complete
 from protocols.design.settings import DESIGN
 from protocols.engine.centring import Array
 from protocols.steps.excite import Step
@@ -65,11 +65,6 @@ def extended(
                 break
         chosen.append(best)
     return chosen
-
-
-def complete(verdicts: Verdicts) -> bool:
-    """Return whether every parameter of every family is determined."""
-    return all(verdict.complete for verdict in verdicts.values())
 
 
 def worst(verdicts: Verdicts) -> float:

@@ -34,12 +34,12 @@ def motion_within(
     try:
         alone = Protocol(name="candidate", joints=len(rig.joints), steps=(step,))
         planned = resolve(alone, rig).steps[0]
-        biases, moved = centred(planned, rig, twin)
+        centring = centred(planned, rig, twin)
     except InputError as error:
         log.debug("%s", error)
         return None
-    lines = judge_motion(planned, rig, biases, moved).predictions
-    return moved if all(_kept(line, spare) for line in lines) else None
+    lines = judge_motion(planned, rig, centring).predictions
+    return centring.moved if all(_kept(line, spare) for line in lines) else None
 
 
 def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[str, Array]] | None:

@@ -134,7 +134,7 @@ def _checked(
 
 
 def _passing_scale(step: StepPlan, parameters: TwinParameters) -> float | None:
-    from protocols.design.remedy import passing_scale
+    from protocols.design.check import passing_scale
 
     return passing_scale(step, parameters.rig, parameters.twin, parameters.draws)
 
