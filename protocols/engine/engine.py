@@ -8,11 +8,11 @@ raised again after the outputs were zeroed and the state was noted.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 from drivers.base import DeviceError, DeviceLost
-from protocols.engine.plan_runner import PlanRunner
+from protocols.engine.plan_runner import OnPhase, PlanRunner
 from protocols.engine.run_inputs import RunInputs
 from protocols.engine.session import BenchSession
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded
@@ -23,9 +23,6 @@ from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed, SafetyTrip
 
 log = logging.getLogger(__name__)
-
-# step, phase, repeat (0 outside of records), repeats, message
-OnPhase = Callable[[str, str, int, int, str], None]
 
 
 def run(

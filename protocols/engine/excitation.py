@@ -55,6 +55,7 @@ class ExcitationRun:
         self._engine = engine
         self._first = first
         self._more = dict(attributes or {})
+        self._hold = Hold(step.name, step.settle, step.record / session.rate)
         self.locks: list[JointLock] = []
 
     def report_phase(self, phase: str, message: str, repeat: int = 0) -> None:
@@ -79,7 +80,7 @@ class ExcitationRun:
         while not good and not self._engine.interrupted:
             if self.session.now - began >= most * self.session.rate:
                 break
-            excitation.keep_on(ENGINE.look_seconds)
+            excitation.go_on(ENGINE.look_seconds)
             good = done()
         self._stop(excitation)
         return good
@@ -129,11 +130,10 @@ class ExcitationRun:
 
     def _lock(self) -> list[JointLock]:
         """Lock the joints: end stops first, because the push disturbs closed joints."""
-        hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
         locks = []
         for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
             self.report_phase("lock", f"joint {part.joint + 1} {_lock_text(part)}")
-            locks.append(lock(self.session, part, self.place, hold))
+            locks.append(lock(self.session, part, self.place, self._hold))
             self._engine.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
         return locks
 
@@ -229,19 +229,15 @@ class ExcitationRun:
             )
             plan = next(part for part in self.step.locks if part.joint == held.joint)
             excitation.hold()
-            self.session.bench.guard(self._roles_without(held.joint))
-            hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
-            self.locks[n] = lock(self.session, plan, self.place, hold)
+            roles = self._roles()
+            roles[held.joint] = FREE
+            self.session.bench.guard(roles)
+            self.locks[n] = lock(self.session, plan, self.place, self._hold)
             changed = True
         if changed:
             excitation.resume(self.locks)
             self.session.bench.guard(self._roles())
         return changed
-
-    def _roles_without(self, joint: int) -> list[JointRole]:
-        roles = self._roles()
-        roles[joint] = FREE
-        return roles
 
 
 def _lock_text(part: LockPlan) -> str:

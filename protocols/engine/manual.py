@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -32,16 +32,12 @@ log = logging.getLogger(__name__)
 KIND: Final = "manual"  # of the session, as screens see it
 
 
-class ManualBench(BenchSession, Protocol):
-    """The interface of `rig.bench.session.Bench` for manual operation."""
-
-
 class Manual:
     """One manual session: the moving joint, the locked joints, and the end of the jog."""
 
     def __init__(
         self,
-        bench: ManualBench,
+        bench: BenchSession,
         rig: Rig,
         clock: Callable[[], float] = time.monotonic,
         *,

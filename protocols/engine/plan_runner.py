@@ -27,7 +27,7 @@ from rig.runs.recorder import RecordMeta
 
 log = logging.getLogger(__name__)
 
-
+# step, phase, repeat (0 outside of records), repeats, message
 OnPhase = Callable[[str, str, int, int, str], None]
 
 

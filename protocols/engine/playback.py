@@ -63,10 +63,10 @@ class Playback:
         self.start = self.session.apply(silent, restart=True)
         self._checked = self.session.now
         self._grow(firm)
-        self._go_on(FIRM_SECONDS)
+        self.go_on(FIRM_SECONDS)
         self._find_biases(round(FIRM_SECONDS * self.session.rate))
         self._play(loop=firm)
-        self._go_on(0.5 * FIRM_SECONDS)
+        self.go_on(0.5 * FIRM_SECONDS)
         self._loosen(firm)
         passed = self.session.now - self.start
         self.at = self.start + math.ceil(passed / self.step.period) * self.step.period
@@ -120,7 +120,7 @@ class Playback:
             return
         laws = {d.joint: self._law(d, 1.0, 0.0) for d in self.joints}
         while before and self.session.now < self.at + period:
-            self._go_on(ENGINE.ramp_step)
+            self.go_on(ENGINE.ramp_step)
             for j, off in list(before.items()):
                 now = self._off_path(j, paths[j])
                 if abs(now) <= allowed[j] or now * off < 0.0:
@@ -188,7 +188,7 @@ class Playback:
         """Let the waveforms grow to full size."""
         sizes = max(1, round(self.step.ramp / ENGINE.ramp_step))
         for size in range(1, sizes + 1):
-            self._go_on(ENGINE.ramp_step)
+            self.go_on(ENGINE.ramp_step)
             self._play(size / sizes, loop)
 
     def _loosen(self, firm: float) -> None:
@@ -198,16 +198,12 @@ class Playback:
         while loop * ENGINE.looser > loose:
             loop *= ENGINE.looser
             self._play(loop=loop)
-            self._go_on(0.5 / (slowest * loop))
+            self.go_on(0.5 / (slowest * loop))
 
     def _loose(self) -> float:
         return min(d.centring.position_gain for d in self.joints)
 
-    def keep_on(self, seconds: float) -> None:
-        """Continue under the slow loop, without records, checking the locks."""
-        self._go_on(seconds)
-
-    def _go_on(self, seconds: float) -> None:
+    def go_on(self, seconds: float) -> None:
         """Continue for a time, to any tick, checking the locks."""
         self.session.wait(seconds, self._watch_locks)
 

@@ -1,7 +1,8 @@
 """The protocol file: frozen models that hold data in SI and reject inconsistent data.
 
 Steps and signals are separate classes (`protocols.steps`, `protocols.signals`). What depends on the
-rig (joints that exist, limits, sample rate) is checked by `protocols.files.plan`.
+rig (joints that exist, limits, sample rate) is checked by `protocols.files.plan`. The JSON schema
+of a file is made from the same models.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from rig.model.quantity import Time
 
 VERSION: Final = 2
 INCOMPLETE: Final = "incomplete"  # validation context: steps are missing, already rejected
+DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+_REFERENCE: Final = {"type": "string", "pattern": r"^\$[a-z][a-z0-9_]*$"}
+_PLAIN: Final = ("integer", "number", "boolean")
 
 
 class OnTrip(ProtocolPart):
@@ -139,3 +143,25 @@ def every_step(steps: Sequence[StepKind]) -> Iterator[StepKind]:
 def _named_joints(step: StepKind) -> set[int]:
     parts = (*getattr(step, "lock", ()), *getattr(step, "excite", ()), *getattr(step, "move", ()))
     return {part.joint for part in parts}
+
+
+def protocol_schema() -> dict[str, Any]:
+    """Return the schema; its `$id` ends in the version of the language.
+
+    Numbers may also be references to parameters, which are texts in the file.
+    """
+    schema: dict[str, Any] = _with_references(Protocol.model_json_schema())
+    schema["properties"]["version"] = {"type": "integer", "minimum": 1, "maximum": VERSION}
+    return {"$schema": DIALECT, "$id": f"urn:bramah:protocol:{VERSION}", **schema}
+
+
+def _with_references(node: Any) -> Any:
+    if isinstance(node, list):
+        return [_with_references(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    if node.get("type") in _PLAIN and "const" not in node:
+        about = {k: node[k] for k in ("title", "description", "default") if k in node}
+        rest = {k: v for k, v in node.items() if k not in about}
+        return {**about, "anyOf": [rest, _REFERENCE]}
+    return {key: _with_references(value) for key, value in node.items()}

@@ -1,7 +1,11 @@
-"""Base of every part of a protocol file: frozen, in SI, unknown keys refused."""
+"""Base of every part of a protocol file, frozen and in SI, and discovery of its plug-ins."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
+from types import ModuleType
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo
@@ -10,7 +14,7 @@ from rig.model.quantity import UnitError, parse_quantity, shown_in_schema
 
 
 class ProtocolPart(BaseModel):
-    """A part of a protocol file."""
+    """A part of a protocol file; unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -24,3 +28,19 @@ def _position_gain(value: Any, info: ValidationInfo) -> Any:
 
 
 PositionGain = Annotated[float, BeforeValidator(_position_gain), shown_in_schema("V/m")]
+
+
+def classes_in(package: ModuleType, base: type) -> tuple[type, ...]:
+    """Return the concrete subclasses of `base` in the modules of `package`, by module name.
+
+    A class is taken from the module that defines it; names that begin with '_' are left out.
+    """
+    classes: list[type] = []
+    for entry in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
+        module = importlib.import_module(f"{package.__name__}.{entry.name}")
+        for name, item in vars(module).items():
+            if not inspect.isclass(item) or name.startswith("_") or item is base:
+                continue
+            if issubclass(item, base) and item.__module__ == module.__name__:
+                classes.append(item)
+    return tuple(classes)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 from pydantic import Field
 
-from protocols.language.discovery import classes_in
+from protocols.language.part import classes_in
 from protocols.language.signal import SignalKind
 
 SIGNALS: tuple[type[SignalKind], ...] = classes_in(sys.modules[__name__], SignalKind)

@@ -6,20 +6,38 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Annotated, Any, Final, Union
 
 from pydantic import Discriminator, Tag
 
-from protocols.language.discovery import classes_in
-from protocols.steps.base import StepKind, by_rank, choose_kind
+from protocols.language.part import classes_in
+from protocols.steps.base import StepKind
 
-_kinds = [k for k in classes_in(sys.modules[__name__], StepKind) if hasattr(k, "key")]
-STEPS: dict[str, type[StepKind]] = {found.key: found for found in sorted(_kinds, key=by_rank)}
+MISSPELT: Final = 0.8  # similarity (difflib) from which an unknown key is a kind's, misspelt
+_kinds: tuple[type[StepKind], ...] = classes_in(sys.modules[__name__], StepKind)
+STEPS: dict[str, type[StepKind]] = {
+    found.key: found
+    for found in sorted(
+        (k for k in _kinds if hasattr(k, "key")), key=lambda kind: (kind.rank, kind.key)
+    )
+}
 
 
 def kind_of_step(data: Any) -> str | None:
-    """Return the key of the kind of a step, or of its data; None if it has none."""
-    return choose_kind(data, STEPS)
+    """Return the key of the kind of a step, or of its data; None if it has none.
+
+    The first kind of `STEPS` counts whose key is in the data. With a misspelt key of a kind it has
+    none: the step's other keys would be read as those of another kind.
+    """
+    if isinstance(data, StepKind):
+        return data.key
+    if not isinstance(data, dict):
+        return None
+    known = {name for kind in STEPS.values() for name in kind.model_fields}
+    if any(get_close_matches(str(key), STEPS, 1, MISSPELT) for key in data if key not in known):
+        return None
+    return next((key for key in STEPS if key in data), None)
 
 
 def _tag_of_step(data: Any) -> str | None:

@@ -7,21 +7,18 @@ file names it. The registry, the JSON schema, `check` and the engine then know i
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
-from typing import Annotated, Any, ClassVar, Final, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 from pydantic import Field, PrivateAttr
 
 from protocols.language.conditions import Condition
 from protocols.language.part import ProtocolPart
-from protocols.steps.parts import Place
-from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
+from protocols.steps.plans import LockPlan, StepPlan
 from rig.model.parts import MAX_NAME
 from rig.model.rig import Rig
 
-MISSPELT: Final = 0.8  # similarity (difflib) from which an unknown key is a kind's, misspelt
 StepName = Annotated[str, Field(pattern=r"^[a-z0-9]+(?:_[a-z0-9]+)*$", max_length=MAX_NAME)]
 
 
@@ -178,29 +175,3 @@ class Macro(StepKind):
     def run(self, planned: PlannedStep, actions: Actions) -> None:
         """Raise an error: macros are never planned."""
         raise TypeError(f"{self.key} is replaced when a protocol file is read")
-
-
-def by_rank(kind: type[StepKind]) -> tuple[int, str]:
-    """Return the sort key of the order in which kinds are recognised."""
-    return kind.rank, kind.key
-
-
-def choose_kind(data: Any, kinds: Mapping[str, type[StepKind]]) -> str | None:
-    """Return the key of the first kind whose key is in a step's data; None for no kind.
-
-    A misspelt key of a kind is none: the step's other keys would be read as those of another kind.
-    """
-    if isinstance(data, StepKind):
-        return data.key
-    if not isinstance(data, dict):
-        return None
-    known = {name for kind in kinds.values() for name in kind.model_fields}
-    if any(get_close_matches(str(key), kinds, 1, MISSPELT) for key in data if key not in known):
-        return None
-    return next((key for key in kinds if key in data), None)
-
-
-__all__ = [
-    "Actions", "Condition", "ExcitePlan", "LockPlan", "Macro", "Place", "PlannedStep", "Planner",
-    "Question", "StepKind", "StepPlan", "by_rank", "choose_kind",
-]  # fmt: skip

@@ -14,8 +14,7 @@ from analysis.identify.result import Identification
 from analysis.simulation.validate import validate
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.scenario.file import Scenario
-from protocols.design.generate import generate
-from protocols.design.validation_steps import validation
+from protocols.design.generate import generate, validation
 from protocols.files import library
 from protocols.files.plan import resolve
 from protocols.files.schema import Protocol

@@ -10,8 +10,7 @@ import pytest
 from analysis.simulation.twin import simulate_commands
 from protocols.design.candidates import candidates
 from protocols.design.check import check
-from protocols.design.generate import GeneratedProtocol, generate, prove
-from protocols.design.validation_steps import validation
+from protocols.design.generate import GeneratedProtocol, generate, prove, validation
 from protocols.files import library
 from protocols.files.plan import resolve
 from protocols.files.schema import Protocol

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from protocols.files.json_schema import protocol_schema
 from protocols.files.library import load, parsed_values, read_protocol, shipped_names
 from protocols.files.plan import piston_gain, resolve
-from protocols.files.schema import VERSION, Protocol
+from protocols.files.schema import VERSION, Protocol, protocol_schema
 from protocols.language.conditions import parse_condition
 from protocols.language.waveforms import start_centred
 from protocols.signals import SIGNALS

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protocols.design.generate import Predictor, generate, prove
+from protocols.design.generate import Predictor, generate, prove, validation
 from protocols.design.proof import Proof
-from protocols.design.validation_steps import validation
 from protocols.files import library
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text

@@ -20,7 +20,7 @@ def schema(
 
     Example: bramah schema --out protocol.schema.json
     """
-    from protocols.files.json_schema import protocol_schema
+    from protocols.files.schema import protocol_schema
     from rig.cli.text.output import write_json
 
     write_json(Path("-") if out is None else out, protocol_schema())

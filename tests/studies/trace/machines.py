@@ -135,8 +135,7 @@ def protocols_of(rig: Rig) -> tuple[Protocol, Protocol]:
 
     Raises InputError where nothing can be planned for it.
     """
-    from protocols.design.generate import generate
-    from protocols.design.validation_steps import validation
+    from protocols.design.generate import generate, validation
     from rig.cli.proof.step_planning import predictor
 
     tools = predictor()
