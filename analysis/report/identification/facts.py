@@ -81,25 +81,6 @@ def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
     )
 
 
-@dataclass(frozen=True)
-class ParameterRow:
-    """One line of the parameter table, every field as text."""
-
-    name: str
-    meaning: str
-    value: str
-    half: str
-    unit: str
-    interval: str
-    rsd: str
-    nominal: str
-    truth: str
-    error: str
-    covered: str
-    paper: str
-    note: str
-
-
 def records_of(runs: Sequence[Run]) -> list[Record]:
     """Return all records of the runs in their order."""
     return [record for run in runs for record in run.records]
@@ -226,8 +207,8 @@ def covers(estimate: Estimate, truth: float) -> bool:
 
 def parameter_rows(
     rig: Rig, identification: Identification, truth: Mapping[str, float] | None
-) -> list[ParameterRow]:
-    """Return the parameter table; fields without a number hold a dash."""
+) -> list[dict[str, str]]:
+    """Return the parameter table; cells without a number hold a dash."""
     return [
         _parameter_row(rig, name, estimate, truth or {})
         for name, estimate in identification.estimates.items()
@@ -236,7 +217,7 @@ def parameter_rows(
 
 def _parameter_row(
     rig: Rig, name: str, estimate: Estimate, truth: Mapping[str, float]
-) -> ParameterRow:
+) -> dict[str, str]:
     unit = fm.display_unit(estimate.unit)
     value = unit.scale * estimate.value
     low, high = (unit.scale * end for end in estimate.ci95)
@@ -247,19 +228,21 @@ def _parameter_row(
     shown = estimate.identified
     error = 100 * (estimate.value / true - 1) if true and shown else None
     has_interval = shown and math.isfinite(low)
-    return ParameterRow(
-        name,
-        fm.meaning(name, len(rig.joints)),
-        fm.fixed(value, places) if shown else fm.DASH,
-        f"± {fm.half_width(0.5 * (high - low), places)}" if has_interval else "",
-        unit.text,
-        f"{fm.fixed(low, places)} … {fm.fixed(high, places)}" if has_interval else fm.DASH,
-        fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
-        fm.significant(rig.nominal.get(name), digits, unit.scale),
-        fm.significant(true, digits, unit.scale),
-        fm.column_percent(error, signed=True),
-        ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH,
-        fm.significant(mean, digits, unit.scale),
-        "" if shown and not estimate.note else f"not identifiable: {estimate.note or 'no value'}"
-        if not shown else estimate.note,
-    )  # fmt: skip
+    held = ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH
+    return {
+        "name": name,
+        "meaning": fm.meaning(name, len(rig.joints)),
+        "value": fm.fixed(value, places) if shown else fm.DASH,
+        "half": f"± {fm.half_width(0.5 * (high - low), places)}" if has_interval else "",
+        "unit": unit.text,
+        "interval": f"{fm.fixed(low, places)} … {fm.fixed(high, places)}"
+        if has_interval
+        else fm.DASH,
+        "rsd": fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
+        "nominal": fm.significant(rig.nominal.get(name), digits, unit.scale),
+        "truth": fm.significant(true, digits, unit.scale),
+        "error": fm.column_percent(error, signed=True),
+        "covered": held,
+        "paper": fm.significant(mean, digits, unit.scale),
+        "note": estimate.note if shown else f"not identifiable: {estimate.note or 'no value'}",
+    }

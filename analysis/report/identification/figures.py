@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -72,12 +73,9 @@ def arm(rig: Rig) -> ReportFigure | None:
     )  # fmt: skip
 
 
-def _excitation(rig: Rig) -> Callable[[Rig, Record, int, str], Markup]:
-    return record_plots.electric_excitation if rig.electric else record_plots.excitation
-
-
 def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
     """Return one figure per step and excited joint, of the step's first repeat."""
+    drawn = record_plots.electric_excitation if rig.electric else record_plots.excitation
     wanted = [
         (step, joint) for step in steps(rig, runs) for joint in step.excited
         if ch.channel(rig.drive_kind, joint) in step.records[0].channels
@@ -85,7 +83,7 @@ def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
     return Gallery(
         tuple(
             ReportFigure(
-                _excitation(rig)(rig, step.records[0], joint, f"exc{n}"),
+                drawn(rig, step.records[0], joint, f"exc{n}"),
                 f"{step.name}, joint {joint}",
                 f"record {step.records[0].name}",
             )
@@ -156,48 +154,31 @@ def paired(
     return [(v, by_name.get(v.record)) for v in validation]
 
 
-@dataclass(frozen=True)
-class ResidualRow:
-    """One line of the residual table, in N m or mL/s."""
-
-    step: str
-    joint: int
-    equation: str
-    unit: str
-    side: str
-    rms: str
-    share: str
-    repeatable: str
-    scatter: str
-    rows: str
-    masked: str
-
-
-def residual_rows(residuals: Sequence[Residual]) -> list[ResidualRow]:
-    """Return the residual table as text."""
+def residual_rows(residuals: Sequence[Residual]) -> list[dict[str, Any]]:
+    """Return the residual table as text, in N m or mL/s."""
     out = []
     for residual in residuals:
         unit = fm.display_unit(residual.unit)
         share = 100 * residual.rms / residual.rms_side if residual.rms_side else float("nan")
         scatter = residual.scatter if residual.repeats > 1 else float("nan")
         repeatable = residual.repeatable if residual.repeats > 1 else float("nan")
+        masked = 100 * residual.masked / (residual.rows + residual.masked) if residual.masked else 0
         out.append(
-            ResidualRow(
-                residual.step, residual.joint, equation_text(residual), unit.text,
-                fm.significant(unit.scale * residual.rms_side),
-                fm.significant(unit.scale * residual.rms),
-                fm.percent(share), fm.significant(unit.scale * repeatable),
-                fm.significant(unit.scale * scatter), str(residual.rows),
-                _masked_share(residual),
-            )
-        )  # fmt: skip
+            {
+                "step": residual.step,
+                "joint": residual.joint,
+                "equation": equation_text(residual),
+                "unit": unit.text,
+                "side": fm.significant(residual.rms_side, scale=unit.scale),
+                "rms": fm.significant(residual.rms, scale=unit.scale),
+                "share": fm.percent(share),
+                "repeatable": fm.significant(repeatable, scale=unit.scale),
+                "scatter": fm.significant(scatter, scale=unit.scale),
+                "rows": residual.rows,
+                "masked": fm.percent(masked),
+            }
+        )
     return out
-
-
-def _masked_share(residual: Residual) -> str:
-    if not residual.masked:
-        return "0"
-    return fm.percent(100 * residual.masked / (residual.rows + residual.masked))
 
 
 def largest_share(residuals: Sequence[Residual]) -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.report import format as fm
 from analysis.report.format import constant as _n
@@ -14,6 +15,8 @@ from rig.model import channels as ch
 from rig.model.parts import Joint
 from rig.model.records import Record, Run
 from rig.model.rig import ElectricRig, Rig
+
+Array = NDArray[np.float64]
 
 LOCKS = {
     "closed": "valve closed",
@@ -127,32 +130,12 @@ def steps(rig: Rig, runs: Sequence[Run]) -> list[StepSummary]:
     ]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class StepRow:
-    """One line of the protocol table, as text."""
-
-    run: str
-    name: str
-    locked: str
-    excited: str
-    repeats: str
-    seconds: str
-    period: str
-    spool: str
-    travel: str
-    yielding: str
-    lost: str
-    late: str
-    jitter: str
-    saturated: str
-
-
-def step_rows(rig: Rig, runs: Sequence[Run]) -> list[StepRow]:
+def step_rows(rig: Rig, runs: Sequence[Run]) -> list[dict[str, str]]:
     """Return the protocol table; a dash stands for values missing in the records."""
     return [_step_row(runs, step) for step in steps(rig, runs)]
 
 
-def _step_row(runs: Sequence[Run], step: StepSummary) -> StepRow:
+def _step_row(runs: Sequence[Run], step: StepSummary) -> dict[str, str]:
     first = step.records[0]
     attributes = [record.attributes for record in step.records]
     travels = (_largest(attributes, f"lock_give_m_{i}") for i in step.locked)
@@ -165,22 +148,23 @@ def _step_row(runs: Sequence[Run], step: StepSummary) -> StepRow:
         if lines:
             period += f", {fm.count(len(lines), 'line')} at {_n(min(lines))}"
             period += f" to {_n(max(lines))} Hz" if len(lines) > 1 else " Hz"
-    return StepRow(
-        fm.folder_name(runs[step.run].source) or f"run {step.run + 1}",
-        step.name,
-        "; ".join(_lock(i, first) for i in step.locked) or "none",
-        " and ".join(map(str, step.excited)) or "none",
-        str(len(step.records)),
-        _n(round(float(np.mean([r.samples / r.sample_rate for r in step.records])), 3)),
-        period,
-        _per_joint(step, ch.SPOOL, 1e3, np.std),
-        _per_joint(step, ch.PISTON, 1e3, np.ptp),
-        fm.significant(max(yielding) * 1e6) if yielding else fm.DASH,
-        _total(attributes, "lost_samples"),
-        _total(attributes, "late_blocks"),
-        fm.DASH if jitter is None else fm.significant(jitter * 1e3),
-        _total(attributes, "saturated_samples"),
-    )
+    seconds = float(np.mean([r.samples / r.sample_rate for r in step.records]))
+    return {
+        "run": fm.folder_name(runs[step.run].source) or f"run {step.run + 1}",
+        "name": step.name,
+        "locked": "; ".join(_lock(i, first) for i in step.locked) or "none",
+        "excited": " and ".join(map(str, step.excited)) or "none",
+        "repeats": str(len(step.records)),
+        "seconds": _n(round(seconds, 3)),
+        "period": period,
+        "spool": _per_joint(step, ch.SPOOL, np.std),
+        "travel": _per_joint(step, ch.PISTON, np.ptp),
+        "yielding": fm.significant(max(yielding) * 1e6) if yielding else fm.DASH,
+        "lost": _total(attributes, "lost_samples"),
+        "late": _total(attributes, "late_blocks"),
+        "jitter": fm.DASH if jitter is None else fm.significant(jitter * 1e3),
+        "saturated": _total(attributes, "saturated_samples"),
+    }
 
 
 def _lock(joint: int, record: Record) -> str:
@@ -208,12 +192,13 @@ def _total(attributes: Attributes, key: str) -> str:
     return f"{sum(counts):.0f}" if counts else fm.DASH
 
 
-def _per_joint(step: StepSummary, kind: str, scale: float, figure: object) -> str:
+def _per_joint(step: StepSummary, kind: str, figure: Callable[[Array], float]) -> str:
+    """Return a figure of each excited joint's channel in thousandths, the mean over repeats."""
     out = []
     for joint in step.excited:
         name = ch.channel(kind, joint)
         values = [
-            float(figure(np.asarray(r.channels[name]))) * scale  # type: ignore[operator]
+            float(figure(np.asarray(r.channels[name]))) * 1e3
             for r in step.records if name in r.channels
         ]  # fmt: skip
         out.append(fm.significant(float(np.mean(values))) if values else fm.DASH)

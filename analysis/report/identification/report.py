@@ -39,14 +39,6 @@ class Provenance:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class _RunLine:
-    name: str
-    role: str
-    state: str
-    records: int
-
-
 def render_report(
     *,
     runs: Sequence[Run],
@@ -158,10 +150,15 @@ def _validated(
     }
 
 
-def _run_lines(runs: Sequence[Run], validation_runs: Sequence[Run]) -> list[_RunLine]:
+def _run_lines(runs: Sequence[Run], validation_runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Name the run folders without their paths, because a report may be published."""
     return [
-        _RunLine(fm.folder_name(run.source) or f"run {n}", role, run.state, len(run.records))
+        {
+            "name": fm.folder_name(run.source) or f"run {n}",
+            "role": role,
+            "state": run.state,
+            "records": len(run.records),
+        }
         for role, group in (("identification", runs), ("validation", validation_runs))
         for n, run in enumerate(group, start=1)
     ]

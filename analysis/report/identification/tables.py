@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,25 +40,16 @@ def worst_fit(validation: Sequence[RecordValidation]) -> Worst | None:
     return min(every, key=lambda w: w.fit, default=None)
 
 
-@dataclass(frozen=True)
-class FitRow:
-    """One joint of one validation record: FIT [%], RMSE and windowed RMSE of s, p_cap, p_rod."""
-
-    record: str
-    joint: int
-    fit: tuple[str, ...]
-    rmse: tuple[str, ...]
-    window: tuple[str, ...]
-    remark: str
-
-
 def joints_of(result: RecordValidation) -> list[int]:
     """Return the 1-based joints that a validation compares."""
     return sorted({joint for name in result.fit if (joint := ch.kind_of(name)[1]) is not None})
 
 
-def fit_rows(validation: Sequence[RecordValidation]) -> list[FitRow]:
-    """Return the table of all validation records, RMSE in mm and kPa."""
+def fit_rows(validation: Sequence[RecordValidation]) -> list[dict[str, Any]]:
+    """Return the table of all validation records, one row for each joint of a record.
+
+    FIT [%], RMSE and windowed RMSE [mm, kPa] are those of s, p_cap, p_rod.
+    """
     out = []
     for result in validation:
         for joint in joints_of(result):
@@ -69,42 +61,25 @@ def fit_rows(validation: Sequence[RecordValidation]) -> list[FitRow]:
                     f"{fm.count(result.outside, 'simulated sample')} outside [0, supply]"
                 )
             out.append(
-                FitRow(
-                    result.record, joint,
-                    tuple(fm.fit(result.fit.get(n)) for n in names),
-                    tuple(fm.significant(result.rmse.get(n), scale=s) for n, s in scaled),
-                    tuple(fm.significant(result.window_rmse.get(n), scale=s) for n, s in scaled),
-                    remark,
-                )
-            )  # fmt: skip
+                {
+                    "record": result.record,
+                    "joint": joint,
+                    "fit": [fm.fit(result.fit.get(n)) for n in names],
+                    "rmse": [fm.significant(result.rmse.get(n), scale=s) for n, s in scaled],
+                    "window": [
+                        fm.significant(result.window_rmse.get(n), scale=s) for n, s in scaled
+                    ],
+                    "remark": remark,
+                }
+            )
     return out
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One comparison: own value, the paper's, and a mark between them ('' if there is none)."""
-
-    own: str
-    paper: str
-    mark: str
-
-
-@dataclass(frozen=True)
-class ComparedFit:
-    """One joint of one kind of record against one column of the paper's Table IV."""
-
-    record: str
-    joint: int
-    records: int
-    cells: tuple[Cell, ...]
-    figure: str
 
 
 @dataclass(frozen=True)
 class FitTable:
     """The paper's Table IV: rows, number of cells compared, number above the paper's."""
 
-    rows: tuple[ComparedFit, ...]
+    rows: tuple[dict[str, Any], ...]
     compared: int
     above: int
 
@@ -131,9 +106,15 @@ def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
             mark = "" if printed is None or math.isnan(own) else mark_of(own, printed)
             compared += bool(printed is not None)
             above += mark == ABOVE
-            cells.append(Cell(fm.fit(own), fm.fit(printed), mark))
+            cells.append({"own": fm.fit(own), "paper": fm.fit(printed), "mark": mark})
         rows.append(
-            ComparedFit(column.step, column.joint, len(results), tuple(cells), column.figure)
+            {
+                "record": column.step,
+                "joint": column.joint,
+                "records": len(results),
+                "cells": cells,
+                "figure": column.figure,
+            }
         )
     return FitTable(tuple(rows), compared, above)
 
@@ -143,23 +124,9 @@ def mark_of(own: float, printed: float) -> str:
     return EQUAL if own == printed else ABOVE if own > printed else BELOW
 
 
-@dataclass(frozen=True)
-class ComparedParameter:
-    """One parameter against the paper's Table III, as text."""
-
-    name: str
-    unit: str
-    coupled: str
-    repeats: tuple[str, ...]  # min, mean, max
-    rsd: str
-    rsd_mark: str
-    paper: tuple[str, ...]  # min, mean, max, RSD, PSO, GA, nominal
-    against: str  # our coupled value against the paper's mean [%]
-
-
 def table_iii(
     rig_name: str, identification: Identification, scatter: Mapping[str, Scatter]
-) -> list[ComparedParameter]:
+) -> list[dict[str, Any]]:
     """Compare the parameters with the paper's Table III; empty for another rig."""
     if rig_name != paper.RIG:
         return []
@@ -174,15 +141,17 @@ def table_iii(
         deviation = 100 * (estimate.value / printed.mean - 1)
         mark = mark_of(own.rsd, printed.rsd) if own and math.isfinite(own.rsd) else ""
         out.append(
-            ComparedParameter(
-                name, unit.text, fm.significant(estimate.value, 4, unit.scale),
-                tuple(fm.significant(v, 4, unit.scale) for v in spread),
-                fm.column_percent(own.rsd if own else None),
-                mark,
-                _printed(printed, unit.scale, 0 if name == "b" else 2),
-                fm.column_percent(deviation, signed=True),
-            )
-        )  # fmt: skip
+            {
+                "name": name,
+                "unit": unit.text,
+                "coupled": fm.significant(estimate.value, 4, unit.scale),
+                "repeats": [fm.significant(v, 4, unit.scale) for v in spread],  # min, mean, max
+                "rsd": fm.column_percent(own.rsd if own else None),
+                "rsd_mark": mark,
+                "paper": _printed(printed, unit.scale, 0 if name == "b" else 2),
+                "against": fm.column_percent(deviation, signed=True),  # coupled over their mean [%]
+            }
+        )
     return out
 
 
