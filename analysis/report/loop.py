@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from markupsafe import Markup
 
 from analysis.report import format as fm
 from analysis.report.identification.report import Provenance
-from analysis.report.page import page, write
+from analysis.report.page import page
 from analysis.report.plots import trace_plots
 from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, note, style, svg
 from analysis.report.trace import body
@@ -21,14 +20,6 @@ from rig.model.channels import place_in_words
 from rig.model.records import Record, Run
 
 TEMPLATE = "loop.html"
-
-
-def write_loop_report(
-    path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str,
-    provenance: Provenance | None = None,
-) -> None:  # fmt: skip
-    """Write all rounds as one HTML file; raises InputError where it cannot be written."""
-    write(path, render(train, holdout, rounds, stopped, provenance))
 
 
 def render(
@@ -52,6 +43,7 @@ def render(
 def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
     result = r.result
     following = result.next_experiment
+    experiment = None if r.experiment is None else str(r.experiment["text"])
     return {
         "number": r.number,
         "verdict": result.verdict,
@@ -61,19 +53,15 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
         "achieved": fm.significant(r.achieved),
         "baseline_ratio": fm.significant(r.baseline_ratio),
         "left": fm.significant(r.residual),
-        "did": "The protocol as given." if r.experiment is None
-        else f"{_capital(str(r.experiment['text']))}.",
+        "did": "The protocol as given." if experiment is None
+        else f"{experiment[:1].upper()}{experiment[1:]}.",
         "runs": " and ".join(r.runs),
         "sentence": result.sentence,
-        "excitation": None if run is None or r.experiment is None else excited(run, r.number),
+        "excitation": None if run is None or experiment is None else excited(run, r.number),
         # The last round has its own section below.
         "overview": None if last else trace_plots.over_noise(result, f"overnoise{r.number}"),
         "next": None if following is None else following["text"],
     }  # fmt: skip
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _names(effects: Any) -> str:

@@ -10,14 +10,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from markupsafe import Markup
 
 from analysis.report import format as fm
-from analysis.report.page import page, write
+from analysis.report.page import page
 from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, style, svg
 
 TEMPLATE: Final = "night.html"
@@ -69,11 +68,6 @@ class Night:
     items: tuple[NightItem, ...]
     notes: tuple[tuple[datetime, str], ...] = ()
     paused: str = ""
-
-
-def write_night(path: Path, night: Night) -> None:
-    """Write the page as one HTML file; raises InputError where it cannot be written."""
-    write(path, render(night))
 
 
 def render(night: Night) -> str:
@@ -243,7 +237,7 @@ def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> M
         for k, name in enumerate(names, start=1):
             axes = canvas.add_subplot(rows, _COLUMNS, k)
             shown = [item for item in items if name in item.parameters]
-            hours = np.array([_hours(begin, item) for item in shown])
+            hours = [(item.ended - begin).total_seconds() / 3600.0 for item in shown if item.ended]
             values = np.array([item.parameters[name].value for item in shown])
             half = np.array([item.parameters[name].half for item in shown])
             scale = 100.0 / abs(values[0]) if values[0] else 1.0
@@ -260,7 +254,3 @@ def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> M
         canvas.tight_layout()
         key = "drift" + "".join(c for c in rig if c.isalnum())
         return svg(canvas, key, "Every parameter over the night, in percent of its first value")
-
-
-def _hours(begin: datetime, item: NightItem) -> float:
-    return (item.ended - begin).total_seconds() / 3600.0 if item.ended else math.nan

@@ -20,7 +20,7 @@ from analysis.regression.least_squares import least_squares
 from analysis.regression.rows import Rows
 from analysis.regression.solve import RowCluster, solve, triangle
 from analysis.report.settings import REPORT
-from analysis.terms.base import FAMILIES, family_of, inverted
+from analysis.terms.base import family_of, inverted
 
 Array = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ def _solve_repeat(
             clusters.append(
                 RowCluster(member.group, member.record.repeat, triangle(matrix, rhs), len(rhs))
             )
-    if not clusters or family not in FAMILIES:
+    if not clusters:
         return {}
     return dict(zip(names, solve(names, clusters).value, strict=True))
 

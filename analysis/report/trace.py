@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from analysis.effects.base import Effect
 from analysis.report import format as fm
 from analysis.report.identification.report import Provenance
-from analysis.report.page import page, write
+from analysis.report.page import page
 from analysis.report.plots import place_plot, trace_plots
 from analysis.simulation.model import Estimate
 from analysis.trace.clues.frequency import FREQUENCY
@@ -28,13 +27,6 @@ TITLES = {
     "confounded": "Two or more effects fit equally well",
     "unexplained": "An effect that the catalogue does not have",
 }
-
-
-def write_trace_report(
-    path: Path, holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
-) -> None:
-    """Write the report as one HTML file; raises InputError where it cannot be written."""
-    write(path, render(holdout, result, provenance))
 
 
 def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None) -> str:

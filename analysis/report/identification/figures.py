@@ -80,17 +80,15 @@ def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
         (step, joint) for step in steps(rig, runs) for joint in step.excited
         if ch.channel(rig.drive_kind, joint) in step.records[0].channels
     ]  # fmt: skip
-    return Gallery(
-        tuple(
-            ReportFigure(
-                drawn(rig, step.records[0], joint, f"exc{n}"),
-                f"{step.name}, joint {joint}",
-                f"record {step.records[0].name}",
-            )
-            for n, (step, joint) in enumerate(wanted[: REPORT.most_figures])
-        ),
-        max(0, len(wanted) - REPORT.most_figures),
-    )
+    figures = [
+        ReportFigure(
+            drawn(rig, step.records[0], joint, f"exc{n}"),
+            f"{step.name}, joint {joint}",
+            f"record {step.records[0].name}",
+        )
+        for n, (step, joint) in enumerate(wanted[: REPORT.most_figures])
+    ]
+    return Gallery(tuple(figures), len(wanted) - len(figures))
 
 
 EQUATIONS = {
@@ -102,16 +100,14 @@ EQUATIONS = {
 
 def residuals(all_residuals: Sequence[Residual]) -> Gallery:
     """Return one figure per step and equation."""
-    return Gallery(
-        tuple(
-            ReportFigure(
-                record_plots.residual(residual, f"res{n}"),
-                f"{residual.step}, joint {residual.joint}: {equation_text(residual)}",
-            )
-            for n, residual in enumerate(all_residuals[: REPORT.most_figures])
-        ),
-        max(0, len(all_residuals) - REPORT.most_figures),
-    )
+    figures = [
+        ReportFigure(
+            record_plots.residual(residual, f"res{n}"),
+            f"{residual.step}, joint {residual.joint}: {equation_text(residual)}",
+        )
+        for n, residual in enumerate(all_residuals[: REPORT.most_figures])
+    ]
+    return Gallery(tuple(figures), len(all_residuals) - len(figures))
 
 
 def equation_text(residual: Residual) -> str:
@@ -140,7 +136,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
             text += f"; {result.failure}"
         svg = validation_plots.comparison(rig, result, record, joint, f"val{n}")
         figures.append(ReportFigure(svg, f"{result.record}, joint {joint}", text))
-    return Gallery(tuple(figures), max(0, len(wanted) - REPORT.most_figures))
+    return Gallery(tuple(figures), len(wanted) - len(figures))
 
 
 def paired(

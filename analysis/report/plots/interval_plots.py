@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from analysis.report.plots.style import BLUE, GREY, INK, MODEL, PALE, figure, style, svg
 from analysis.report.settings import REPORT
@@ -26,9 +27,7 @@ def against_reference(
         if e.identified and reference.get(name)
     }
     with style():
-        canvas = figure(0.75 + ROW * len(names))
-        axes = canvas.add_axes((0.13, 0.42 / canvas.get_figheight(), 0.84,
-                              1 - 0.62 / canvas.get_figheight()))  # fmt: skip
+        canvas, axes = _canvas(len(names))
         limit = _limit([max(abs(v) for v in row if np.isfinite(v)) for row in rows.values()])
         axes.axvline(0.0, color=INK, linewidth=0.8)
         for y, name in enumerate(names):
@@ -42,6 +41,13 @@ def against_reference(
         axes.set_xlabel(f"deviation from {kind} [%]")
         axes.set_title("estimate and 95 % interval")
         return svg(canvas, "par-ref", f"Deviation of every parameter from its {kind} value")
+
+
+def _canvas(parameters: int) -> tuple[Figure, Any]:
+    """Return a figure with a row for each parameter, and its axes."""
+    height = 0.75 + ROW * parameters
+    canvas = figure(height)
+    return canvas, canvas.add_axes((0.13, 0.42 / height, 0.84, 1 - 0.62 / height))
 
 
 def _limit(extents: list[float]) -> float:
@@ -84,9 +90,7 @@ def interval_widths(estimates: Mapping[str, Estimate]) -> Markup:
     widths = [relative_half_width(e) for e in estimates.values()]
     shown = [w for w in widths if np.isfinite(w) and w > 0]
     with style():
-        canvas = figure(0.75 + ROW * len(names))
-        axes = canvas.add_axes((0.13, 0.42 / canvas.get_figheight(), 0.84,
-                              1 - 0.62 / canvas.get_figheight()))  # fmt: skip
+        canvas, axes = _canvas(len(names))
         low = min(shown, default=0.1) / 2
         axes.set_xscale("log")
         for y, width in enumerate(widths):

@@ -50,7 +50,6 @@ from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.settings import TRACE
 from analysis.trace.words import equation_of_largest_reduction
 from rig.model import channels as ch
-from rig.model.channels import kind_of
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.units import AXES, display_unit, typeset
@@ -135,9 +134,9 @@ def against(
             axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
             colour = BLUE if k else GREY
             axes.plot(x[kept], y[kept], ".", color=colour, ms=2.2, alpha=0.5, mew=0)
-            curve = binned(x, y)
-            axes.plot(curve["x"], curve["mean"], "-", color=MODEL, lw=1.8)
-            axes.plot(curve["x"], curve["mean"], "o", color=MODEL, ms=2.6)
+            means = _binned(x, y)
+            axes.plot(*means, "-", color=MODEL, lw=1.8)
+            axes.plot(*means, "o", color=MODEL, ms=2.6)
             axes.set_ylim(-top, top)
             axes.set_xlabel(label)
             if not k:
@@ -318,17 +317,12 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
         return svg(canvas, key, f"Lines of the residual{_compared(after)}")
 
 
-def binned(x: Array, y: Array) -> dict[str, Array]:
-    """Return mean and quartiles of y in bins of equally many x."""
+def _binned(x: Array, y: Array) -> tuple[Array, Array]:
+    """Return the means of x and of y in bins of equally many x."""
     order = np.argsort(x)
     count = min(REPORT.scatter_means, max(1, len(x) // 5))
     parts = [p for p in np.array_split(order, count) if len(p)]
-    return {
-        "x": np.array([x[p].mean() for p in parts]),
-        "mean": np.array([y[p].mean() for p in parts]),
-        "low": np.array([np.quantile(y[p], 0.25) for p in parts]),
-        "high": np.array([np.quantile(y[p], 0.75) for p in parts]),
-    }
+    return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
 def axis(rig: Rig, name: str) -> tuple[str, float]:
@@ -365,9 +359,3 @@ def equation_of(
     if not own:
         return equation_of_largest_reduction(result)
     return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
-
-
-__all__ = [
-    "ResidualSeries", "abscissae", "against", "axis", "equation_of", "held_out", "in_time",
-    "kind_of", "over_noise", "rival_errors", "spectrum",
-]  # fmt: skip

@@ -15,7 +15,6 @@ from analysis.identify.result import Identification
 from analysis.identify.result import to_json as identification_json
 from analysis.report.identification.report import render_report
 from analysis.report.page import write
-from analysis.report.trace import write_trace_report
 from analysis.simulation.model import save_model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.simulation.validate import to_json as validation_json
@@ -27,7 +26,7 @@ from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
 from rig.cli.simulated.simulated_bench import read_truth, simulated_bench
 from rig.cli.text.output import Countdown, Say, progress, write_json
 from rig.cli.text.render import identification_text, parameter_table, validation_text
-from rig.cli.text.reports import provenance
+from rig.cli.text.reports import provenance, write_trace
 from rig.model.records import Run
 from rig.runs.store import load_run, refuse_occupied
 
@@ -97,7 +96,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
     write_experiment(folder / "report.html", done, command, seed)
-    write_trace_report(folder / "trace.html", held_out, traced, provenance())
+    write_trace(folder / "trace.html", held_out, traced)
     for name in ("report.html", "trace.html"):
         shutil.copyfile(folder / name, out / name)
     print(identification_text(done.identification, done.truth))

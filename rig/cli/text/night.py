@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from analysis.report.night import Night, NightEstimate, NightItem, write_night
+from analysis.report.night import Night, NightEstimate, NightItem, render
+from analysis.report.page import write
 from rig.queue.items import Item
 from rig.queue.store import QueueStore
 from rig.runs.listing.summary import summarise
@@ -78,4 +79,4 @@ def _half(interval: Sequence[float | None] | None) -> float:
 
 def write_page(path: Path, store: QueueStore, since: datetime | None = None) -> None:
     """Write the page of the night; raises InputError if the file cannot be written."""
-    write_night(path, night_of(store, since))
+    write(path, render(night_of(store, since)))

@@ -9,8 +9,11 @@ from datetime import datetime
 from pathlib import Path
 
 from analysis.identify.result import Identification
+from analysis.report import loop, trace
 from analysis.report.identification.report import Provenance, render_report
 from analysis.report.page import write
+from analysis.trace.loop_rounds import Round
+from analysis.trace.result import Trace
 from rig.model.records import Run
 from rig.runs.store import versions
 
@@ -33,3 +36,15 @@ def write_identification(path: Path, runs: Sequence[Run], result: Identification
         provenance=provenance(),
     )
     write(path, text)
+
+
+def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:
+    """Write the report of a trace."""
+    write(path, trace.render(holdout, result, provenance()))
+
+
+def write_loop(
+    path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str
+) -> None:
+    """Write the report of a loop."""
+    write(path, loop.render(train, holdout, rounds, stopped, provenance()))

@@ -109,10 +109,9 @@ def _confirmed(experiment: Mapping[str, Any]) -> bool:
 
 
 def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
-    from analysis.report.loop import write_loop_report
     from analysis.trace.loop_rounds import rounds_json
     from rig.cli.proof.twin_choice import save_identified
-    from rig.cli.text.reports import provenance
+    from rig.cli.text.reports import write_loop
     from rig.cli.text.trace_text import rounds_text
 
     if not experiments.rounds and not experiments.request.out.is_dir():
@@ -126,7 +125,6 @@ def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
     text = rounds_text(experiments.rounds, experiments.stopped)
     with printed_at_end(json, lambda: f"{text}\nreport: {report}"):
         save_identified(last, experiments.request.out / "model.json", progress)
-        write_loop_report(
-            report, experiments.train, experiments.judge, experiments.rounds,
-            experiments.stopped, provenance(),
-        )  # fmt: skip
+        write_loop(
+            report, experiments.train, experiments.judge, experiments.rounds, experiments.stopped
+        )

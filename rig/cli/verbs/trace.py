@@ -87,7 +87,6 @@ def trace(
         if model is not None:
             save_identified(result.model_after, model, progress)
         if report is not None:
-            from analysis.report.trace import write_trace_report
-            from rig.cli.text.reports import provenance
+            from rig.cli.text.reports import write_trace
 
-            write_trace_report(report, unseen, result, provenance())
+            write_trace(report, unseen, result)
