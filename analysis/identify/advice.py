@@ -8,7 +8,7 @@ directions of the records. The step determines a null direction whose product is
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +34,13 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
         noise = solution.noise[:k, :k] if len(solution.noise) else None
         base = determined(solution.names, solution.triangle[:k, :k], noise)
         combined = ", ".join(part.text for part in base.base) or "no combination of them"
-        helps = _help(rig, family, base)
+        helps = ", and: ".join(_help(rig, family, base))
+        wanted = f"Add: {helps}" if helps else "Add a richer excitation: other poses, other speeds"
         out.append(
             Check(
                 f"base parameters {family}", False,
                 f"rank {base.rank} of {k}; of {' '.join(solution.unidentifiable)} these records "
-                f"determine: {combined}. {_joined(helps)}",
+                f"determine: {combined}. {wanted}",
             )
         )  # fmt: skip
     return out
@@ -52,12 +53,6 @@ def _help(rig: Rig, family: str, lacking: Determinacy) -> list[str]:
     if rig.electric or any(name not in known for name in lacking.names):
         return []
     return mechanical_help(rig, lacking) if family == "mechanical" else fluid_help(rig, lacking)
-
-
-def _joined(helps: Sequence[str]) -> str:
-    if not helps:
-        return "Add a richer excitation: other poses, other speeds"
-    return "Add: " + ", and: ".join(helps)
 
 
 def fluid_help(rig: Rig, lacking: Determinacy) -> list[str]:

@@ -262,7 +262,7 @@ def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
     return out
 
 
-def noise_bias(solutions: Mapping[str, Solution], unbiased: bool = False) -> Check:
+def noise_bias(solutions: Mapping[str, Solution], unbiased: bool) -> Check:
     """State the worst relative bias that sensor noise in the columns is predicted to cause.
 
     The prediction is for least squares; `unbiased` says that the estimator used is not affected.

@@ -30,7 +30,7 @@ from analysis.identify.result import PLAIN, Identification, estimates_of, with_e
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.regression.solve import Solution
-from analysis.simulation.model import Estimate, Model
+from analysis.simulation.model import Model
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -113,7 +113,11 @@ def conclude(
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(reduction.masked for reduction in reductions)
     statements = (
-        *_statements(rig, reductions, refinement, estimates, rows),
+        *record_checks(rig, reductions, rows),
+        *ck.identifiability(solutions),
+        *base_statements(rig, solutions),
+        ck.noise_bias(solutions, refinement.estimator in UNBIASED),
+        *consistency(rig, estimates),
         *refinement.checks,
         *known,
     )
@@ -131,22 +135,6 @@ def conclude(
         "coupled", estimates, solutions, rows, masked, seconds, statements, model,
         geometry=geometry,
     )  # fmt: skip
-
-
-def _statements(
-    rig: Rig,
-    reductions: Sequence[RecordReduction],
-    refinement: Refinement,
-    estimates: Mapping[str, Estimate],
-    rows: Mapping[str, int],
-) -> tuple[Check, ...]:
-    return (
-        *record_checks(rig, reductions, rows),
-        *ck.identifiability(refinement.solutions),
-        *base_statements(rig, refinement.solutions),
-        ck.noise_bias(refinement.solutions, refinement.estimator in UNBIASED),
-        *consistency(rig, estimates),
-    )
 
 
 def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:

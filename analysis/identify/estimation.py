@@ -83,9 +83,9 @@ class EstimationJob:
     runs: Sequence[Run]
     terms: Sequence[Used]
     built: Sequence[RecordRows]
-    estimator: str = "ls"
-    bootstrap: int = 0
-    rng: np.random.Generator | None = None
+    estimator: str
+    bootstrap: int
+    rng: np.random.Generator | None
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,11 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     if estimator == OUTPUT_ERROR:
         from analysis.identify.output_error.fit import output_error  # noqa: PLC0415 - compiles
 
-        start = {p.family: _solve(p, "ls") for p in prepared}
-        values = _named(prepared, start)
+        values = {
+            name: float(v)
+            for p in prepared
+            for name, v in zip(p.names, _solve(p, "ls")[0], strict=False)
+        }
         done = output_error(job.rig, job.runs, job.terms, values)
         checks.append(done.check)
         new = {family: done.solution(family, solution) for family, solution in solutions.items()}
@@ -182,7 +185,11 @@ def _bootstrap_ends(
     rng = job.rng or np.random.default_rng(0)
     kind = _FITS[estimator]
     rows = _prior_rows(p, kind(p.blocks), estimator)
-    drawn = bootstrap(p.blocks, _redo(kind, rows, p.parameters), job.bootstrap, rng)
+
+    def estimate(blocks: Sequence[RepeatBlock]) -> Array:
+        return with_prior_rows(kind(blocks), rows).beta[: p.parameters]
+
+    drawn = bootstrap(p.blocks, estimate, job.bootstrap, rng)
     # Towards the estimate by instruments, or with the nuisances that are left out.
     low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
     high = drawn.high[: p.parameters] - np.minimum(shift, 0.0)
@@ -277,13 +284,6 @@ def _prior_rows(p: FamilyBlocks, fit: EquationFit, estimator: str) -> tuple[Prio
     return prior_rows(plain, nu.priors(p.names, plain.beta))
 
 
-def _redo(
-    kind: Callable[[Sequence[RepeatBlock]], EquationFit], rows: Sequence[PriorRow], count: int
-) -> Callable[[Sequence[RepeatBlock]], Array]:
-    """Return the function that estimates (count,) from resampled blocks, with the same priors."""
-    return lambda blocks: with_prior_rows(kind(blocks), rows).beta[:count]
-
-
 def _hausman(p: FamilyBlocks) -> Hausman:
     plain = least_squares(common(p.blocks))
     return hausman(plain, prior_rows(plain, nu.priors(p.names, plain.beta)))
@@ -291,16 +291,6 @@ def _hausman(p: FamilyBlocks) -> Hausman:
 
 def _first(s: CovarianceParts, k: int) -> CovarianceParts:
     return CovarianceParts(s.covariance[:k, :k], s.dof[:k], s.systematic[:k])
-
-
-def _named(
-    prepared: Sequence[FamilyBlocks], fits: Mapping[str, tuple[Array, CovarianceParts, EquationFit]]
-) -> dict[str, float]:
-    return {
-        name: float(v)
-        for p in prepared
-        for name, v in zip(p.names, fits[p.family][0], strict=False)
-    }
 
 
 def merged(

@@ -52,7 +52,8 @@ def identify(
     that cannot be used, naming record and channel.
     """
     refuse_malformed(runs)
-    _refuse_method(method)
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
     _refuse_estimator(estimator, bootstrap)
     rig, runs = ck.common_rig(runs), with_loads_stated(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
@@ -78,11 +79,6 @@ def _with_exact_geometry(rig: Rig, result: Identification) -> Identification:
     failed = [c.name for c in checks if not c.ok]
     model = replace(result.model, provenance={**result.model.provenance, "checks_failed": failed})
     return replace(result, checks=checks, model=model)
-
-
-def _refuse_method(method: str) -> None:
-    if method not in METHODS:
-        raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
 
 
 def _refuse_estimator(estimator: str, bootstrap: int) -> None:

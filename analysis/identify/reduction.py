@@ -119,11 +119,6 @@ def bands_task(task: StepTask) -> tuple[float, ...]:
     return tuple(map(float, motion_bands(task.rig, repeats)))
 
 
-def path_of(task: RecordTask | StepTask) -> str:
-    """Return the run folder that a task reads."""
-    return task.path
-
-
 def reduce_rows(
     rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows]
 ) -> list[RecordReduction]:
@@ -159,7 +154,7 @@ def reduce_record(
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering],
     with_noise: bool,
-    stretch: int = REGRESSION.chunk_samples,
+    stretch: int,
     bands: Array | None = None,
 ) -> RecordReduction:
     """Reduce one record, a long one chunk by chunk; raises InputError for an unusable one.

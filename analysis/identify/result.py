@@ -45,9 +45,13 @@ class Identification:
 
 def to_json(result: Identification) -> dict[str, Any]:
     """Return the identification as JSON data; null where a number does not exist."""
+    geometry, model = {}, result.model
+    if result.geometry is not None:
+        shifts = geo.to_json(model.rig, model.terms, result.estimates, result.geometry)
+        geometry = {"geometry": shifts}
     return {
         "method": result.method,
-        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
+        "estimator": str(model.provenance.get("estimator", PLAIN)),
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()
@@ -57,7 +61,7 @@ def to_json(result: Identification) -> dict[str, Any]:
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
         "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
-        **_geometry(result),
+        **geometry,
         **result.extra,
     }
 
@@ -69,14 +73,6 @@ def by_geometry(result: Identification) -> dict[str, float]:
     model = result.model
     S = geo.parameter_shifts(model.rig, model.terms, result.estimates, result.geometry)
     return dict(zip(result.estimates, map(float, np.linalg.norm(S, axis=1)), strict=True))
-
-
-def _geometry(result: Identification) -> dict[str, Any]:
-    """Return the shifts by the rig's tolerances under their key; nothing where there are none."""
-    if result.geometry is None:
-        return {}
-    model = result.model
-    return {"geometry": geo.to_json(model.rig, model.terms, result.estimates, result.geometry)}
 
 
 def estimates_of(

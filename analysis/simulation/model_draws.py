@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
-from analysis.simulation.model import Model, rig_difference
+from analysis.simulation.model import Estimate, Model, rig_difference
 from analysis.simulation.settings import SIMULATION
 from analysis.terms import BASELINE
 from rig.model.parameters import is_positive
@@ -33,8 +33,12 @@ def equivalent_errors(model: Model) -> Array:
 
     With few repeats an interval is wider than two standard errors; the draws follow the interval.
     """
-    half = [max(p.ci95[1] - p.value, p.value - p.ci95[0]) for p in model.parameters.values()]
-    return np.array(half) / SIGMAS
+    return np.array([_wider_half(p) for p in model.parameters.values()]) / SIGMAS
+
+
+def _wider_half(p: Estimate) -> float:
+    """Return the wider half of a parameter's 95 % interval."""
+    return max(p.ci95[1] - p.value, p.value - p.ci95[0])
 
 
 def model_draws(model: Model, count: int, rng: np.random.Generator) -> list[Model]:
@@ -47,9 +51,10 @@ def model_draws(model: Model, count: int, rng: np.random.Generator) -> list[Mode
         return []
     values = np.array([p.value for p in model.parameters.values()])
     std = np.sqrt(np.diag(model.covariance))
+    scale = np.where(values == 0.0, 1.0, np.abs(values))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = model.covariance / np.outer(std, std)
-        relative = errors / np.where(values == 0.0, 1.0, np.abs(values))
+        relative = errors / scale
     correlation[~np.isfinite(correlation)] = 0.0
     np.fill_diagonal(correlation, 1.0)
     variance, directions = np.linalg.eigh(correlation * np.outer(relative, relative))
@@ -58,7 +63,6 @@ def model_draws(model: Model, count: int, rng: np.random.Generator) -> list[Mode
     signs = rng.choice((-1.0, 1.0), size=(count, len(values)))
     exact = min(count, len(values))
     signs[:, :exact] = hadamard(count)[:, :exact] * rng.choice((-1.0, 1.0), size=exact)
-    scale = np.where(values == 0.0, 1.0, np.abs(values))
     return [_moved(model, values + scale * (root @ row)) for row in signs]
 
 
@@ -96,7 +100,7 @@ def _implausible(model: Model, rig: Rig) -> str:
             return f"its {name} is {p.value:.3g} {p.unit}, expected more than 0"
     for name in _baseline_parameters(model, "fluid"):
         p = model.parameters[name]
-        half = max(p.ci95[1] - p.value, p.value - p.ci95[0])
+        half = _wider_half(p)
         if half > SIMULATION.widest_interval * p.value:
             return (
                 f"its {name} is known to +- {100 * half / p.value:.0f} % only, expected "

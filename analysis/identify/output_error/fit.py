@@ -21,8 +21,7 @@ from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces
-from analysis.identify.output_error.window_data import ReducedWindow
-from analysis.identify.output_error.windows import Windows
+from analysis.identify.output_error.windows import ReducedWindow, Windows
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution

@@ -95,7 +95,7 @@ def shoot(
     locked: NDArray[np.bool_],
     window: ShootingWindow,
     every: int,
-    parts: int = 1,
+    parts: int,
 ) -> Array | None:
     """Return the states (P, points, size) from `starts` (P, size) with `pars` (P, parameters).
 

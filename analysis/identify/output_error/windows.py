@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +17,19 @@ from analysis.identify.output_error.shooting import (
     parts_of,
     shoot,
 )
-from analysis.identify.output_error.window_data import (
-    PerturbedModel,
-    PlacedWindow,
-    ReducedWindow,
-    WindowSource,
-)
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import condition_runs
-from analysis.signals.conditioning import Mask
+from analysis.signals.conditioning import Mask, Signals
 from analysis.signals.filters import channel_filter
 from analysis.simulation.model import Model, as_loaded, model_of
-from analysis.simulation.simulate import Effort, compiled, drive_of, hidden_paths, sensor_corrected
+from analysis.simulation.simulate import (
+    Compiled,
+    Effort,
+    compiled,
+    drive_of,
+    hidden_paths,
+    sensor_corrected,
+)
 from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -36,6 +37,61 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlacedWindow:
+    """A window ready to simulate: inputs, measured outputs (points, 3 F), its record and part."""
+
+    record: int
+    stratum: int
+    repeat: int
+    part: int
+    shooting: ShootingWindow
+    measured: Array
+
+
+@dataclass(frozen=True)
+class WindowSource:
+    """One record: signals and inputs of the integrator, oil temperature above nominal [K].
+
+    The signals are corrected for the model's sensor effects.
+    """
+
+    signals: Signals
+    inputs: Array
+    locked: Mask
+    kelvin: float
+
+
+@dataclass(frozen=True)
+class ReducedWindow:
+    """A window after its start was eliminated: score, information, cost and back substitution.
+
+    `rest` is the cost at the best start.
+    """
+
+    score: Array
+    information: Array
+    cost: float
+    rest: float
+    back: Array
+    offset: Array
+    residual: Array
+
+
+@dataclass(frozen=True)
+class PerturbedModel:
+    """One record's model; `pars` (1 + k, parameters) as it is and with each parameter perturbed.
+
+    `sizes` (k,) are the perturbations, `hidden` the terms' hidden states (n, h) along the record
+    for each.
+    """
+
+    ready: Compiled
+    pars: Array
+    sizes: Array
+    hidden: tuple[Array, ...]
 
 
 class Windows:
@@ -118,11 +174,6 @@ class Windows:
     def every(self) -> int:
         """Steps between two points compared."""
         return max(1, round(self.rig.sample_rate / IDENTIFY.point_rate / SAMPLES_PER_STEP))
-
-    @property
-    def parts(self) -> int:
-        """Steps into which two samples are cut."""
-        return parts_of(self.terms, self.rig.sample_rate)
 
     def sigma(self) -> dict[int, Array]:
         """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
@@ -226,7 +277,8 @@ class Windows:
             y0[:, len(start) :] = [perturbed.hidden[k][first] for k in chosen]
         states = shoot(
             ready, np.ascontiguousarray(perturbed.pars[chosen]), y0, source.inputs,
-            source.signals.rate, source.locked, window.shooting, self.every, self.parts,
+            source.signals.rate, source.locked, window.shooting, self.every,
+            parts_of(self.terms, self.rig.sample_rate),
         )  # fmt: skip
         if states is None:
             return None

@@ -13,7 +13,6 @@ from analysis.identify.reduction import (
     RecordTask,
     bands_task,
     first_of_steps,
-    path_of,
     reduce_tasks,
     steps_of,
 )
@@ -64,7 +63,8 @@ def identify_folders(
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
         for repeats in steps_of(rig, folder, head.records)
     ]
-    decisions = workers.map(bands_task, [repeats for _, repeats in steps], reads=path_of)
+    tasks_of_steps = [repeats for _, repeats in steps]
+    decisions = workers.map(bands_task, tasks_of_steps, reads=lambda task: task.path)
     bands = {(n, repeats.step): band for (n, repeats), band in zip(steps, decisions, strict=True)}
     rigs = [rig, *map(rig.with_moved, rig.uncertain_numbers)]
     tasks = [
@@ -85,7 +85,7 @@ def identify_folders(
     ]
     reductions: list[RecordReduction] = []
     groups = _groups(tasks, workers.workers)
-    for group in workers.map(reduce_tasks, groups, reads=lambda part: path_of(part[0])):
+    for group in workers.map(reduce_tasks, groups, reads=lambda part: part[0].path):
         reductions += group
         if progress is not None:
             progress(len(reductions) / len(tasks))
@@ -103,7 +103,7 @@ def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]
     most = max(1, min(RECORDS_TOGETHER, len(tasks) // (4 * workers)))
     groups: list[list[RecordTask]] = []
     for task in tasks:
-        if not groups or len(groups[-1]) == most or path_of(groups[-1][0]) != path_of(task):
+        if not groups or len(groups[-1]) == most or groups[-1][0].path != task.path:
             groups.append([])
         groups[-1].append(task)
     return groups
