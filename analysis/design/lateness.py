@@ -15,7 +15,7 @@ Assumed: e is exponential, independent from sample to sample, and stamped withou
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from analysis.design.settings import DESIGN
 from analysis.design.twin_records import Played, ideal
 from analysis.identify.stacked_rows import build_rows
-from analysis.regression.rows import Filtering, parameters_of
+from analysis.regression.rows import parameters_of
 from analysis.regression.solve import merge, triangle
 from analysis.terms.base import Used, family_of
 from rig.model.records import Record, Run
@@ -32,7 +32,6 @@ from rig.model.rig import Rig
 from rig.model.wire.resample import Resampler
 
 Array = NDArray[np.float64]
-Filters = Callable[[Record], Filtering]
 BULK = "b"
 
 
@@ -90,21 +89,17 @@ def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Recor
 
 
 def lateness_cost(
-    rig: Rig,
-    played: Sequence[Played],
-    terms: Sequence[Used],
-    filtering: Filters,
-    jitter: float,
+    rig: Rig, played: Sequence[Played], terms: Sequence[Used], jitter: float
 ) -> LatenessCost | None:
     """Return the error of b by `jitter` [s] in these steps; None if they do not determine b."""
     rng = np.random.default_rng(DESIGN.seed)
-    even = _bulk(rig, played, terms, filtering, {})
+    even = _bulk(rig, played, terms, {})
     if even is None:
         return None
     shifts, lost = [], []
     for _ in range(DESIGN.late_draws):
         late = {play.step.name: taken_late(play.record, jitter, rng) for play in played}
-        bulk = _bulk(rig, played, terms, filtering, late)
+        bulk = _bulk(rig, played, terms, late)
         if bulk is not None:
             shifts.append(bulk / even - 1.0)
         first = rig.channels[0]
@@ -118,11 +113,7 @@ def lateness_cost(
 
 
 def _bulk(
-    rig: Rig,
-    played: Sequence[Played],
-    terms: Sequence[Used],
-    filtering: Filters,
-    late: Mapping[str, Record],
+    rig: Rig, played: Sequence[Played], terms: Sequence[Used], late: Mapping[str, Record]
 ) -> float | None:
     """Return b [Pa] by least squares over one record a step, weighted by its repeats."""
     exact = ideal(rig)
@@ -132,7 +123,7 @@ def _bulk(
     triangles = []
     for play in played:
         record = late.get(play.step.name, play.record)
-        (built,) = build_rows(exact, [Run(exact, (record,), source="twin")], terms, filtering)
+        (built,) = build_rows(exact, [Run(exact, (record,), source="twin")], terms)
         mine = [r for name, r in built.rows.items() if family_of(name) == "fluid"]
         weight = math.sqrt(max(play.step.repeats, 1))
         X = np.concatenate([r.matrix for r in mine])

@@ -35,15 +35,11 @@ class Bound:
     @property
     def share(self) -> float:
         """The largest deviation from the mean over that to the limit."""
-        return _share(self.signal, self.low, self.high)
-
-
-def _share(signal: Array, low: float, high: float) -> float:
-    mean = float(np.mean(signal))
-    if not low < mean < high:
-        return float("inf")
-    up, down = float(np.max(signal)) - mean, mean - float(np.min(signal))
-    return max(up / (high - mean), down / (mean - low))
+        mean = float(np.mean(self.signal))
+        if not self.low < mean < self.high:
+            return float("inf")
+        up, down = float(np.max(self.signal)) - mean, mean - float(np.min(self.signal))
+        return max(up / (self.high - mean), down / (mean - self.low))
 
 
 def bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> list[Bound]:

@@ -27,17 +27,16 @@ from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.noise import record_moments
-from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
+from analysis.regression.rows import Rows, default_filtering, parameters_of
 from analysis.regression.solve import RowCluster, half_width, solve, triangle
 from analysis.signals.conditioning import condition
 from analysis.simulation.model import finite, nominal_model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, family_of, inverted
-from rig.model.records import Record, Run
+from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-Filters = Callable[[Record], Filtering]
 
 
 @dataclass(frozen=True)
@@ -110,11 +109,11 @@ def predict(
     played, parts = [], []
     for number, step in enumerate(steps, start=1):
         played.append(play(rig, step))
-        parts.append(information(rig, played[-1], used, default_filtering, moments=True))
+        parts.append(information(rig, played[-1], used, moments=True))
         if progress is not None:
             progress(number / len(steps))
     predicted = combine(rig, used, parts)
-    cost = None if jitter is None else lateness_cost(rig, played, used, default_filtering, jitter)
+    cost = None if jitter is None else lateness_cost(rig, played, used, jitter)
     if cost is None:
         return predicted
     bulk = predicted.parameters[BULK]
@@ -128,26 +127,16 @@ def coefficients(rig: Rig, terms: Sequence[Used]) -> dict[str, float]:
 
 
 def information(
-    rig: Rig,
-    played: Played,
-    terms: Sequence[Used],
-    filtering: Filters = default_filtering,
-    *,
-    moments: bool = False,
+    rig: Rig, played: Played, terms: Sequence[Used], *, moments: bool = False
 ) -> StepInformation:
     """Return the information of one record of a simulated step; `moments` adds noise moments."""
     exact, record = ideal(rig), played.record
-    # A real end stop yields a little, by an amount that no rig file states. Where it is visible,
-    # the analysis includes that piston's noise in the rows; so does the prediction.
-    moving = np.ones(len(rig.joints), dtype=bool)
-    filters = filtering(record)
+    filters = default_filtering(record)
     signals = condition(exact, record, filters.channels, np.full(len(rig.joints), np.inf))
     run = Run(exact, (record,), source="twin")
-    (built,) = build_rows(exact, [run], terms, filtering)
+    (built,) = build_rows(exact, [run], terms)
     rows = built.rows
-    scores = score_covariance(
-        exact, terms, signals, moving, filters, rows, coefficients(rig, terms)
-    )
+    scores = score_covariance(exact, terms, signals, filters, rows, coefficients(rig, terms))
     share = {}
     if moments:
         share = record_moments(

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
 from analysis.regression.noise import sensor_variance
-from analysis.regression.rows import Filtering, Rows, right_sides
-from analysis.signals.conditioning import Mask, Signals
+from analysis.regression.rows import Filtering, Rows, prepared, right_sides
+from analysis.signals.conditioning import Signals
 from analysis.signals.convolution import same_convolved
 from analysis.signals.filters import FirSmoother
 from analysis.terms.base import Used, family_of
@@ -48,16 +48,19 @@ class Input:
     joint: int | None
 
 
-def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:
-    """Return the inputs of the rows; a joint that does not move is held and adds no noise."""
+def inputs_of(rig: Rig) -> tuple[Input, ...]:
+    """Return the inputs of the rows, the pistons of all joints among them.
+
+    A real end stop yields a little, by an amount that no rig file states. Where it is visible, the
+    analysis includes that piston's noise in the rows; so does the prediction.
+    """
     inputs = []
     for i in range(len(rig.joints)):
 
         def name(kind: str, joint: int = i + 1) -> str:
             return ch.channel(kind, joint)
 
-        if moving[i]:
-            inputs += [Input(name(ch.PISTON), k, f, i) for k, f in enumerate(("s", "sd", "sdd"))]
+        inputs += [Input(name(ch.PISTON), k, f, i) for k, f in enumerate(("s", "sd", "sdd"))]
         inputs.append(Input(name(ch.SPOOL), 0, "u", i))
         for kind, fields in ((ch.CAP, ("p_cap", "pd_cap")), (ch.ROD, ("p_rod", "pd_rod"))):
             inputs += [Input(name(kind), k, f, i) for k, f in enumerate(fields)]
@@ -98,8 +101,7 @@ def residuals(
     rig: Rig, terms: Sequence[Used], signals: Signals, beta: Mapping[str, float]
 ) -> dict[str, Array]:
     """Return y - X beta (n,) of every equation, before the rows' filter."""
-    for used in terms:
-        signals = used.term.prepare(rig, signals, used.shape)
+    signals = prepared(rig, terms, signals)
     out = right_sides(rig, signals)
     for used in terms:
         for name, columns in used.term.columns(rig, signals, used.shape).items():
@@ -112,7 +114,6 @@ def score_covariance(
     rig: Rig,
     terms: Sequence[Used],
     signals: Signals,
-    moving: Mask,
     filtering: Filtering,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
@@ -129,7 +130,7 @@ def score_covariance(
     back = {name: _backwards(r, filtering, n, signals.rate) for name, r in rows.items()}
     out = {family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()}
     by_channel: dict[str, list[Input]] = {}
-    for derivative in inputs_of(rig, moving):
+    for derivative in inputs_of(rig):
         by_channel.setdefault(derivative.channel, []).append(derivative)
     for channel, parts in by_channel.items():
         variance = sensor_variance(rig.sensors.of(ch.kind_of(channel)[0]))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
+from analysis.regression.identifiability import twin_channels
 from analysis.simulation.twin import simulate_commands
-from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Record
 from rig.model.rig import Rig
@@ -170,18 +170,7 @@ def _trimmed(
 
 
 def _record(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> Record:
-    channels: dict[str, Array] = {}
-    kinds = {
-        ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure",
-        ch.COMMAND: "command",
-    }  # fmt: skip
-    for name in rig.recorded:
-        kind, joint = ch.kind_of(name)
-        if joint is not None:
-            channels[name] = motion[kinds[kind]][:, joint - 1]
-        else:
-            level = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
-            channels[name] = np.full(step.samples, level)
+    channels = twin_channels(rig, rig.recorded, motion)
     return Record(
         f"{step.name}_r1", step.name, step.locked, 1, rig.sample_rate, channels,
         period=step.period, lines=step.lines,

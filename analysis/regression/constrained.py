@@ -87,13 +87,15 @@ def _least(x: Array, F: Array) -> float:
     return float(np.linalg.eigvalsh(np.tensordot(x, F, axes=1))[0])
 
 
-def _inside(x: Array, G: Array, F: Array) -> bool:
-    return bool((G @ x > 0).all()) and (not F.shape[1] or _least(x, F) > 0)
+def _inside(x: Array, G: Array, F: Array, shift: Array | float = 0.0) -> bool:
+    return bool((G @ x + shift > 0).all()) and (not F.shape[1] or _least(x, F) > 0)
 
 
-def _barrier(x: Array, G: Array, F: Array) -> tuple[float, Array, Array]:
-    """Return - sum log(Gx) - log det F(x), its gradient and Hessian; x inside."""
-    c = G @ x
+def _barrier(
+    x: Array, G: Array, F: Array, shift: Array | float = 0.0
+) -> tuple[float, Array, Array]:
+    """Return - sum log(Gx + shift) - log det F(x), its gradient and Hessian; x inside."""
+    c = G @ x + shift
     value, gradient = -float(np.log(c).sum()), -G.T @ (1.0 / c)
     hessian = (G / c[:, None] ** 2).T @ G
     if F.shape[1]:
@@ -122,7 +124,7 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
     target, t = np.zeros(len(z)), 1.0
     for _ in range(400):
         shifted = np.append(np.zeros(len(G)), size)
-        gradient, hessian = _shifted(z, wide, shifted, wider)
+        _, gradient, hessian = _barrier(z, wide, wider, shifted)
         target[:] = 0.0
         target[-1] = t / size
         # Staying near the unconstrained solution keeps the search bounded.
@@ -130,26 +132,13 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
         ridge = 1e-3 * np.diag(np.append(np.ones(len(x)), 0.0)) / size**2
         step = -np.linalg.solve(hessian + ridge, gradient + target + pull)
         length = 1.0
-        while length > 1e-12 and not _held(z + length * step, wide, shifted, wider):
+        while length > 1e-12 and not _inside(z + length * step, wide, wider, shifted):
             length *= 0.5
         z = z + 0.9 * length * step
         if z[-1] < 0 and _inside(z[:-1], G, F):
             return np.asarray(z[:-1])
         t *= 1.2
     raise InputError("the constraints leave no parameter set strictly inside them")
-
-
-def _held(z: Array, G: Array, shift: Array, F: Array) -> bool:
-    return bool((G @ z + shift > 0).all()) and (not F.shape[1] or _least(z, F) > 0)
-
-
-def _shifted(z: Array, G: Array, shift: Array, F: Array) -> tuple[Array, Array]:
-    """Return gradient and Hessian of - sum log(Gz + shift) - log det F(z)."""
-    c = G @ z + shift
-    gradient = -G.T @ (1.0 / c)
-    hessian = (G / c[:, None] ** 2).T @ G
-    more = _barrier(z, np.zeros((0, len(z))), F)
-    return gradient + more[1], hessian + more[2]
 
 
 def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:

@@ -27,7 +27,23 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 Triangles = Mapping[str, Array]  # family -> triangle (k, k) of its rows
 
-_KEYS = {ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure"}
+_KEYS = {
+    ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure",
+    ch.COMMAND: "command",
+}  # fmt: skip
+
+
+def twin_channels(rig: Rig, names: Sequence[str], moved: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the channels `names`, each (n,), of a motion on the twin, supply and oil steady."""
+    channels: dict[str, Array] = {}
+    for name in names:
+        kind, joint = ch.kind_of(name)
+        if joint is not None:
+            channels[name] = moved[_KEYS[kind]][:, joint - 1]
+        else:
+            steady = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
+            channels[name] = np.full(len(moved["piston"]), steady)
+    return channels
 
 
 def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) -> dict[str, Array]:
@@ -38,15 +54,7 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
     """
     used = tuple(Used(term) for term in baseline_of(rig))
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
-    n = len(moved["piston"])
-    channels: dict[str, Array] = {}
-    for name in rig.channels:
-        kind, joint = ch.kind_of(name)
-        if joint is not None:
-            channels[name] = moved[_KEYS[kind]][:, joint - 1]
-        else:
-            steady = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
-            channels[name] = np.full(n, steady)
+    channels = twin_channels(rig, rig.channels, moved)
     record = Record("twin", "twin", tuple(locked), 1, rig.sample_rate, channels)
     filters = Filtering(channel_filter(rig.sample_rate), None, REGRESSION.sample_step)
     bands = np.array([0.0 if i + 1 in locked else np.inf for i in range(len(rig.joints))])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from analysis.effects.base import shapes_of
-from analysis.terms import make
+from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
 from rig.model.parse import InputError, first_problem
 from rig.model.rig import Rig
@@ -71,8 +71,12 @@ class Model:
         return {name: p.value for name, p in self.parameters.items()}
 
 
-def nominal_model(rig: Rig, terms: Sequence[Used]) -> Model:
-    """Return the model of the rig's nominal values; raises InputError where one is missing."""
+def nominal_model(rig: Rig, terms: Sequence[Used] | None = None) -> Model:
+    """Return the model of the rig's nominal values; raises InputError where one is missing.
+
+    Its terms are the rig's baseline by default.
+    """
+    terms = tuple(map(Used, baseline_of(rig))) if terms is None else terms
     for used in terms:
         for c in used.term.parameters(rig):
             if c.parameter not in rig.nominal:

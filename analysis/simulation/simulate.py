@@ -113,6 +113,17 @@ class Simulation:
         return out
 
 
+def constant_supply(
+    rig: Rig, rate: float, spool: Array, locked: NDArray[np.bool_], q: Array
+) -> DrivingInput:
+    """Return the drive by spools (n, N) [V] at nominal supply and oil, locked joints at q (N,)."""
+    n, still = len(spool), np.zeros(spool.shape)
+    return DrivingInput(
+        rate, spool, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), locked,
+        np.tile(q, (n, 1)), still, still,
+    )  # fmt: skip
+
+
 def drive_of(signals: Signals) -> DrivingInput:
     """Return the drive of a record: its measured spool, supply, and locked joints' motion."""
     return DrivingInput(

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from analysis.simulation.model import Model, nominal_model
 from analysis.simulation.settings import SIMULATION
-from analysis.simulation.simulate import DrivingInput, Simulation, simulate
+from analysis.simulation.simulate import DrivingInput, Simulation, constant_supply, simulate
 from analysis.simulation.twin import holding_state
-from analysis.terms import baseline_of
-from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -78,7 +76,7 @@ def synthetic_run(
 
     rate = rig.sample_rate
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
-    model = nominal_model(rig, tuple(Used(term) for term in baseline_of(rig)))
+    model = nominal_model(rig)
     lead, n = round(SIMULATION.lead * rate), round(seconds * rate)
     records = []
     for step, locked in lock_steps(len(rig.joints)):
@@ -118,17 +116,13 @@ def _centred(
     )
     state = holding_state(rig, model, place)
     held = np.array([i in locked for i in range(N)])
-    still = np.zeros((n, N))
     free = np.flatnonzero(~held)
     t = np.arange(n) / rate
     bias, slope_of_bias = np.zeros(N), np.full(N, np.nan)
     before: tuple[Array, Array] | None = None
     for attempt in range(SIMULATION.trim_rounds + 1):
         u = np.where(held, 0.0, spool[:, None] + bias)
-        drive = DrivingInput(
-            rate, u, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), held,
-            np.tile(state.q, (n, 1)), still, still,
-        )  # fmt: skip
+        drive = constant_supply(rig, rate, u, held, state.q)
         result = simulate(model, drive, state)
         drift = np.array([np.polyfit(t, result.piston[:, i], 1)[0] for i in range(N)])
         if attempt == SIMULATION.trim_rounds:

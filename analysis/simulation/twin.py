@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from analysis.simulation.model import Model, nominal_model
-from analysis.simulation.simulate import DrivingInput, State, simulate
-from analysis.terms import baseline_of
-from analysis.terms.base import Used
+from analysis.simulation.simulate import State, constant_supply, simulate
 from rig.model.parse import InputError
 from rig.model.parts import Valve
 from rig.model.rig import Rig
@@ -102,20 +100,14 @@ def simulate_commands(
         raise InputError(f"commands of shape {commands.shape} do not fit a rig of {N} joints")
     held = np.array([i in locked for i in range(N)])
     place = np.array([locked.get(i, float(start[i])) for i in range(N)])
-    if model is None:
-        model = nominal_model(rig, tuple(Used(term) for term in baseline_of(rig)))
+    model = nominal_model(rig) if model is None else model
     state = holding_state(rig, model, place)
     n, rate = len(commands), rig.sample_rate
     spool = np.column_stack(
         [spool_response(j.valve, commands[:, i], rate) for i, j in enumerate(rig.joints)]
     )
     spool[:, held] = 0.0
-    still = np.zeros((n, N))
-    drive = DrivingInput(
-        rate, spool, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), held,
-        np.tile(state.q, (n, 1)), still, still,
-    )  # fmt: skip
-    result = simulate(model, drive, state)
+    result = simulate(model, constant_supply(rig, rate, spool, held, state.q), state)
     if result.failure:
         log.info("the twin stopped: %s", result.failure)
     return {

@@ -12,7 +12,6 @@ from analysis.design.lateness import late_times, lateness_cost, taken_late
 from analysis.design.predict import predict
 from analysis.design.twin_records import TwinStep, play
 from analysis.identify.identify import identify
-from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import parse_model
@@ -71,7 +70,7 @@ def test_the_cost_is_that_of_identifying_a_finer_twin_at_those_times() -> None:
     rig, fine = rig_at(RATE), rig_at(FINER * RATE)
     played = [play(rig, step) for step in at_rate(RATE)]
     used = [Used(term) for term in baseline()]
-    cost = lateness_cost(rig, played, used, default_filtering, JITTER)
+    cost = lateness_cost(rig, played, used, JITTER)
     assert cost is not None
 
     rng = np.random.default_rng(77)

@@ -48,6 +48,16 @@ class RepeatBlock:
         """The (run, step) that the repeat belongs to."""
         return self.run, self.step
 
+    @property
+    def shared(self) -> tuple[int, str, str]:
+        """Run, step and equation, which the repeats of a step have in common."""
+        return self.run, self.step, self.equation
+
+    @property
+    def ticks(self) -> Array:
+        """The rows' times (m,) [s] without rounding errors, equal in repeats."""
+        return np.round(self.time, 9)
+
 
 @dataclass(frozen=True)
 class FamilyBlocks:
@@ -188,9 +198,9 @@ def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
     shared = shared_ticks(blocks)
     out = []
     for b in blocks:
-        ticks = shared[*b.stratum, b.equation]
+        ticks = shared[b.shared]
         same = len(ticks) == len(b.time)  # nearly always
-        out.append(b if same else rows_of(b, np.isin(_ticks(b), ticks)))
+        out.append(b if same else rows_of(b, np.isin(b.ticks, ticks)))
     return out
 
 
@@ -198,15 +208,19 @@ def shared_ticks(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], Ar
     """Return, by (run, step, equation), the times [s] of rows that every repeat has."""
     shared: dict[tuple[int, str, str], Array] = {}
     for b in blocks:
-        key, ticks = (*b.stratum, b.equation), _ticks(b)
-        before = shared.setdefault(key, ticks)
+        ticks = b.ticks
+        before = shared.setdefault(b.shared, ticks)
         if not np.array_equal(before, ticks):
-            shared[key] = np.intersect1d(before, ticks)
+            shared[b.shared] = np.intersect1d(before, ticks)
     return shared
 
 
-def _ticks(b: RepeatBlock) -> Array:
-    return np.round(b.time, 9)
+def alike(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], list[int]]:
+    """Return the places of the blocks by run, step and equation: those of all repeats."""
+    places: dict[tuple[int, str, str], list[int]] = {}
+    for k, b in enumerate(blocks):
+        places.setdefault(b.shared, []).append(k)
+    return places
 
 
 def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
@@ -226,13 +240,10 @@ def levelled(
     bins of equally many rows. The mean over the repeats is sorted, so that noise does not affect
     the order. A law that is wrong at some states has its residual in few of the bins.
     """
-    alike: dict[tuple[int, str, str], list[int]] = {}
-    for k, b in enumerate(blocks):
-        alike.setdefault((*b.stratum, b.equation), []).append(k)
     out = list(blocks)
-    for number, (_, mine) in enumerate(sorted(alike.items())):
+    for number, (_, mine) in enumerate(sorted(alike(blocks).items())):
         own = [blocks[k] for k in mine]
-        ticks = np.round(np.concatenate([b.time for b in own]), 9)
+        ticks = np.concatenate([b.ticks for b in own])
         state = np.concatenate([_state(b, records[b.run, b.record]) for b in own])
         times, place = np.unique(ticks, return_inverse=True)
         mean = np.bincount(place, state) / np.bincount(place)
@@ -275,7 +286,6 @@ def over_repeats(blocks: Sequence[RepeatBlock], arrays: Sequence[Array]) -> list
     total: dict[tuple[int, str, str], Array] = {}
     count: dict[tuple[int, str, str], int] = {}
     for b, array in zip(blocks, arrays, strict=True):
-        key = (*b.stratum, b.equation)
-        total[key] = total[key] + array if key in total else array.copy()
-        count[key] = count.get(key, 0) + 1
-    return [(total[*b.stratum, b.equation], count[*b.stratum, b.equation]) for b in blocks]
+        total[b.shared] = total[b.shared] + array if b.shared in total else array.copy()
+        count[b.shared] = count.get(b.shared, 0) + 1
+    return [(total[b.shared], count[b.shared]) for b in blocks]

@@ -54,7 +54,7 @@ def steps_without_instruments(blocks: Sequence[RepeatBlock]) -> set[str]:
 
     A repeat that was cut short may have no rows outside the filters' edges.
     """
-    repeats = Counter((*b.stratum, b.equation) for b in blocks)
+    repeats = Counter(b.shared for b in blocks)
     shared = shared_ticks(blocks)
     return {key[1] for key, n in repeats.items() if n < 2 or not len(shared[key])}
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.estimators.equations import EquationFit, RepeatBlock, least_squares
+from analysis.identify.estimators.equations import EquationFit, RepeatBlock, alike, least_squares
 from analysis.identify.settings import IDENTIFY
 
 Array = NDArray[np.float64]
@@ -59,29 +59,24 @@ def _tukey(r: Array) -> Array:
 def _scales(
     blocks: Sequence[RepeatBlock], residuals: Sequence[Array], weights: Sequence[Array]
 ) -> list[float]:
-    deviations: dict[tuple[int, str, str], list[Array]] = {}
-    for b, e, w in zip(blocks, residuals, weights, strict=True):
-        deviations.setdefault((*b.stratum, b.equation), []).append(np.abs(e[w > 0.5]))
-    scale = {
-        k: max(IDENTIFY.mad_to_std * float(np.median(np.concatenate(v))), 1e-300)
-        for k, v in deviations.items()
-    }
-    return [scale[*b.stratum, b.equation] for b in blocks]
+    scale = {}
+    for key, places in alike(blocks).items():
+        deviations = [np.abs(residuals[k][weights[k] > 0.5]) for k in places]
+        median = float(np.median(np.concatenate(deviations)))
+        scale[key] = max(IDENTIFY.mad_to_std * median, 1e-300)
+    return [scale[b.shared] for b in blocks]
 
 
 def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
     """Return weights (m,) of rows by their distance from the repeats' median, 1 for most."""
-    groups: dict[tuple[int, str, str], list[int]] = {}
-    for i, b in enumerate(blocks):
-        groups.setdefault((*b.stratum, b.equation), []).append(i)
     out = [np.ones(len(b.y)) for b in blocks]
-    for members in groups.values():
+    for members in alike(blocks).values():
         if len(members) < IDENTIFY.least_repeats:
             continue
-        times = np.unique(np.concatenate([np.round(blocks[i].time, 9) for i in members]))
+        times = np.unique(np.concatenate([blocks[i].ticks for i in members]))
         width = blocks[members[0]].X.shape[1] + 1
         stack = np.full((len(members), len(times), width), np.nan)
-        places = [np.searchsorted(times, np.round(blocks[i].time, 9)) for i in members]
+        places = [np.searchsorted(times, blocks[i].ticks) for i in members]
         for n, (i, at) in enumerate(zip(members, places, strict=True)):
             stack[n, at] = np.column_stack((blocks[i].X, blocks[i].y))
         off = np.abs(stack - np.nanmedian(stack, axis=0))

@@ -44,21 +44,20 @@ def _whitened(blocks: Sequence[RepeatBlock], fit: EquationFit) -> list[RepeatBlo
     out = list(blocks)
     for i, b in enumerate(blocks):
         other = place.get((b.run, b.record, b.equation.replace("flow_cap", "flow_rod")), i)
-        key = (*b.stratum, b.equation)
         if b.equation.startswith("flow_rod") and _paired(blocks, place, b):
             continue
         pair = [i] if other == i or len(blocks[other].y) != len(b.y) else [i, other]
-        if key not in factors:
+        if b.shared not in factors:
             members = [
                 (m, *(place[c.run, c.record, blocks[p].equation] for p in pair[1:]))
                 for m, c in enumerate(blocks)
-                if c.stratum == b.stratum and c.equation == b.equation
+                if c.shared == b.shared
             ]
             stacked = np.concatenate(
                 [np.column_stack([deviation[j] for j in member]) for member in members]
             )
-            factors[key] = _whitener(stacked, b)
-        L = factors[key]
+            factors[b.shared] = _whitener(stacked, b)
+        L = factors[b.shared]
         for row, target in enumerate(pair):
             X = sum(L[row, c] * blocks[j].X for c, j in enumerate(pair))
             y = sum(L[row, c] * blocks[j].y for c, j in enumerate(pair))
