@@ -59,6 +59,12 @@ class DeviceInfo:
     block_samples: int
     virtual_time: bool
 
+    @classmethod
+    def of(cls, rig: Rig, identity: str, block_samples: int, *, virtual_time: bool) -> Self:
+        """Return a device that has the rig's size and clock."""
+        joints, channels = len(rig.joints), len(rig.channels)
+        return cls(identity, joints, channels, rig.sample_rate, block_samples, virtual_time)
+
 
 @dataclass(frozen=True)
 class OutputLaw:
@@ -78,10 +84,15 @@ class OutputLaw:
 OFF = OutputLaw()
 
 
-def possible_laws(laws: Sequence[OutputLaw], rig: Rig) -> tuple[OutputLaw, ...]:
-    """Return one law per joint; raises DeviceError naming the joint of an impossible law."""
+def check_count(laws: Sequence[OutputLaw], rig: Rig) -> None:
+    """Raise DeviceError unless there is one law per joint."""
     if len(laws) != len(rig.joints):
         raise DeviceError(f"{len(laws)} laws for a rig of {len(rig.joints)} joints")
+
+
+def possible_laws(laws: Sequence[OutputLaw], rig: Rig) -> tuple[OutputLaw, ...]:
+    """Return one law per joint; raises DeviceError naming the joint of an impossible law."""
+    check_count(laws, rig)
     for number, (law, joint) in enumerate(zip(laws, rig.joints, strict=True), start=1):
         if not all(math.isfinite(value) for value in astuple(law)):
             raise DeviceError(f"law of joint {number} has a value that is not finite: {law}")

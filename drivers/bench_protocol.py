@@ -78,7 +78,7 @@ def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
             f"the device at {where} converts with other ranges or bits than the sensors and "
             f"valves of rig {rig.name!r}; start it with the same rig file"
         )
-    return DeviceInfo(name, joints, channels, rig.sample_rate, samples, bool(virtual))
+    return DeviceInfo.of(rig, name, samples, virtual_time=bool(virtual))
 
 
 def wave_codes(
@@ -99,13 +99,23 @@ def wave_codes(
     return encode_output(volts, limit, reg.WAVE_BITS).astype(np.int16)
 
 
-def trip_text(cause: int, tick: int) -> str | None:
-    """Return why and when a device has zeroed its outputs, None if it has not."""
+def number_in(data: bytes, register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
+    """Return an unsigned register's number from the bytes of the registers from `first` on."""
+    at = 2 * (register.address - first)
+    return int.from_bytes(data[at : at + 2 * register.words], "big")
+
+
+def trip_text(status: bytes) -> str | None:
+    """Return why and when a device has zeroed its outputs, None if it has not.
+
+    `status` is the bytes of the status group (`reg.STATUS_SPAN`).
+    """
+    cause = number_in(status, reg.STATUS_CAUSE)
     if cause == TripCause.NONE:
         return None
     known = cause in TripCause.__members__.values()
     text = reg.TRIP_TEXT[TripCause(cause)] if known else f"cause {cause}"
-    return f"{text} (at sample {tick})"
+    return f"{text} (at sample {number_in(status, reg.STATUS_TRIP_TICK)})"
 
 
 def refusal_text(reason: Refusal, trip: str | None) -> str:

@@ -126,15 +126,8 @@ class InProcessDriver:
         self._object = made
         self._streaming = False
         self._rest()
-        rig = self._rig
-        return DeviceInfo(
-            type(made).__name__,
-            len(rig.joints),
-            len(rig.channels),
-            rig.sample_rate,
-            BLOCK_SAMPLES,
-            virtual_time=True,
-        )
+        name = type(made).__name__
+        return DeviceInfo.of(self._rig, name, BLOCK_SAMPLES, virtual_time=True)
 
     def _imported(self) -> Callable[[Rig], Advancing]:
         module, _, name = self._path.partition(":")
@@ -168,8 +161,7 @@ class InProcessDriver:
     def upload(self, joint: int, wave: Array) -> None:
         """Store a waveform [V]; it acts from `apply` on."""
         self._open()
-        volts = possible_wave(joint, wave, self._rig)
-        self._stored[joint] = volts
+        self._stored[joint] = possible_wave(joint, wave, self._rig)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws from the next sample on; returns its tick."""

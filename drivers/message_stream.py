@@ -22,12 +22,14 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
     WireSettings,
+    check_count,
 )
 from drivers.bench_protocol import (
     VIRTUAL_PATIENCE,
     DeviceRefused,
     DeviceSilent,
     check_identity,
+    number_in,
     refusal_text,
     trip_text,
     wave_codes,
@@ -90,7 +92,7 @@ class MessageStreamDriver:
                 self._link.be_patient(VIRTUAL_PATIENCE)
             # This also zeroes the outputs and stops a stream.
             self._command(Message.OPEN, struct.pack(">H", round(self._wire.watchdog * 1e3)))
-            self._decoder.restart(_u32(self._status(), reg.STATUS_TICK))
+            self._decoder.restart(number_in(self._status(), reg.STATUS_TICK))
         except BaseException:
             self._link.close()
             raise
@@ -150,7 +152,7 @@ class MessageStreamDriver:
 
     def trip_cause(self) -> str | None:
         """Return why the device has zeroed its outputs, None if it has not."""
-        return _trip_text(self._status())
+        return trip_text(self._status())
 
     # -- outputs ----------------------------------------------------------------------------
 
@@ -169,8 +171,7 @@ class MessageStreamDriver:
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
-        if len(laws) != len(self._rig.joints):
-            raise DeviceError(f"{len(laws)} laws for a rig of {len(self._rig.joints)} joints")
+        check_count(laws, self._rig)
         flag = reg.APPLY_AND_RESTART if restart else reg.APPLY
         payload = msg.pack_apply(flag, [astuple(law) for law in laws])
         answer = self._command(Message.APPLY, payload, 4, f"laws {list(laws)}")
@@ -237,7 +238,7 @@ class MessageStreamDriver:
                 f"({silent})"
             ) from None
         info = check_identity(data, self._rig, where)
-        self._capacity = _u32(data, reg.IDENTITY_CAPACITY, reg.IDENTITY_SPAN[0])
+        self._capacity = number_in(data, reg.IDENTITY_CAPACITY, reg.IDENTITY_SPAN[0])
         return info
 
     def _zero_once(self) -> None:
@@ -303,13 +304,13 @@ class MessageStreamDriver:
         except DeviceSilent as silent:
             self._link.close()
             raise DeviceLost(str(silent)) from None
-        cause = _trip_text(status)
-        flags = Status(_u16(status, reg.STATUS_FLAGS))
+        cause = trip_text(status)
+        flags = Status(number_in(status, reg.STATUS_FLAGS))
         if not flags & Status.STREAMING or self._stream is None:
             if self._stream is not None:
-                self._decoder.refuse_restarted(_u32(status, reg.STATUS_TICK))
+                self._decoder.refuse_restarted(number_in(status, reg.STATUS_TICK))
             raise DeviceError(f"the device at {where} does not stream ({cause or 'not started'})")
-        if _u16(status, reg.STATUS_CAUSE) == TripCause.FAULT:
+        if number_in(status, reg.STATUS_CAUSE) == TripCause.FAULT:
             raise DeviceError(f"the device at {where} measures nothing any more: {cause}")
         self._accept()
         if overdue and not self._ready:
@@ -319,17 +320,3 @@ class MessageStreamDriver:
             raise DeviceLost(
                 f"the device at {where} answers, but for {self._link.patience:g} s {what}"
             )
-
-
-def _trip_text(status: bytes) -> str | None:
-    return trip_text(_u16(status, reg.STATUS_CAUSE), _u32(status, reg.STATUS_TRIP_TICK))
-
-
-def _u16(data: bytes, register: reg.Register) -> int:
-    at = 2 * (register.address - reg.STATUS_SPAN[0])
-    return int.from_bytes(data[at : at + 2], "big")
-
-
-def _u32(data: bytes, register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
-    at = 2 * (register.address - first)
-    return int.from_bytes(data[at : at + 4], "big")

@@ -24,6 +24,7 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
     WireSettings,
+    check_count,
 )
 from drivers.bench_protocol import (
     VIRTUAL_PATIENCE,
@@ -31,6 +32,7 @@ from drivers.bench_protocol import (
     DeviceRefused,
     DeviceSilent,
     check_identity,
+    number_in,
     refusal_text,
     trip_text,
     wave_codes,
@@ -113,7 +115,7 @@ class ModbusTcpDriver:
             self._command(reg.CONTROL_WATCHDOG, round(self._wire.watchdog * 1e3))
             self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
             self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
-            self._decoder.restart(unpack(">I", self._status(), _offset(reg.STATUS_TICK)))
+            self._decoder.restart(number_in(self._status(), reg.STATUS_TICK))
         except BaseException:
             self._link.close()
             raise
@@ -168,9 +170,7 @@ class ModbusTcpDriver:
 
     def trip_cause(self) -> str | None:
         """Return why the device has zeroed its outputs, None if it has not."""
-        status = self._status()
-        cause = unpack(">H", status, _offset(reg.STATUS_CAUSE))
-        return trip_text(cause, unpack(">I", status, _offset(reg.STATUS_TRIP_TICK)))
+        return trip_text(self._status())
 
     # -- outputs ----------------------------------------------------------------------------
 
@@ -187,8 +187,7 @@ class ModbusTcpDriver:
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
-        if len(laws) != len(self._rig.joints):
-            raise DeviceError(f"{len(laws)} laws for a rig of {len(self._rig.joints)} joints")
+        check_count(laws, self._rig)
         values = np.array([astuple(law) for law in laws])
         with np.errstate(over="ignore"):  # the device refuses values beyond single precision
             words = reg.float_words(values)
@@ -200,7 +199,7 @@ class ModbusTcpDriver:
             )
         except DeviceRefused as refused:
             raise self._explained(refused, "apply") from refused
-        tick = unpack(">I", answer)
+        tick = int.from_bytes(answer, "big")
         self._decoder.refuse_restarted(tick)
         return unwrap(tick, self._decoder.tick, 32)
 
@@ -324,8 +323,8 @@ class ModbusTcpDriver:
     def _explained(self, refused: DeviceRefused, about: str) -> DeviceError:
         """Return the refusal with the reason from the device's registers."""
         status = self._status()
-        reason = unpack(">H", status, _offset(reg.STATUS_REFUSAL))
-        joint = unpack(">H", status, _offset(reg.STATUS_REFUSAL_JOINT))
+        reason = number_in(status, reg.STATUS_REFUSAL)
+        joint = number_in(status, reg.STATUS_REFUSAL_JOINT)
         if reason not in Refusal.__members__.values():
             return DeviceRefused(f"{refused} (reason {reason}): {about}")
         if reason == Refusal.NOT_IN_CONTROL:
@@ -344,15 +343,5 @@ class ModbusTcpDriver:
         return check_identity(data, self._rig, self._link.where)
 
 
-def _offset(register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
-    return 2 * (register.address - first)
-
-
 def _u32(value: int) -> list[int]:
     return [value >> 16, value & 0xFFFF]
-
-
-def unpack(form: str, data: bytes, offset: int = 0) -> int:
-    """Read one integer in `struct`'s form from bytes at `offset`."""
-    (value,) = struct.unpack_from(form, data, offset)
-    return int(value)

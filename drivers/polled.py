@@ -129,7 +129,8 @@ class PolledDriver:
         self._silence_allowed = _silence_allowed(wire, rig, device.watchdog, accept_no_watchdog)
         self._wire, self._rig, self._device = wire, rig, device
         self._clock, self._sleep = clock, sleep
-        self._block_samples = _block_samples(rig.sample_rate)
+        wanted = max(1, round(DRIVER.block_seconds * rig.sample_rate))
+        self._block_samples = min(DRIVER.block_samples, wanted)
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         low, high = np.array([sensor.range for sensor in sensors], dtype=np.float64).T
         rounding = DRIVER.rounding * (high - low)
@@ -179,15 +180,7 @@ class PolledDriver:
             )
         if self._origin is None:
             self._origin = self._clock()
-        rig = self._rig
-        return DeviceInfo(
-            identity,
-            len(rig.joints),
-            len(rig.channels),
-            rig.sample_rate,
-            self._block_samples,
-            virtual_time=False,
-        )
+        return DeviceInfo.of(self._rig, identity, self._block_samples, virtual_time=False)
 
     def close(self) -> None:
         """Zero the outputs if the device still answers, then close; never raises."""
@@ -516,10 +509,6 @@ class _Laws:
         known = np.isfinite(positions)
         pull = position_gain * (setpoint - np.where(known, positions, 0.0))
         return np.where(known, np.clip(gain * wave + bias + pull, -limit, limit), 0.0)
-
-
-def _block_samples(rate: float) -> int:
-    return min(DRIVER.block_samples, max(1, round(DRIVER.block_seconds * rate)))
 
 
 def _silence_allowed(wire: Wire, rig: Rig, watchdog: float | None, accepted: bool) -> float:

@@ -95,15 +95,9 @@ class ReplayDriver:
         self._data = self._read()
         self._streaming = False
         self._tick = self._sequence = 0
-        rig = self._rig
-        return DeviceInfo(
-            f"recording {self._path}",
-            len(rig.joints),
-            len(rig.channels),
-            rig.sample_rate,
-            self._settings.block_samples,
-            virtual_time=not self._settings.pace,
-        )
+        at = self._settings
+        name = f"recording {self._path}"
+        return DeviceInfo.of(self._rig, name, at.block_samples, virtual_time=not at.pace)
 
     def close(self) -> None:
         """Drop the recording; never raises."""

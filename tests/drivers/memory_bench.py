@@ -204,10 +204,7 @@ class MemoryDriver:
         except BaseException:
             self.link.end(self)
             raise
-        rig = self.rig
-        return DeviceInfo(
-            "memory", len(rig.joints), len(rig.channels), rig.sample_rate, SAMPLES, True
-        )
+        return DeviceInfo.of(self.rig, "memory", SAMPLES, virtual_time=True)
 
     def check_identity(self) -> None:
         found = self.ask(lambda device: device.rig)

@@ -51,14 +51,7 @@ class FakeDriver:
         pace: float = 0.0,
     ) -> None:
         self.rig = rig
-        self.info = DeviceInfo(
-            "fake bench",
-            len(rig.joints),
-            len(rig.channels),
-            rig.sample_rate,
-            block_samples,
-            virtual,
-        )
+        self.info = DeviceInfo.of(rig, "fake bench", block_samples, virtual_time=virtual)
         self.calls: list[str] = []
         self.tick = first_tick
         self.sequence = 0

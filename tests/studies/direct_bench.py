@@ -68,9 +68,7 @@ class DirectBench:
     def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
         self.rig = rig
         self.plant = Plant(rig, scenario, seed)
-        self.info = DeviceInfo(
-            "in process", len(rig.joints), len(rig.channels), rig.sample_rate, BLOCK, True
-        )
+        self.info = DeviceInfo.of(rig, "in process", BLOCK, virtual_time=True)
         self.records: list[Record] = []
         self._waves: list[Array] = [np.zeros(0) for _ in rig.joints]
         self._start = 0
