@@ -27,7 +27,7 @@ shift viscous friction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -44,7 +44,8 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
+Gains = tuple[tuple[str, float], ...]
+Law = Callable[[Array], Array]
 
 KAPPA, TAU = "1/b per kelvin", "transition pressure squared"
 BETWEEN = "spool's path between samples at joint "
@@ -81,7 +82,7 @@ class LaminarTransition(Term):
     """- (C u / 4) dp^(-3/2) on every edge, with the gains C of a first solution."""
 
     name: ClassVar[str] = "laminar_transition_nuisance"
-    gains: tuple[tuple[str, float], ...] = ()
+    gains: Gains = ()
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return dp_t^2 [Pa^2]."""
@@ -89,17 +90,11 @@ class LaminarTransition(Term):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the column of each chamber."""
-        C = dict(self.gains)
         out: Columns = {}
         for i in signals.excited_joints:
-            pp, pm, mp, mm = (C.get(name, 0.0) for name in gain_names(i + 1))
-            u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
-            cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
-            ahead, astern = np.maximum(u, 0.0), np.minimum(u, 0.0)
-            in_cap = pp * _lost(p_s - cap) * ahead + pm * _lost(cap - p_t) * astern
-            in_rod = -mp * _lost(rod - p_t) * ahead - mm * _lost(p_s - rod) * astern
-            out[equation("flow_cap", i)] = {TAU: in_cap}
-            out[equation("flow_rod", i)] = {TAU: in_rod}
+            u = signals.u[:, i]
+            openings = np.maximum(u, 0.0), np.minimum(u, 0.0)
+            out |= _at_edges(signals, i, self.gains, TAU, openings, _lost)
         return out
 
 
@@ -108,7 +103,7 @@ class SpoolPath(Term):
     """C T du/dt sqrt(dp) of every edge of joint `joint` (0-based), with first gains C."""
 
     name: ClassVar[str] = "spool_path_nuisance"
-    gains: tuple[tuple[str, float], ...] = ()
+    gains: Gains = ()
     joint: int = 0
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
@@ -117,18 +112,13 @@ class SpoolPath(Term):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the column of each chamber; none where the joint is not excited."""
-        C, i = dict(self.gains), self.joint
+        i = self.joint
         if i not in signals.excited_joints:
             return {}
-        pp, pm, mp, mm = (C.get(name, 0.0) for name in gain_names(i + 1))
-        u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
-        cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
+        u = signals.u[:, i]
         step = np.gradient(u)  # T du/dt
-        ahead, astern = np.where(u > 0, step, 0.0), np.where(u < 0, step, 0.0)
-        in_cap = pp * root_of_drop(p_s - cap) * ahead + pm * root_of_drop(cap - p_t) * astern
-        in_rod = -mp * root_of_drop(rod - p_t) * ahead - mm * root_of_drop(p_s - rod) * astern
-        name = f"{BETWEEN}{i + 1}"
-        return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
+        openings = np.where(u > 0, step, 0.0), np.where(u < 0, step, 0.0)
+        return _at_edges(signals, i, self.gains, f"{BETWEEN}{i + 1}", openings, root_of_drop)
 
 
 @dataclass(frozen=True)
@@ -149,6 +139,22 @@ class DrivePath(Term):
             return {}
         column = -rig.drive_gains[i] * np.gradient(signals.u[:, i])
         return {equation("torque", i): {f"{DRIVE_BETWEEN}{i + 1}": column}}
+
+
+def _at_edges(
+    signals: Signals, i: int, gains: Gains, name: str, openings: tuple[Array, Array], law: Law
+) -> Columns:
+    """Return the column `name` of joint i's chambers: gain times `law` of the drop times opening.
+
+    `openings` are those of the edges that are open for u > 0 and for u < 0.
+    """
+    C, (ahead, astern) = dict(gains), openings
+    pp, pm, mp, mm = (C.get(gain, 0.0) for gain in gain_names(i + 1))
+    p_s, p_t = signals.p_s, signals.p_tank
+    cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
+    in_cap = pp * law(p_s - cap) * ahead + pm * law(cap - p_t) * astern
+    in_rod = -mp * law(rod - p_t) * ahead - mm * law(p_s - rod) * astern
+    return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
 
 
 def _lost(drop: Array) -> Array:
@@ -202,20 +208,16 @@ def sample_paths(rig: Rig, joints: Iterable[int], values: Mapping[str, float]) -
 
 def priors(names: Sequence[str], value: Array) -> list[Prior]:
     """Return the prior knowledge of the nuisances among the columns `names` (k,)."""
+    unit = np.eye(len(names))
     out = []
     if KAPPA in names and "b" in names:
-        h = np.zeros(len(names))
         b = names.index("b")
-        h[names.index(KAPPA)], h[b] = 1.0, IDENTIFY.bulk_slope
+        h = unit[names.index(KAPPA)] + IDENTIFY.bulk_slope * unit[b]
         out.append(Prior(KAPPA, h, IDENTIFY.bulk_slope_std * abs(float(value[b]))))
     if TAU in names:
-        h = np.zeros(len(names))
-        h[names.index(TAU)] = 1.0
-        out.append(Prior(TAU, h, IDENTIFY.transition_drop**2))
-    for k, name in enumerate(names):
+        out.append(Prior(TAU, unit[names.index(TAU)], IDENTIFY.transition_drop**2))
+    for name, h in zip(names, unit, strict=True):
         if name.startswith((BETWEEN, DRIVE_BETWEEN)):
-            h = np.zeros(len(names))
-            h[k] = 1.0
             out.append(Prior(name, h, IDENTIFY.path_between_samples))
     return out
 

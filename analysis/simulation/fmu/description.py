@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from analysis.simulation.fmu.variables import TIME, UnitVariable, UnitVariables
+
+_Attributes = dict[str, str]
 
 # Exponents of SI base units, for the units that a simulation tool may convert.
 _BASE_UNITS: dict[str, dict[str, str]] = {
@@ -38,37 +40,18 @@ def description_2(name: str, about: str, token: str, step: float, unit: UnitVari
     _units(root, unit)
     SubElement(root, "DefaultExperiment", startTime="0", stopTime="1", stepSize=repr(step))
     listed = SubElement(root, "ModelVariables")
-    order: list[str] = []
-
-    def add(variable: UnitVariable, kind: str, attributes: dict[str, str], **more: str) -> None:
-        order.append(variable.name)
-        item = SubElement(listed, "ScalarVariable", _identity(variable) | more)
-        SubElement(item, kind, attributes)
-
-    for v in unit.inputs:
-        add(v, "Real", _real(v), causality="input", variability="continuous")
-    for v in unit.outputs:
-        add(v, "Real", {"unit": v.unit}, causality="output", variability="continuous",
-            initial="calculated")  # fmt: skip
-    for v in unit.starts:
-        add(v, "Real", _real(v), causality="parameter", variability="fixed", initial="exact")
-    for v in unit.constants:
-        add(v, "Real", {"start": repr(v.start)}, causality="local", variability="constant",
-            initial="exact")  # fmt: skip
-    for v in unit.switches:
-        add(v, "Boolean", {"start": "false"}, causality="parameter", variability="fixed",
-            initial="exact")  # fmt: skip
+    index: dict[str, str] = {}
+    for variable, role, value in _described(unit):
+        index[variable.name] = str(len(index) + 1)
+        item = SubElement(listed, "ScalarVariable", role)
+        SubElement(item, "Boolean" if variable in unit.switches else "Real", value)
     structure = SubElement(root, "ModelStructure")
-    for part in ("Outputs", "InitialUnknowns"):
-        unknowns = SubElement(structure, part)
-        for v in unit.outputs:
-            depends = _start_of(v, unit.starts)
-            index = str(order.index(v.name) + 1)
-            if part == "Outputs":
-                SubElement(unknowns, "Unknown", index=index, dependencies="")
-            else:
-                on = str(order.index(depends) + 1)
-                SubElement(unknowns, "Unknown", index=index, dependencies=on)
+    outputs = SubElement(structure, "Outputs")
+    initial = SubElement(structure, "InitialUnknowns")
+    for v in unit.outputs:
+        at, start = index[v.name], index[f"{v.name}_start"]
+        SubElement(outputs, "Unknown", index=at, dependencies="")
+        SubElement(initial, "Unknown", index=at, dependencies=start)
     return _text(root)
 
 
@@ -88,33 +71,18 @@ def description_3(name: str, about: str, token: str, step: float, unit: UnitVari
     _units(root, unit)
     SubElement(root, "DefaultExperiment", startTime="0", stopTime="1", stepSize=repr(step))
     listed = SubElement(root, "ModelVariables")
-
-    def add(variable: UnitVariable, kind: str, **more: str) -> None:
-        SubElement(listed, kind, _identity(variable) | more)
-
     time = UnitVariable("time", TIME, "s", 0.0, "simulated time")
-    add(time, "Float64", causality="independent", variability="continuous", unit="s")
-    for v in unit.inputs:
-        add(v, "Float64", causality="input", variability="continuous", **_real(v))
-    for v in unit.outputs:
-        add(v, "Float64", causality="output", variability="continuous", initial="calculated",
-            unit=v.unit)  # fmt: skip
-    for v in unit.starts:
-        add(v, "Float64", causality="parameter", variability="fixed", initial="exact", **_real(v))
-    for v in unit.constants:
-        add(v, "Float64", causality="local", variability="constant", initial="exact",
-            start=repr(v.start))  # fmt: skip
-    for v in unit.switches:
-        add(v, "Boolean", causality="parameter", variability="fixed", initial="exact",
-            start="false")  # fmt: skip
+    clock = _identity(time) | {"causality": "independent", "variability": "continuous"}
+    SubElement(listed, "Float64", clock, unit=time.unit)
+    for variable, role, value in _described(unit):
+        SubElement(listed, "Boolean" if variable in unit.switches else "Float64", role | value)
     structure = SubElement(root, "ModelStructure")
     for v in unit.outputs:
         SubElement(structure, "Output", valueReference=str(v.reference), dependencies="")
-    by_name = {v.name: v.reference for v in unit.starts}
+    starts = {v.name: str(v.reference) for v in unit.starts}
     for v in unit.outputs:
-        on = str(by_name[_start_of(v, unit.starts)])
-        reference = str(v.reference)
-        SubElement(structure, "InitialUnknown", valueReference=reference, dependencies=on)
+        at, start = str(v.reference), starts[f"{v.name}_start"]
+        SubElement(structure, "InitialUnknown", valueReference=at, dependencies=start)
     return _text(root)
 
 
@@ -143,12 +111,23 @@ def _identity(variable: UnitVariable) -> dict[str, str]:
     }
 
 
-def _real(variable: UnitVariable) -> dict[str, str]:
-    return {"unit": variable.unit, "start": repr(variable.start)}
-
-
-def _start_of(output: UnitVariable, starts: Sequence[UnitVariable]) -> str:
-    return next(v.name for v in starts if v.name == f"{output.name}_start")
+def _described(unit: UnitVariables) -> Iterator[tuple[UnitVariable, _Attributes, _Attributes]]:
+    """Yield every variable with the attributes of its identity and role, and of its value."""
+    groups = (
+        (unit.inputs, "input", "continuous", None, ("unit", "start")),
+        (unit.outputs, "output", "continuous", "calculated", ("unit",)),
+        (unit.starts, "parameter", "fixed", "exact", ("unit", "start")),
+        (unit.constants, "local", "constant", "exact", ("start",)),
+        (unit.switches, "parameter", "fixed", "exact", ("start",)),
+    )
+    for variables, causality, variability, initial, keys in groups:
+        role = {"causality": causality, "variability": variability}
+        if initial is not None:
+            role["initial"] = initial
+        for v in variables:
+            start = "false" if v in unit.switches else repr(v.start)
+            value = {"unit": v.unit, "start": start}
+            yield v, _identity(v) | role, {key: value[key] for key in keys}
 
 
 def _text(root: Element) -> str:
