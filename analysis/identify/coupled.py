@@ -131,10 +131,7 @@ def conclude(
     }
     model = Model(rig, used, estimates, covariance, provenance)
     log.info("identified %d parameters from %d records", len(estimates), len(reductions))
-    return Identification(
-        "coupled", estimates, solutions, rows, masked, seconds, statements, model,
-        geometry=geometry,
-    )  # fmt: skip
+    return Identification(model, solutions, rows, masked, seconds, statements, geometry=geometry)
 
 
 def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:

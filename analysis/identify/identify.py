@@ -75,10 +75,7 @@ def _with_exact_geometry(rig: Rig, result: Identification) -> Identification:
     """Return the result of a method that ignores tolerances, with a check if the rig has some."""
     if not rig.uncertain_numbers:
         return result
-    checks = (*result.checks, tolerances_ignored(rig, result.method))
-    failed = [c.name for c in checks if not c.ok]
-    model = replace(result.model, provenance={**result.model.provenance, "checks_failed": failed})
-    return replace(result, checks=checks, model=model)
+    return result.with_checks((*result.checks, tolerances_ignored(rig, result.method)))
 
 
 def _refuse_estimator(estimator: str, bootstrap: int) -> None:

@@ -154,19 +154,9 @@ def physical(result: Identification) -> Physical:
 def with_physics(result: Identification, physical: Physical) -> Identification:
     """Return the identification with the consistent parameters in place of the free ones."""
     level = physical.levels[physical.returned]
-    checks = (*result.checks, *physical.checks)
-    provenance = {
-        **result.model.provenance,
-        "physical": level.name,
-        "checks_failed": [c.name for c in checks if not c.ok],
-    }
-    model = replace(
-        result.model, parameters=level.estimates, covariance=level.covariance,
-        provenance=provenance,
-    )  # fmt: skip
-    return replace(
-        result, estimates=level.estimates, model=model, checks=checks, geometry=level.geometry
-    )
+    model = replace(result.model, parameters=level.estimates, covariance=level.covariance)
+    held = replace(result, model=model, geometry=level.geometry)
+    return held.with_checks((*result.checks, *physical.checks), physical=level.name)
 
 
 def _level(result: Identification, name: str, rigid: bool) -> Level:

@@ -24,23 +24,37 @@ PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between 
 
 @dataclass(frozen=True)
 class Identification:
-    """The result of an identification: estimates, conditioning, rows used, masked rows, checks.
+    """The result of an identification: model, conditioning, rows used, masked rows, checks.
 
     `built` are the rows it was solved from; none where they were not all in memory. `geometry`
     holds the shifts by the rig's tolerances; None where there are none, or the method ignores them.
     """
 
-    method: str
-    estimates: Mapping[str, Estimate]
+    model: Model
     solutions: Mapping[str, Solution]
     rows: Mapping[str, int]
     masked_rows: int
     solve_seconds: float
     checks: tuple[Check, ...]
-    model: Model
     extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
     built: tuple[RecordRows, ...] = field(default=(), repr=False, compare=False)
     geometry: geo.GeometryShifts | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def method(self) -> str:
+        """The method by which it was found."""
+        return str(self.model.provenance["method"])
+
+    @property
+    def estimates(self) -> Mapping[str, Estimate]:
+        """The parameters with their intervals."""
+        return self.model.parameters
+
+    def with_checks(self, checks: tuple[Check, ...], **provenance: str) -> Identification:
+        """Return the result with other checks, and `provenance` added to its model's."""
+        failed = [c.name for c in checks if not c.ok]
+        known = {**self.model.provenance, **provenance, "checks_failed": failed}
+        return replace(self, checks=checks, model=replace(self.model, provenance=known))
 
 
 def to_json(result: Identification) -> dict[str, Any]:

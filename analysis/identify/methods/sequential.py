@@ -80,18 +80,7 @@ def sequential(
     second = {f: as_solution(o, o.averaged) for f, o in outcomes.items()}
     extra = {"sequential": _json(outcomes, shown, estimates, estimates_of(rig, terms, second)[0])}
     model = Model(rig, tuple(terms), estimates, covariance, provenance)
-    return Identification(
-        "sequential",
-        estimates,
-        solutions,
-        rows,
-        masked,
-        seconds,
-        statements,
-        model,
-        extra,
-        tuple(built),
-    )
+    return Identification(model, solutions, rows, masked, seconds, statements, extra, tuple(built))
 
 
 def _stages(

@@ -49,10 +49,7 @@ def simultaneous(
         *gravity_order(rig, {n: e for n, e in result.estimates.items() if e.identified}),
         *result.checks,
     )  # fmt: skip
-    failed = [c.name for c in statements if not c.ok]
-    provenance = {**result.model.provenance, "method": "simultaneous", "checks_failed": failed}
-    model = replace(result.model, provenance=provenance)
-    return replace(result, method="simultaneous", checks=statements, model=model)
+    return result.with_checks(statements, method="simultaneous")
 
 
 def gravity_order(rig: Rig, estimates: dict[str, Estimate]) -> list[Check]:

@@ -188,9 +188,7 @@ def _identification(
     model = Model(rig, used, estimates, covariance, provenance)
     rows = dict.fromkeys(FAMILIES, 0)
     extra = {"search": history_json(task, history, options)}
-    return Identification(
-        method, estimates, solutions, rows, 0, history.seconds, statements, model, extra
-    )
+    return Identification(model, solutions, rows, 0, history.seconds, statements, extra)
 
 
 def _as_solution(method: str, task: SearchTask, history: SearchHistory, family: str) -> Solution:

@@ -116,7 +116,7 @@ def _with_shape_errors(
     from analysis.trace.judge.inference import with_shape_errors
 
     model, shapes = with_shape_errors(found, result.model)
-    return replace(result, model=model, estimates=model.parameters), shapes
+    return replace(result, model=model), shapes
 
 
 def identify(
