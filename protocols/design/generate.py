@@ -1,9 +1,9 @@
 """Generates the lock-and-excite steps of a rig, with the proof that they determine all parameters.
 
-Every candidate (`protocols.design.candidates`) is sized on the twin until it keeps all limits
-(`protocols.design.sizing`); the rows of its record follow from its motion there, and the smallest
-set is chosen by them (`protocols.design.selection`). Rows and verdicts come from a predictor, an
-argument, so that protocols and analysis stay independent.
+Every candidate is sized on the twin until it keeps all limits (`protocols.design.candidates`); the
+rows of its record follow from its motion there, and the smallest set is chosen by them
+(`protocols.design.selection`). Rows and verdicts come from a predictor, an argument, so that
+protocols and analysis stay independent.
 
 Validation steps are sines, which are never used for a fit.
 """
@@ -13,12 +13,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from protocols.design.candidates import CENTRING, candidates, described
+from protocols.design.candidates import (
+    CENTRING,
+    SPARE,
+    candidates,
+    described,
+    motion_within,
+    sized,
+)
 from protocols.design.check import Twin, centred
 from protocols.design.proof import Proof, Reason, Triangles, Verdicts, complete
 from protocols.design.selection import Judge, SizedStep, extended, smallest
 from protocols.design.settings import DESIGN
-from protocols.design.sizing import SPARE, motion_within, sized
 from protocols.engine.centring import Array
 from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
