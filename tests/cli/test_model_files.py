@@ -74,9 +74,14 @@ def test_a_simulated_run_gives_its_models_parameters_back(folder: Path, rubbed: 
     assert told["Fv2"]["value"] == pytest.approx(wanted["Fv2"], rel=0.004)
 
 
-def test_the_model_taken_over_keeps_its_shapes(folder: Path, rubbed: Path) -> None:
+def test_the_model_taken_over_keeps_its_shapes_in_model_and_output(
+    folder: Path, rubbed: Path
+) -> None:
     again = folder / "again.json"
-    bramah("identify", rubbed, "--like", folder / "rubbing.json", "--model", again)
+    line = ("identify", rubbed, "--like", folder / "rubbing.json", "--physical", "--json", "-")
+    found = json.loads(bramah(*line, "--model", again))
+    assert found["shapes"]["presliding_2"]["value"] == PRESLIDING
+    assert "physical" in found
     term = load_model(again).terms[-1]
     assert (term.term.name, term.term.where, term.shape) == (
         "coulomb_friction", "joint 2", (PRESLIDING,),

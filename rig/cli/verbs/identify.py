@@ -226,7 +226,8 @@ def identify(
     if found is not None:
         result, fitted = _with_shape_errors(result, found)
         shapes |= fitted
-    document, more = to_json(result), shapes_text(shapes) + method_text(result)
+    document: dict[str, Any] = {}
+    more = shapes_text(shapes) + method_text(result)
     if shapes:
         document["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
     if physical:
@@ -236,12 +237,12 @@ def identify(
 
         projection = projected(result)
         result = with_physics(result, projection)
-        document = {**to_json(result), "physical": physical_json(projection)}
+        document["physical"] = physical_json(projection)
         more += f"\n\n{physical_text(projection)}"
     with printed_at_end(json, lambda: identification_text(result, known) + more):
         if model is not None:
             save_identified(result.model, model, progress)
-        write_json(json, document)
+        write_json(json, {**to_json(result), **document})
         if report is not None:
             from rig.cli.text.reports import write_identification
 

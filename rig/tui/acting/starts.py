@@ -141,7 +141,8 @@ class Starts(Commands):
         self.open_page("run log")
 
         def read() -> None:
-            self.browsed = replace(self.browsed, log=read_log(folder))
+            log = read_log(folder)  # slow: `browsed` may change meanwhile
+            self.browsed = replace(self.browsed, log=log)
 
         self._in_background(read)
 
@@ -152,7 +153,8 @@ class Starts(Commands):
         self.look = replace(self.look, channel=0)
 
         def read() -> None:
-            self.browsed = replace(self.browsed, trace=read_trace(folder))
+            trace = read_trace(folder)  # slow: `browsed` may change meanwhile
+            self.browsed = replace(self.browsed, trace=trace)
 
         self._in_background(read)
 
