@@ -45,6 +45,7 @@ from analysis.terms.base import (
 from analysis.terms.orifice import root_of_drop, signed_root
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 OPENINGS: Final = 8  # knots of |u|, the first at the null; that and the last have no value
 PACKED: Final = 3 * OPENINGS  # numbers of an edge as `packed`
@@ -158,6 +159,14 @@ class MeteringCurve(Effect):
             if np.min(whole) < least or np.min(whole - np.maximum.accumulate(whole)) < least:
                 return f"edge {gain} would close as the spool opens it, or pass oil backwards"
         return ""
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State at which opening the gains hold."""
+        gains, largest = gain_names(self.joint + 1), self.shape_of(rig, shape)[-1]
+        return (
+            f"{', '.join(gains)} are each edge's flow over the spool at the largest opening of "
+            f"these records, {plain(largest, 3)} V; at smaller ones the curve says how it differs"
+        )
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the spool [V]."""

@@ -362,6 +362,11 @@ def test_a_tapered_metering_edge_is_a_curve_over_the_spool(rig: Rig) -> None:
         opening = (u + 2.0 * u * np.abs(u)) * (1 if line is cap else -1)
         there = np.where(u > 0, TRUTH[ahead], TRUTH[astern]) * opening
         assert line.y == pytest.approx(there, abs=0.01 * np.abs(there).max())
+    # The gain is the true edge's chord at the opening that the note states: (u + 2 u^2) / u.
+    (note,) = (n for n in result.notes if n.startswith("metering_curve: C_pp_2"))
+    largest = float(note.split("these records, ")[1].split()[0])
+    found = result.model_after.parameters["C_pp_2"].value
+    assert found == pytest.approx(TRUTH["C_pp_2"] * (1.0 + 2.0 * largest), rel=0.01)
 
 
 @pytest.mark.slow
