@@ -204,6 +204,22 @@ async def test_after_a_trip_the_first_cause_is_acknowledged_and_then_reset_with_
         assert "▲ ACTIVE UNACK  spool" in shown.text, "what followed still stands"
 
 
+async def test_a_reset_is_of_the_bench_that_tripped_whatever_runs_when_the_reason_is_given(
+    tripped_run: Machine, bramah: Path
+) -> None:
+    """Another bench's run is attached while the operator types."""
+    async with glass(tripped_run) as shown:
+        await keys(shown, "5", "k", "r", *"hose")
+        frame = shown.app.link.frame
+        assert frame.snapshot is not None
+        other = replace(frame.snapshot, wire="modbus-tcp://127.0.0.1:6020", run="")
+        shown.app.link._frame = replace(frame, snapshot=other)
+        await shown.press("enter")
+        await shown.said("reset: cleared")
+        asked = json.loads(bramah.read_text())
+        assert asked[3:] == ["--endpoint", "modbus-tcp://127.0.0.1:5020", "--reason", "hose"]
+
+
 async def test_a_reset_without_a_reason_resets_nothing(tripped_run: Machine, bramah: Path) -> None:
     async with glass(tripped_run) as shown:
         await keys(shown, "5", "k", "r", "enter")

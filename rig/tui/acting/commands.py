@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar, Final
 
-from rig.bench.screens.sockets import Endpoint
+from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.model.alarms.states import Alarm, AlarmState, AlarmTable
 from rig.model.trips import RecordingFailed
 from rig.runs.runstate import EventLog
@@ -185,14 +185,16 @@ class Commands:
     def act_reset(self) -> None:
         """Reset a latched alarm, separately from its acknowledgement and with a reason."""
         alarm, frame = self._marked_alarm(), self.link.frame
-        if alarm is None or alarm.state is not AlarmState.LATCHED:
+        snapshot = frame.snapshot
+        if alarm is None or snapshot is None or alarm.state is not AlarmState.LATCHED:
             self.remark = "reset: the marked alarm is not latched; it ends by itself."
         elif not alarm.acknowledged:
             self.remark = f"reset: acknowledge {alarm.key} first (k); to reset is another act."
         elif not frame.over:
             self.remark = "reset: the run still holds the bench; wait for its end."
         else:
-            self.ask_reason(alarm.sentence, lambda why: self._reset(alarm, why))
+            # Of the run that is shown now: another may be attached before the reason is given.
+            self.ask_reason(alarm.sentence, lambda why: self._reset(snapshot, alarm, why))
 
     def ask_reason(self, about: str, reset: Callable[[str], None]) -> None:
         """Ask what was found and done at a trip, then reset with that reason."""
@@ -207,10 +209,7 @@ class Commands:
         keys = "Enter resets device and bench, Esc closes"
         self.ask(Dialog("reset", body, text="", keys=keys), answered)
 
-    def _reset(self, alarm: Alarm, reason: str) -> None:
-        snapshot = self.link.frame.snapshot
-        if snapshot is None:
-            return
+    def _reset(self, snapshot: Snapshot, alarm: Alarm, reason: str) -> None:
         rig, pid = rig_of_run(snapshot.run, snapshot.rig), snapshot.pid
         self.remark = "reset: asking the device ..."
 
