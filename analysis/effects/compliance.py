@@ -33,6 +33,9 @@ DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sen
 MOST_AIR: Final = 0.2
 EXPONENTS: Final = (1.0, 1.4)
 MOST_VOLUME: Final = 10.0  # of the oil in pipe and chamber at mid-stroke
+# Stiffening times the supply's pressure of a hose, at first and at most: there it gives a fourth,
+# or an eleventh, of what it gives at zero.
+HOSE, STIFFEST = 3.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -181,11 +184,20 @@ class DeadVolume(Effect):
         known = cap if self.side == "cap" else rod
         stated = self._stated(rig)
         grid = (-0.2 * stated, 0.05 * known, 0.25 * known, 1.0 * known)
-        volume, stiffening = self.shape_names()
+        (volume, stiffening), p = self.shape_names(), rig.supply.pressure
         return (
             Shape(volume, "m^3", -stated, MOST_VOLUME * known, grid, 0.0),
-            Shape(stiffening, "1/Pa", 0.0, 1e-6, (1e-7,), resolution=True, detail=True),
+            Shape(stiffening, "1/Pa", 0.0, STIFFEST / p, (1.0 / p,), resolution=True, detail=True),
         )
+
+    def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
+        """Return hoses: beside a smaller b, what shows of them is that they stiffen."""
+        volume, _ = self.shapes(rig)
+        return tuple((start, HOSE / rig.supply.pressure) for start in volume.grid[1:3])
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the rigid volume of a hose."""
+        return (tuple(shape[:1]),) if len(shape) > 1 else ()
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Add the volume to the chamber's."""

@@ -218,7 +218,9 @@ def quantity(estimate: Estimate) -> str:
     low, high = estimate.ci95
     sides, unit = (estimate.value - low, high - estimate.value), typeset(estimate.unit)
     if max(sides) > LOPSIDED * min(sides) > 0.0:
-        value, low_end, high_end = (plain(x, 2) for x in (estimate.value, low, high))
+        # Two digits, and more where the ends would be shown as equal.
+        digits = 2 + max(0, math.floor(math.log10(max(abs(low), abs(high)) / (high - low))))
+        value, low_end, high_end = (plain(x, digits) for x in (estimate.value, low, high))
         return f"{value} ({low_end} to {high_end}) {unit}".strip()
     return with_interval(estimate.value, estimate.half, unit)
 

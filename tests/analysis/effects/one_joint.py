@@ -29,11 +29,12 @@ NAMES = (
     "stiffening", "inclination", "k_spring", "rest", "T_offset",
     "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool",
     "c_internal", "c_cap", "c_rod", "dp_supply", "p_tank", "p_back",
-    "alpha_air", "V_cap", "V_rod", "m_payload",
+    "alpha_air", "V_cap", "V_rod", "m_payload", "hose",
 )  # fmt: skip
 (
     FC, FS, VS, FALL, FE, FR, KF, KD, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD,
     ASTERN, NULL, UNDERLAP, TAU, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD, LOAD,
+    HOSE,
 ) = range(len(NAMES))  # fmt: skip
 SHAPES = {"presliding": 40e-6, "v_stribeck": 0.03, "fall": 2.0, "rest": -1.35}
 NAMES_1 = ("M2", "Fv2", "W2", "b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2")
@@ -144,6 +145,9 @@ def _rates(y, t, packed):
     soft_rod = 1 / par[3] + e[AIR] * P0 / (rod + P0) ** 2
     volume_cap = 6.3e-5 + e[V_CAP] + (0.0375 + s) * 7.0e-4
     volume_rod = 6.3e-5 + e[V_ROD] + (0.0375 - s) * 5.4e-4
+    # Two hoses whose walls give like so much oil without pressure, e times less at each 5 MPa.
+    volume_cap += e[HOSE] * math.exp(-cap / 5e6)
+    volume_rod += e[HOSE] * math.exp(-rod / 5e6)
     force, deflecting = _friction(v, cap, rod, y[4], e)
     torque = G * (7.0e-4 * cap - 5.4e-4 * rod - force) - par[1] * w + e[TORQUE]
     torque -= (par[2] + 0.5 * e[LOAD]) * 9.8 * math.sin(q1 + q + e[INCLINATION])

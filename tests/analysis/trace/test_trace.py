@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis import small_bench
+from tests.analysis.trace import gate_cases
 from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs, understated
 
 BOTH = (
@@ -323,3 +325,22 @@ def test_a_pipe_of_which_the_rig_file_states_too_much_is_found(rig: Rig) -> None
     assert found.effects[0].parameters["V_dead_2_cap"].value == pytest.approx(-0.6 * true, rel=0.01)
     assert found.model_after.values["b"] == pytest.approx(small_bench.TRUTH["b"], rel=2e-3)
     assert any("the pipe holds 63 cm³, not the 101 cm³ of the rig file" in n for n in found.notes)
+
+
+def test_hoses_at_both_chambers_are_found_beside_the_smaller_b_that_hides_them(rig: Rig) -> None:
+    """Rigid volumes at both chambers are nearly a smaller b: what shows is that hoses stiffen.
+
+    Their walls give by another law than the catalogue's.
+    """
+    names = ("dead_volume", "entrained_air", "channel_delay")
+    result = gate_cases.traced(rig, pair_of_runs(rig, hose=1e-4), *names)
+    assert result.verdict == "explained"
+    assert {e.where for e in result.effects} == {"joint 2 cap", "joint 2 rod"}
+    at_half_supply = 1e-4 * math.exp(-3.5 / 5.0)
+    for effect in result.effects:
+        assert effect.name == "dead_volume"
+        volume = effect.parameters[f"V_dead_2_{effect.where.split()[-1]}"]
+        assert volume.value == pytest.approx(at_half_supply, rel=0.03)
+    assert result.model_after.parameters["b"].value == pytest.approx(
+        small_bench.TRUTH["b"], rel=0.01
+    )

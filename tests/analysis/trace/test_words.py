@@ -182,6 +182,8 @@ def test_a_lopsided_interval_is_stated_by_its_ends() -> None:
     """A breakaway of unknown form is known to a factor."""
     assert quantity(Estimate(96.0, "N", 50.0, (31.0, 196.0))) == "96 (31 to 200) N"
     assert quantity(Estimate(96.0, "N", 10.0, (76.0, 117.0))) == "96 ± 20 N"
+    play = Estimate(0.040043, "V", 5e-5, (0.0400256, 0.0402338))
+    assert quantity(play) == "0.04004 (0.04003 to 0.04023) V"
 
 
 def test_what_only_some_rows_hold_is_stated_where_the_errors_do_not_show_it() -> None:
