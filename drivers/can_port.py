@@ -10,7 +10,6 @@ import errno
 import logging
 import os
 import queue
-import select
 import socket
 import threading
 import time
@@ -21,18 +20,14 @@ from typing import Annotated, Any, Final
 from urllib.parse import SplitResult, parse_qsl
 
 import can
-from can.interfaces.slcan import slcanBus
-from can.interfaces.socketcand import SocketCanDaemonBus
 from pydantic import AfterValidator, Field
 
 from drivers.base import DeviceError, DeviceLost, WireSettings
-from drivers.serial_transport import PortInUse, port_in_use
+from drivers.can_adapters import SlcanBus, SocketcandBus
+from drivers.serial_transport import PortInUse
 from drivers.settings import DRIVER
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.can_layout import EXTENDED
-
-if os.name == "posix":
-    import fcntl
 
 logger = logging.getLogger(__name__)
 
@@ -257,7 +252,7 @@ class CanPort:
         place = self._place
         rates: dict[str, Any] = {"bitrate": self._bitrate}
         if place.interface == SOCKETCAND:
-            return _SocketcandBus(  # type: ignore[no-untyped-call]
+            return SocketcandBus(  # type: ignore[no-untyped-call]
                 place.channel, place.host, place.port, tcp_tune=True
             )
         if place.interface == SLCAN:
@@ -271,7 +266,7 @@ class CanPort:
                     data_sample_point=75.0,
                 )
             if os.name == "posix" and self._make is can.Bus:
-                return _SlcanBus(place.channel, shared=self._shared, **rates)
+                return SlcanBus(place.channel, shared=self._shared, **rates)
         elif self._data_bitrate is not None:
             rates |= {"fd": True, "data_bitrate": self._data_bitrate}
         return self._make(interface=place.interface, channel=place.channel, **rates)
@@ -302,115 +297,6 @@ class CanPort:
                 f"{self._bitrate}"
             )
         return DeviceLost(f"cannot open {self.where} at {self._bitrate} bit/s: {text}")
-
-
-class _SocketcandBus(SocketCanDaemonBus):
-    """python-can's client, corrected: a busy bus never opened, an ended one never stopped."""
-
-    def _expect_msg(self, msg: str) -> None:
-        # The last answer of the greeting may arrive together with the first frames.
-        answer = b""
-        while not answer.endswith(b">") and (byte := self._end.recv(1)):
-            answer += byte
-        if answer.decode("ascii", "replace") != msg:
-            self._end.close()
-            raise can.CanInitializationError(f"expected {msg!r}, got {answer!r}")
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        message, filtered = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
-        waiting = message is None and bool(select.select([self._end], [], [], 0)[0])
-        if waiting and not self._end.recv(1, socket.MSG_PEEK):
-            raise ConnectionResetError(errno.ECONNRESET, "the other end closed it")
-        return message, filtered
-
-    @property
-    def _end(self) -> socket.socket:
-        end: socket.socket = getattr(self, "_SocketCanDaemonBus__socket")  # noqa: B009 - mangled
-        return end
-
-
-class _SlcanBus(slcanBus):
-    """python-can's client, corrected: it reads byte by byte and ends at a damaged text.
-
-    It also takes a port that another program has, sets the adapter anew, and takes bytes from that
-    program. Here the port is locked as pyserial does it; if `shared`, it is not, and the adapter is
-    left as it is.
-    """
-
-    def __init__(self, channel: str, *, shared: bool, **options: Any) -> None:
-        self._shared = shared
-        self._lock = -1 if shared else _locked(channel.partition("@")[0])
-        try:
-            super().__init__(channel, **options)
-        except BaseException:
-            self._unlock()
-            raise
-
-    def open(self) -> None:
-        if not self._shared:
-            super().open()
-
-    def close(self) -> None:
-        if not self._shared:
-            super().close()
-
-    def set_bitrate(self, bitrate: int, data_bitrate: int | None = None) -> None:
-        if not self._shared:
-            super().set_bitrate(bitrate, data_bitrate)
-
-    def shutdown(self) -> None:
-        try:
-            super().shutdown()
-        finally:
-            self._unlock()
-
-    def _unlock(self) -> None:
-        lock, self._lock = self._lock, -1
-        if lock >= 0:
-            os.close(lock)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        try:
-            return super()._recv_internal(timeout)
-        except (ValueError, IndexError):  # the adapter's own line has no checksum
-            return None, False
-
-    def _read(self, timeout: float | None) -> str | None:
-        end = None if timeout is None else time.monotonic() + timeout
-        port = self.serialPortOrig
-        while True:
-            if (text := _first_text(self._buffer)) is not None:
-                return text
-            left = DRIVER.can_wait if end is None else end - time.monotonic()
-            ready = select.select([port.fileno()], [], [], min(max(left, 0.0), DRIVER.can_wait))[0]
-            if ready:
-                self._buffer.extend(port.read(port.in_waiting or 1))
-            elif end is not None and left <= 0.0:
-                return None
-
-
-def _locked(device: str) -> int:
-    """Lock a serial port against other programs; returns the file to close at the end.
-
-    Raises PortInUse where another program has locked it, OSError where there is no such port.
-    """
-    file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(file)
-        raise port_in_use(device) from error
-    return file
-
-
-def _first_text(begun: bytearray) -> str | None:
-    """Take the first complete text, up to its end or error mark."""
-    ends = [at for mark in (b"\r", b"\a") if (at := begun.find(mark)) >= 0]
-    if not ends:
-        return None
-    text = bytes(begun[: min(ends) + 1])
-    del begun[: len(text)]
-    return text.decode("ascii", "replace")
 
 
 @dataclass
