@@ -106,9 +106,8 @@ def conclude(
     estimates, covariance = estimates_of(rig, used, solutions)
     if refinement.bootstrap:
         estimates = with_ends(estimates, refinement.bootstrap)
-    known: tuple[Check, ...] = ()
+    known = (geometry_check(rig, used, estimates, geometry),) if "fluid" in rig.families else ()
     if geometry is not None:
-        known = (geometry_check(rig, used, estimates, geometry),)
         estimates, covariance = widened(rig, used, estimates, covariance, geometry)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(reduction.masked for reduction in reductions)

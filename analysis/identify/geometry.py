@@ -131,9 +131,20 @@ def geometry_check(
     rig: Rig,
     terms: Sequence[Used],
     estimates: Mapping[str, Estimate],
-    geometry: GeometryShifts,
+    geometry: GeometryShifts | None,
 ) -> Check:
-    """State, for every kind of tolerance, the number and parameter with the largest shift."""
+    """State, for every kind of tolerance, the number and parameter with the largest shift.
+
+    Without tolerances (`geometry` None), state that the rig file's numbers are taken as exact:
+    records show no area and no pin distance that is wrong.
+    """
+    if geometry is None:
+        return Check(
+            NAME,
+            True,
+            "areas, volumes and pin distances of the rig file are taken as exact: records may not "
+            "show that one is wrong; state `tolerances` to have them in the intervals",
+        )
     S = parameter_shifts(rig, terms, estimates, geometry)
     value = np.array([estimate.value for estimate in estimates.values()])
     with np.errstate(divide="ignore", invalid="ignore"):

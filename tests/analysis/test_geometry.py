@@ -70,6 +70,9 @@ def test_a_rig_without_tolerances_has_the_intervals_it_had(
     assert [c.name for c in nothing.checks] == [c.name for c in exact.checks]
     assert exact.geometry is None
     assert "geometry" not in to_json(exact)
+    (check,) = [c for c in exact.checks if c.name == "geometry"]
+    assert check.ok
+    assert "taken as exact" in check.detail
 
 
 def test_the_values_stay_and_the_intervals_grow_in_quadrature(
