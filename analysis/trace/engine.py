@@ -198,7 +198,7 @@ def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
     baseline = identified(records.train, rows.train.terms)
     notes = (
         *undetermined_notes(baseline.model),
-        *(check.detail for check in baseline.checks if check.name == GEOMETRY),
+        *(c.detail for c in baseline.checks if c.name == GEOMETRY and rig.uncertain_numbers),
     )
     return _Prepared(
         records, rows, as_recorded.train, terms,

@@ -8,7 +8,8 @@ import pytest
 
 from analysis.effects.measurement_delay import ChannelDelay, SensorLag
 from analysis.effects.valve import SpoolLag
-from analysis.trace import engine, finding
+from analysis.trace import engine
+from analysis.trace.data import trace_rows
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.result import CLEAN
 from rig.runs.rigs import load_rig
@@ -31,7 +32,7 @@ def test_a_spool_that_bends_between_samples_is_nothing_to_name(
 
     result = engine.trace([train], [held_out], late, look_ahead=False, free_forms=False)
     assert (result.verdict, result.effects) == (CLEAN, ())
-    monkeypatch.setattr(finding, "path_terms", lambda _: ())
+    monkeypatch.setattr(trace_rows, "path_terms", lambda _: ())
     without = engine.trace([train], [held_out], late, look_ahead=False, free_forms=False)
     assert without.verdict != CLEAN  # what stays of its path passes for a late channel
     found = (*without.effects, *without.refused)
