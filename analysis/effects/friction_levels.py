@@ -36,7 +36,7 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 DIFFERENCE: Final = 0.1  # of the mean level: with a smaller difference it is not asymmetric
-LEAST_SHARE: Final = 0.1  # of the other level: those of a seal do not differ by more
+LEAST_SHARE: Final = 0.02  # of the other level: below, friction acts in one direction only
 SUM: Final = 1.0  # weight of the rod pressure in the load where each seal has one pressure
 DIFFERENCE_LOAD: Final = -1.0  # the same where the difference presses the piston's seal
 

@@ -404,7 +404,7 @@ REFUSED = [
         (0.0, 2e6, 4e6, 6e6),
     ),
     ("supply_curve", "bench", {}, (0.0, 1e-4, 2e-4, 6e5, 3e5)),
-    ("asymmetric_friction", "joint 1", {"F_ext_1": 200.0, "F_ret_1": 10.0}, (40e-6, 40e-6)),
+    ("asymmetric_friction", "joint 1", {"F_ext_1": 200.0, "F_ret_1": 3.0}, (40e-6, 40e-6)),
     ("sensor_lag", "joint 1 cap", {}, (0.1,)),
     ("sensor_crosstalk", "joint 1 cap", {}, (0.3,)),
     ("spool_hysteresis", "joint 1", {}, (0.35,)),
@@ -441,6 +441,11 @@ def test_the_unphysical_is_refused_in_words(
     said = effect(name, where).problem(rig, TRUTH | values, shape)
     assert said
     assert "nan" not in said
+
+
+def test_a_seal_may_hold_a_twelfth_in_the_other_direction(rig: Rig) -> None:
+    levels = {"F_ext_1": 120.0, "F_ret_1": 10.0}
+    assert effect("asymmetric_friction", "joint 1").problem(rig, TRUTH | levels, (4e-5,)) == ""
 
 
 def test_a_spring_is_too_stiff_only_where_the_joint_could_not_move_against_it(rig: Rig) -> None:
