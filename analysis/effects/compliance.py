@@ -33,8 +33,8 @@ DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sen
 MOST_AIR: Final = 0.2
 EXPONENTS: Final = (1.0, 1.4)
 MOST_VOLUME: Final = 10.0  # of the oil in pipe and chamber at mid-stroke
-# Stiffening times the supply's pressure of a hose, at first and at most: there it gives a fourth,
-# or an eleventh, of what it gives at zero.
+# A hose's stiffening times the supply's pressure, first tried and largest: at that pressure its
+# volume V_dead is a fourth, or an eleventh, of that at zero.
 HOSE, STIFFEST = 3.0, 10.0
 
 
@@ -191,7 +191,7 @@ class DeadVolume(Effect):
         )
 
     def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
-        """Return hoses: beside a smaller b, what shows of them is that they stiffen."""
+        """Return hoses: a smaller b can replace rigid volumes, but no stiffening."""
         volume, _ = self.shapes(rig)
         return tuple((start, HOSE / rig.supply.pressure) for start in volume.grid[1:3])
 

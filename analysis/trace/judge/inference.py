@@ -173,6 +173,17 @@ def with_form_error(estimate: Estimate, shift: float) -> Estimate:
     return replace(out, ci95=(out.ci95[0], min(out.ci95[1], high / factor)))
 
 
+def all_include(values: Mapping[str, float], parameters: Mapping[str, Estimate]) -> bool:
+    """Return whether the 95 % interval of each parameter that has a value includes it.
+
+    False where none of `values` is that of one of the `parameters`.
+    """
+    found = [
+        (value, *parameters[name].ci95) for name, value in values.items() if name in parameters
+    ]
+    return bool(found) and all(low <= value <= high for value, low, high in found)
+
+
 def is_of_unknown_size(
     rig: Rig, used: Used, parameters: Mapping[str, Estimate], effects: Sequence[Used]
 ) -> bool:
@@ -184,8 +195,7 @@ def is_of_unknown_size(
     """
     own = used.term
     assert isinstance(own, Effect)
-    intervals = [parameters[c.parameter].ci95 for c in own.coefficients(rig)]
-    if own.free or not intervals or not all(low <= 0.0 <= high for low, high in intervals):
+    if own.free or not all_include({c.parameter: 0.0 for c in own.coefficients(rig)}, parameters):
         return False
     others = [o.term for o in effects if o is not used and isinstance(o.term, Effect)]
     return any(

@@ -16,6 +16,7 @@ from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.gates import NO_RIVAL, REMOVES
+from analysis.trace.judge.inference import all_include
 from analysis.trace.judge.rivals import rivals_in_words
 from analysis.trace.result import Gate, JudgedEffect
 from analysis.trace.search.exact_fit import design_matrix, jacobian
@@ -71,14 +72,14 @@ def judged_beside_unknown_cause(
 
     def refused(effect: JudgedEffect) -> JudgedEffect:
         own = used[effect.name, effect.at]
-        why = together or problem([own]) or _may_be_nothing(data.rig, own, effect)
+        why = together or problem([own]) or _size_includes_zero(data.rig, own, effect)
         return _refused(tied_in_held_out(effect), why)
 
     return tuple(map(refused, effects))
 
 
-def _may_be_nothing(rig: Rig, used: Used, effect: JudgedEffect) -> str:
-    """Return in words that the intervals of all sizes hold no effect ('' if one does not).
+def _size_includes_zero(rig: Rig, used: Used, effect: JudgedEffect) -> str:
+    """Return in words that the intervals of all sizes include no effect ('' if one does not).
 
     A size is a coefficient, or a shape with a value at which the effect vanishes. What an unknown
     cause leaves widens the intervals.
@@ -86,12 +87,10 @@ def _may_be_nothing(rig: Rig, used: Used, effect: JudgedEffect) -> str:
     assert isinstance(used.term, Effect)
     sizes = {c.parameter: 0.0 for c in used.term.coefficients(rig)}
     sizes |= {s.parameter: s.neutral for s in shapes_of(rig, used) if s.neutral is not None}
-    found = {name: effect.parameters[name] for name in sizes if name in effect.parameters}
-    if used.term.free or not found:
+    if used.term.free or not all_include(sizes, effect.parameters):
         return ""
-    if not all(e.ci95[0] <= sizes[name] <= e.ci95[1] for name, e in found.items()):
-        return ""
-    return f"{', '.join(found)} may be nothing within the interval beside a cause that is not known"
+    names = ", ".join(name for name in sizes if name in effect.parameters)
+    return f"{names} may be nothing within the interval beside a cause that is not known"
 
 
 def _refused(effect: JudgedEffect, problem: str) -> JudgedEffect:
