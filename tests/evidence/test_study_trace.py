@@ -92,12 +92,12 @@ def test_a_study_that_was_ended_goes_on_from_what_it_kept(tmp_path: Path) -> Non
 
 
 def test_the_command_beside_the_tables_is_the_one_that_makes_them_again() -> None:
-    counts, page = {"--clean": 300, "--single": 3}, Path("docs/trace.md")
+    counts, page = {"--clean": 300, "--single": 3}, Path("docs/trace-rates.md")
     assert command_of(counts, 100, page) == (
-        "python -m tests.studies trace --clean 300 --single 3 --seed 100 --docs docs/trace.md"
+        "python -m tests.studies trace --clean 300 --single 3 --seed 100 --docs docs/trace-rates.md"
     )
     assert command_of(counts, 7, page, quick=True, level=0) == (
-        "python -m tests.studies trace --quick --seed 7 --level 0 --docs docs/trace.md"
+        "python -m tests.studies trace --quick --seed 7 --level 0 --docs docs/trace-rates.md"
     )
     few = command_of({"--clean": 0}, 100, page, only="joint_spring backlash")
     assert "--clean 0 --seed 100 --only 'joint_spring backlash' --docs" in few
