@@ -18,7 +18,13 @@ from analysis.trace.judgement import Judgement, has_tied_rival
 from analysis.trace.remaining import remainders
 from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
 from analysis.trace.search.confounders import act_at_one_joint
-from analysis.trace.search.hypothesis import Hypothesis, law_of, may_grow, within_band
+from analysis.trace.search.hypothesis import (
+    Hypothesis,
+    law_of,
+    may_grow,
+    removes_too_little,
+    within_band,
+)
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 
@@ -70,7 +76,8 @@ def _sets_with_free_form(
         if len(start.laws) >= most:
             continue
         for single in wide.extensions(start, free=True):
-            if wide.removes_too_little(start, single):  # a further effect would make it needless
+            # An effect that removes so little would be needless beside a further one.
+            if removes_too_little(start, single, wide.noise_band):
                 continue
             larger = [_with_further_effect(wide, single)] if len(single.laws) < most else []
             for hypothesis in (single, *larger):

@@ -11,7 +11,13 @@ from collections.abc import Collection, Iterator, Sequence
 
 from analysis.terms.base import Used
 from analysis.trace.search.exact_fit import fit_coefficients
-from analysis.trace.search.hypothesis import Hypothesis, Key, may_grow, within_band
+from analysis.trace.search.hypothesis import (
+    Hypothesis,
+    Key,
+    log_energy_ratio,
+    may_grow,
+    within_band,
+)
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 
@@ -33,7 +39,7 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
         to_noise = within_band(better.excess_energy, hypotheses.noise_band)
         tolerated = hypotheses.within_form_tolerance(now) and not to_noise
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
-        if hypotheses.log_energy_ratio(now, better) < least:
+        if log_energy_ratio(now, better, hypotheses.noise_band) < least:
             break
         now = better
     return now

@@ -142,6 +142,49 @@ def within_band(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
     return all(value <= limit.by_equation[e] for e, value in excess_energy.items())
 
 
+def log_energy_ratio(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand) -> float:
+    """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
+
+    E is what `hypothesis` leaves, E' what `other` leaves, B the noise's band. Ratios are used
+    so that the form error of a large effect does not hide a small effect in other equations.
+    """
+    return sum(
+        float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
+        for e, v in hypothesis.excess_energy.items()
+        for band in (limit.by_equation[e],)
+    )
+
+
+def is_preferred(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand) -> bool:
+    """Return whether a set leaves much less than `other`, or about as little and is simpler.
+
+    Of two equally simple ones that leave about the same in all, that is preferred which leaves
+    less for its equations: what one effect leaves elsewhere may hide what another spoils.
+    """
+    slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
+    more, near = log_energy_ratio(hypothesis, other, limit), float(np.log(SEARCH.simpler_ratio))
+    if hypothesis.size < other.size:
+        return more <= near or hypothesis.total <= other.total + slack
+    if hypothesis.size > other.size:
+        return more < -near and hypothesis.total < other.total - slack
+    about = hypothesis.total / SEARCH.simpler_ratio, hypothesis.total * SEARCH.simpler_ratio
+    if abs(more) > near and about[0] <= other.total <= about[1]:
+        return more < 0.0
+    return hypothesis.total < other.total
+
+
+def spoils_equation(hypothesis: Hypothesis, now: Hypothesis, limit: NoiseBand) -> bool:
+    """Return whether an equation keeps more than under `now`, by more than noise."""
+    band, before = limit.by_equation, now.excess_energy
+    return any(v > before[e] + band[e] for e, v in hypothesis.excess_energy.items())
+
+
+def removes_too_little(without: Hypothesis, hypothesis: Hypothesis, limit: NoiseBand) -> bool:
+    """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
+    least = -float(np.log(1.0 - SEARCH.add_share))
+    return log_energy_ratio(without, hypothesis, limit) < least
+
+
 def effect_of(name: str, where: str) -> Effect:
     """Return an effect of the catalogue at a place."""
     effect = make(name, where)

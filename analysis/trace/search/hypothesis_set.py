@@ -35,13 +35,17 @@ from analysis.trace.search.hypothesis import (
     Key,
     effect_of,
     energy_above_noise,
+    is_preferred,
     keys_of,
     law_of,
+    log_energy_ratio,
     may_grow,
     negative_body,
     noise_band,
     of_one_law,
     parameter_values,
+    removes_too_little,
+    spoils_equation,
     within_band,
 )
 from analysis.trace.search.refinement import refine
@@ -87,11 +91,10 @@ class HypothesisSet:
         """Return a copy with further candidates; sets that were fitted already are shared."""
         wide = copy.copy(self)
         wide.effects = tuple(effects)
-        more = variant_columns(
-            self.train_data, wide.variants_of(self.train_data, self.train_data.mean_residual)
-        )
+        data = self.train_data
+        more = variant_columns(data, wide.variants_of(data, data.mean_residual))
         wide.columns = [*self.columns, *more]
-        wide.candidates = self._candidate_columns(self.train_data, wide.columns)
+        wide.candidates = self._candidate_columns(data, wide.columns)
         wide.effects = (*self.effects, *effects)
         return wide
 
@@ -175,35 +178,6 @@ class HypothesisSet:
             if key not in hypothesis.keys and others <= hypothesis.keys and len(fresh) == 1:
                 yield hypothesis, fresh[0]
 
-    def log_energy_ratio(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
-        """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
-
-        E is what `hypothesis` leaves, E' what `other` leaves, B the noise's band. Ratios are used
-        so that the form error of a large effect does not hide a small effect in other equations.
-        """
-        return sum(
-            float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
-            for e, v in hypothesis.excess_energy.items()
-            for band in (self.noise_band.by_equation[e],)
-        )
-
-    def is_preferred(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether a set leaves much less than `other`, or about as little and is simpler.
-
-        Of two equally simple ones that leave about the same in all, that is preferred which leaves
-        less for its equations: what one effect leaves elsewhere may hide what another spoils.
-        """
-        slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
-        more, near = self.log_energy_ratio(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
-        if hypothesis.size < other.size:
-            return more <= near or hypothesis.total <= other.total + slack
-        if hypothesis.size > other.size:
-            return more < -near and hypothesis.total < other.total - slack
-        about = hypothesis.total / SEARCH.simpler_ratio, hypothesis.total * SEARCH.simpler_ratio
-        if abs(more) > near and about[0] <= other.total <= about[1]:
-            return more < 0.0
-        return hypothesis.total < other.total
-
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
         """Return the simplest physical set of those that leave about the least, else `empty`.
 
@@ -214,11 +188,11 @@ class HypothesisSet:
             return self.empty
 
         def preferred(one: Hypothesis, other: Hypothesis) -> Hypothesis:
-            return other if self.is_preferred(other, one) else one
+            return other if is_preferred(other, one, self.noise_band) else one
 
         least = min(allowed, key=lambda o: o.total)
         least = functools.reduce(preferred, (o for o in allowed if o.size == least.size), least)
-        near = [o for o in allowed if o is least or self.is_preferred(o, least)]
+        near = [o for o in allowed if o is least or is_preferred(o, least, self.noise_band)]
         simplest = min((sum(o.size), o.size[0]) for o in near)
         return functools.reduce(
             preferred, (o for o in near if (sum(o.size), o.size[0]) == simplest)
@@ -245,22 +219,19 @@ class HypothesisSet:
 
         `progress` is called with the share of the candidates' columns that is computed.
         """
-        self.columns = variant_columns(
-            self.train_data,
-            self.variants_of(self.train_data, self.train_data.mean_residual),
-            progress,
-        )
-        candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
-        r = self.train_data.mean_residual
+        data, r = self.train_data, self.train_data.mean_residual
+        self.columns = variant_columns(data, self.variants_of(data, r), progress)
+        candidates = self.candidates = self._candidate_columns(data, self.columns)
         r = r - candidates.basis @ (candidates.basis.T @ r)
         found = self.exchanged(self._searched(candidates, r))
         return self.fitted.get(found.keys, found)  # a later start may have found better shapes
 
     def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
+        band = self.noise_band
         singles = [self.refined(effects) for effects in self._singles(candidates, r)]
         now = self.prune(self.best([self.empty, *singles]))
-        if within_band(now.excess_energy, self.noise_band):
+        if within_band(now.excess_energy, band):
             return now
         pairs = [
             self.refined([candidates.entries[m].variant.used for m in pair.members])
@@ -268,12 +239,19 @@ class HypothesisSet:
         ]
         if self.within_form_tolerance(now):
             others = [o for o in pairs if not now.keys & o.keys]
-            far = [o for o in others if self.log_energy_ratio(o, now) < -SEARCH.far_log_gain]
+            far = [
+                o
+                for o in others
+                if log_energy_ratio(o, now, self.noise_band) < -SEARCH.far_log_gain
+            ]
             return self.completed_to_noise(self.prune(self.best([now, *far])))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within_band(now.excess_energy, self.noise_band) and may_grow(now.effects):
+        while not within_band(now.excess_energy, band) and may_grow(now.effects):
             grown = self.prune(self.best([now, *self.extensions(now)]))
-            if grown.keys == now.keys or self.log_energy_ratio(now, grown) < SEARCH.least_log_gain:
+            if (
+                grown.keys == now.keys
+                or log_energy_ratio(now, grown, self.noise_band) < SEARCH.least_log_gain
+            ):
                 break
             now = grown
             if self.within_form_tolerance(now):
@@ -418,12 +396,9 @@ class HypothesisSet:
         others = [u for u in effects if u not in fresh]
         effects = [*others, *(at_best_size(self.train_data, u, others) for u in fresh)]
         known = self.refined(effects)
-        return self._refined_anew(effects) if self._spoils_equation(known, now) else known
-
-    def _spoils_equation(self, hypothesis: Hypothesis, now: Hypothesis) -> bool:
-        """Return whether an equation keeps more than under `now`, by more than noise."""
-        band, before = self.noise_band.by_equation, now.excess_energy
-        return any(v > before[e] + band[e] for e, v in hypothesis.excess_energy.items())
+        return (
+            self._refined_anew(effects) if spoils_equation(known, now, self.noise_band) else known
+        )
 
     def may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
         """Return whether a candidate may have columns in some of the equations (any if none).
@@ -502,11 +477,12 @@ class HypothesisSet:
             o
             for o in self.fitted.values()
             if 0 < o.size[0] < least[0] and sum(o.size) <= least[1]
-            and not self._spoils_equation(o, now)
+            and not spoils_equation(o, now, self.noise_band)
         ]  # fmt: skip
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:
         """Return the set without effects that are not needed or remove too little."""
+        band = self.noise_band
         while len(hypothesis.effects) > 1:
             smaller = [
                 self._refined_anew([u for u in hypothesis.effects if u is not used])
@@ -516,13 +492,9 @@ class HypothesisSet:
             simpler = [
                 o
                 for o in smaller
-                if self.is_preferred(o, hypothesis) or self.removes_too_little(o, hypothesis)
+                if is_preferred(o, hypothesis, band) or removes_too_little(o, hypothesis, band)
             ]
             if not simpler:
                 break
             hypothesis = min(simpler, key=lambda o: o.total)
         return hypothesis
-
-    def removes_too_little(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
-        """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
-        return self.log_energy_ratio(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))

@@ -13,6 +13,7 @@ from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     energy_above_noise,
+    is_preferred,
     may_grow,
     negative_body,
 )
@@ -94,8 +95,8 @@ def test_of_two_equally_simple_sets_the_one_that_spoils_no_equation_is_preferred
     kept = leaving("internal_leakage", torque=1.0, flow=1.00e5)
     spoiled = leaving("torque_offset", torque=100.0, flow=0.99e5)
     assert spoiled.total < kept.total
-    assert s.hypotheses.is_preferred(kept, spoiled)
-    assert not s.hypotheses.is_preferred(spoiled, kept)
+    assert is_preferred(kept, spoiled, s.hypotheses.noise_band)
+    assert not is_preferred(spoiled, kept, s.hypotheses.noise_band)
     assert s.hypotheses.best([spoiled, kept]) is kept
     far = leaving("torque_offset", torque=100.0, flow=0.5e5)
     assert s.hypotheses.best([far, kept]) is far
