@@ -84,6 +84,25 @@ class OutputLaw:
 OFF = OutputLaw()
 
 
+@dataclass(frozen=True)
+class ActiveLaw:
+    """One joint's output law with its waveform [V] and the tick of the waveform's first sample."""
+
+    wave: Array
+    start: int
+    gain: float = 0.0
+    bias: float = 0.0
+    position_gain: float = 0.0
+    setpoint: float = 0.0
+    limit: float = 0.0
+
+    def volts(self, tick: int, position: float) -> float:
+        """Return the output [V] at a tick and a position [m or rad]."""
+        played = self.gain * self.wave[(tick - self.start) % len(self.wave)] + self.bias
+        wanted = played + self.position_gain * (self.setpoint - position)
+        return float(min(max(wanted, -self.limit), self.limit))
+
+
 def check_count(laws: Sequence[OutputLaw], rig: Rig) -> None:
     """Raise DeviceError unless there is one law per joint."""
     if len(laws) != len(rig.joints):

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 from typing import Any, ClassVar, Protocol
 from urllib.parse import SplitResult
 
@@ -24,6 +24,7 @@ from pydantic import Field
 
 from drivers.base import (
     OFF,
+    ActiveLaw,
     Array,
     DeviceError,
     DeviceInfo,
@@ -43,25 +44,6 @@ logger = logging.getLogger(__name__)
 
 BLOCK_SAMPLES = 10
 _SILENCE = np.zeros(1)
-
-
-@dataclass(frozen=True)
-class ActiveLaw:
-    """One joint's output law with its waveform [V] and the tick of the waveform's first sample."""
-
-    wave: Array
-    start: int
-    gain: float
-    bias: float
-    position_gain: float
-    setpoint: float
-    limit: float
-
-    def volts(self, tick: int, position: float) -> float:
-        """Return the output [V] at a tick and a position [m or rad]."""
-        played = self.gain * self.wave[(tick - self.start) % len(self.wave)] + self.bias
-        wanted = played + self.position_gain * (self.setpoint - position)
-        return float(min(max(wanted, -self.limit), self.limit))
 
 
 class Advancing(Protocol):

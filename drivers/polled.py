@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import (
-    OFF,
+    ActiveLaw,
     Array,
     DeviceBusy,
     DeviceError,
@@ -139,7 +139,7 @@ class PolledDriver:
             rig.channels.index(ch.channel(rig.position_kind, i + 1)) for i in range(len(rig.joints))
         ]
         self._uploaded: list[Array] = [np.zeros(1) for _ in rig.joints]
-        self._laws = _Laws(len(rig.joints))
+        self._laws = [ActiveLaw(wave, 0) for wave in self._uploaded]
         self._resampler = Resampler()
         self._rows: deque[tuple[Row, Array, float]] = deque()
         self._origin: float | None = None
@@ -258,7 +258,11 @@ class PolledDriver:
         if self._cause is not None and any(law.limit > 0.0 for law in laws):
             raise DeviceError(f"tripped: {self._cause}; find the cause, then reset it")
         tick = self._next_tick()
-        self._laws.set(laws, self._uploaded, tick if restart else None)
+        starts = [tick if restart else law.start for law in self._laws]
+        self._laws = [
+            ActiveLaw(wave, start, *astuple(law))
+            for wave, start, law in zip(self._uploaded, starts, laws, strict=True)
+        ]
         return tick
 
     # -- samples ----------------------------------------------------------------------------
@@ -271,7 +275,7 @@ class PolledDriver:
         self._sequence, self._block_end = 0, None
         self._written = self._clock()
         self._last = max(self._last, math.floor(self._periods(self._written) + DRIVER.early))
-        self._laws.restart(self._last + 1)
+        self._laws = [replace(law, start=self._last + 1) for law in self._laws]
         values, at = self._take()  # sample from which the first tick is interpolated
         self._resampler.add(at, values, self._saturated(values))
         self._streaming = True
@@ -322,7 +326,7 @@ class PolledDriver:
         tick = self._wait()
         values, at = self._take()
         self._trip_on_silence()
-        held, self._volts = self._volts, self._laws.volts(tick, values[self._positions])
+        held, self._volts = self._volts, self._wanted(tick, values[self._positions])
         self._put(self._volts)
         lateness = at - tick
         own = at / self._rig.sample_rate
@@ -401,6 +405,15 @@ class PolledDriver:
         marks: NDArray[np.bool_] = (values <= self._low) | (values >= self._high)
         return marks
 
+    def _wanted(self, tick: int, positions: Array) -> Array:
+        """Return the outputs (n,) [V] at a tick; zero for a joint whose position is NaN."""
+        return np.array(
+            [
+                law.volts(tick, position) if math.isfinite(position) else 0.0
+                for law, position in zip(self._laws, positions, strict=True)
+            ]
+        )
+
     def _put(self, volts: Array) -> None:
         self._safely(lambda: self._device.write(volts.copy()))
         self._written = self._clock()
@@ -435,7 +448,7 @@ class PolledDriver:
             )
 
     def _zero_laws(self) -> None:
-        self._laws.zero()
+        self._laws = [ActiveLaw(law.wave, law.start) for law in self._laws]
         self._volts = np.zeros(len(self._rig.joints))
 
     def _make_safe(self) -> None:
@@ -475,40 +488,6 @@ class PolledDriver:
             raise DeviceError(
                 f"the device of wire {self._wire.kind} failed: {type(error).__name__}: {error}"
             ) from error
-
-
-class _Laws:
-    """The laws in force, as arrays over the joints."""
-
-    def __init__(self, joints: int) -> None:
-        self._joints = joints
-        self._waves: list[Array] = [np.zeros(1)] * joints
-        self._starts = [0] * joints
-        self._numbers = np.zeros((5, joints))
-
-    def set(self, laws: Sequence[OutputLaw], waves: Sequence[Array], start: int | None) -> None:
-        """Store laws and waveforms; `start` is the tick of the waveforms' first sample."""
-        self._numbers = np.array([astuple(law) for law in laws], dtype=np.float64).T
-        self._waves = list(waves)
-        if start is not None:
-            self.restart(start)
-
-    def restart(self, tick: int) -> None:
-        """Let every waveform begin at a tick."""
-        self._starts = [tick] * self._joints
-
-    def zero(self) -> None:
-        """Switch every law off."""
-        self._numbers = np.array([astuple(OFF)] * self._joints, dtype=np.float64).T
-
-    def volts(self, tick: int, positions: NDArray[np.float64]) -> Array:
-        """Return the outputs [V] at a tick; zero for a joint whose position is NaN."""
-        gain, bias, position_gain, setpoint, limit = self._numbers
-        waves = zip(self._waves, self._starts, strict=True)
-        wave = np.array([samples[(tick - start) % len(samples)] for samples, start in waves])
-        known = np.isfinite(positions)
-        pull = position_gain * (setpoint - np.where(known, positions, 0.0))
-        return np.where(known, np.clip(gain * wave + bias + pull, -limit, limit), 0.0)
 
 
 def _silence_allowed(wire: Wire, rig: Rig, watchdog: float | None, accepted: bool) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
+from drivers.base import OFF, ActiveLaw, DeviceError, DeviceLost, OutputLaw
 from drivers.conformance import (
     Capabilities,
     CheckVerdict,
@@ -18,7 +18,7 @@ from drivers.conformance import (
     Subject,
     run,
 )
-from drivers.in_process import ActiveLaw, Advancing, InProcessDriver
+from drivers.in_process import Advancing, InProcessDriver
 from rig.model.rig import Rig
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
