@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from analysis.identify import geometry as geo
 from analysis.identify.checks import Check
+from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.solve import Solution, half_width
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
@@ -124,10 +125,19 @@ def _estimate(
     if value == 0:
         return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
     slope = -1.0 / value**2
-    # An interval of 1/b that includes zero leaves b unbounded above.
-    ends = (1.0 / high, 1.0 / low if low > 0 else np.inf) if value > 0 else (np.nan, np.nan)
+    ends = _reciprocal_interval(value, low, high) if value > 0 else (np.nan, np.nan)
     estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
     return estimate, float(slope)
+
+
+def _reciprocal_interval(value: float, low: float, high: float) -> tuple[float, float]:
+    """Return the interval of b [Pa] for an estimate of 1/b > 0 and its interval [1/Pa].
+
+    An interval of 1/b that reaches zero leaves b open above; no hydraulic liquid exceeds
+    `IDENTIFY.stiffest_liquid`.
+    """
+    least = min(1.0 / IDENTIFY.stiffest_liquid, value)
+    return float(1.0 / high), float(1.0 / max(low, least))
 
 
 def with_ends(
@@ -136,6 +146,8 @@ def with_ends(
     """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
     out = dict(estimates)
     for name, (low, high) in ends.items():
-        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        interval = low, high
+        if name == "b" and out[name].value > 0.0:
+            interval = _reciprocal_interval(1.0 / out[name].value, low, high)
         out[name] = replace(out[name], ci95=interval)
     return out

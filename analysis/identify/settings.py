@@ -19,6 +19,7 @@ class IdentifySettings:
     lost_share: float = 0.01  # of a run's samples
     most_creep: float = 2e-4  # [m/s] valves closed; the drift that a record of 10 s may have
     masked_share: float = 0.2  # of an equation's rows
+    stiffest_liquid: float = 4e9  # [Pa] bulk modulus; oils have up to 2.5e9, water-glycol 3.5e9
     condition_limit: float = 200.0  # scaled columns; the paper's are 10 to 27
     noise_bias: float = 0.01  # relative, of the worst parameter
     rejected_level: float = 0.01  # p value below which the data reject a physical constraint

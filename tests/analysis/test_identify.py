@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
-from analysis.identify.result import Identification, to_json
+from analysis.identify.result import Identification, estimates_of, to_json, with_ends
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import FILTERINGS, Filtering
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter, row_filter, row_step
@@ -181,6 +182,22 @@ def test_what_the_records_cannot_tell_is_null_not_a_number(multisine_run: Run) -
     assert "no row contains it" in data["parameters"]["M1"]["note"]
     failed = {c.name for c in result.checks if not c.ok}
     assert {"excited joints", "identifiable mechanical", "identifiable fluid"} <= failed
+
+
+def test_compressibility_that_may_be_zero_leaves_b_up_to_that_of_the_stiffest_liquid(
+    found: Identification,
+) -> None:
+    fluid, b = found.solutions["fluid"], found.estimates["b"]
+    i = fluid.names.index("b")
+    share = fluid.value[i] ** 2 / fluid.covariance[i, i]  # 1/b is one standard error from zero
+    vague = replace(fluid, covariance=share * fluid.covariance)
+    estimates, _ = estimates_of(found.model.rig, found.model.terms, {"fluid": vague})
+    low, high = estimates["b"].ci95
+    assert 0.0 < low < b.value / 2.0
+    assert high == pytest.approx(IDENTIFY.stiffest_liquid)
+    # Ends of a bootstrap of 1/b are treated alike.
+    (low, high) = with_ends(estimates, {"b": (-1e-9, 2.0 / b.value)})["b"].ci95
+    assert (low, high) == pytest.approx((b.value / 2.0, IDENTIFY.stiffest_liquid))
 
 
 def test_with_joint_two_at_one_place_its_inertia_hides_in_joint_ones(multisine_run: Run) -> None:
