@@ -125,12 +125,12 @@ def _estimate(
     if value == 0:
         return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
     slope = -1.0 / value**2
-    ends = _reciprocal_interval(value, low, high) if value > 0 else (np.nan, np.nan)
+    ends = reciprocal_interval(value, low, high) if value > 0 else (np.nan, np.nan)
     estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
     return estimate, float(slope)
 
 
-def _reciprocal_interval(value: float, low: float, high: float) -> tuple[float, float]:
+def reciprocal_interval(value: float, low: float, high: float) -> tuple[float, float]:
     """Return the interval of b [Pa] for an estimate of 1/b > 0 and its interval [1/Pa].
 
     An interval of 1/b that reaches zero leaves b open above; no hydraulic liquid exceeds
@@ -148,6 +148,6 @@ def with_ends(
     for name, (low, high) in ends.items():
         interval = low, high
         if name == "b" and out[name].value > 0.0:
-            interval = _reciprocal_interval(1.0 / out[name].value, low, high)
+            interval = reciprocal_interval(1.0 / out[name].value, low, high)
         out[name] = replace(out[name], ci95=interval)
     return out

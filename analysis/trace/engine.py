@@ -299,7 +299,7 @@ def _traced(
         *phase_notes(finding.named, records.lines),
         *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
         *refitted_notes(winner.fit, last, after),
-        *shared_parameters(winner, after).values(),
+        *(why for _, why in shared_parameters(winner, after).values()),
         *record_condition_notes(train_data, winner),
         *undetermined_notes(after, before, finding.rows.in_motion),
         *kept,

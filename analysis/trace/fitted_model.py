@@ -6,13 +6,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from analysis.effects.base import Effect, ordered
 from analysis.identify.coupled import coupled
 from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
-from analysis.identify.result import Identification, by_geometry
+from analysis.identify.result import Identification, by_geometry, reciprocal_interval
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used, family_of
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.temperature_nuisance import at_nominal_temperature
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns
 from analysis.trace.finding import Finding
@@ -25,7 +29,7 @@ from analysis.trace.next_experiment.detection_limits import AbsorbedEffects, abs
 from analysis.trace.next_experiment.small_effects import sets_with_small_effect, small_effect_notes
 from analysis.trace.notes import shared_parameters
 from analysis.trace.result import UNEXPLAINED, JudgedEffect
-from analysis.trace.search.exact_fit import fit_coefficients
+from analysis.trace.search.exact_fit import contribution, design_matrix, fit_coefficients
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from rig.model.records import Record, Run
 
@@ -90,7 +94,10 @@ def model_with_effects(
         for f in finding.named
     )
     after = with_effect_values(after, effects)
-    shared = {n: _without_interval(after.parameters[n]) for n in shared_parameters(winner, after)}
+    shared = {
+        name: _with_curve(after.parameters[name], name, used, rows.train, finding.winner)
+        for name, (used, _) in shared_parameters(finding.winner, after).items()
+    }
     after = replace(after, parameters={**after.parameters, **shared})
     notes = small_effect_notes(finding.winner, larger)
     return FittedModel(winner, after, effects, tuple(notes), absorbed)
@@ -117,8 +124,22 @@ def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
     return replace(model, parameters=parameters)
 
 
-def _without_interval(estimate: Estimate) -> Estimate:
-    return replace(estimate, std=math.nan, ci95=(math.nan, math.nan))
+def _with_curve(
+    estimate: Estimate, name: str, curve: Used, data: RegressionData, winner: Hypothesis
+) -> Estimate:
+    """Return a parameter that a free curve shares, with an interval of all of both.
+
+    Half of it is the parameter itself and what would add as much to the rows as the curve does.
+    """
+    fit = winner.fit
+    rows = design_matrix(data, fit.terms)
+    column = rows.matrix[:, rows.names.index(name)]
+    value, size = fit.beta[name], np.linalg.norm(contribution(data, fit, curve))
+    half = abs(value) + float(size / np.linalg.norm(column))
+    low, high = value - half, value + half
+    if name == "b":
+        low, high = reciprocal_interval(value, low, high)
+    return replace(estimate, std=0.5 * (high - low) / IDENTIFY.normal_quantile, ci95=(low, high))
 
 
 def with_effect_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:

@@ -9,7 +9,7 @@ from analysis.effects.base import Effect
 from analysis.effects.free_flows import BulkModulusCurve
 from analysis.effects.free_forces import FrictionCurve, PositionForce
 from analysis.simulation.model import Model
-from analysis.terms.base import equation
+from analysis.terms.base import Used, equation
 from analysis.trace.data.noise_floor import (
     NEIGHBOURS,
     OTHER_STEPS,
@@ -196,13 +196,14 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
     return out
 
 
-def shared_parameters(winner: Hypothesis, after: Model) -> dict[str, str]:
-    """Return the baseline parameters that free curves of the same joint share, and why in words.
+def shared_parameters(winner: Hypothesis, after: Model) -> dict[str, tuple[Used, str]]:
+    """Return the baseline parameters that free curves share: the curve, and why in words.
 
-    Their value depends on how the curve is centred, so that it has no interval.
+    Their value depends on how the curve is centred.
     """
     out = {}
-    for effect in (u.term for u in winner.effects):
+    for used in winner.effects:
+        effect = used.term
         if isinstance(effect, PositionForce):
             name, what = f"W{effect.joint + 1}", "weight"
             why = "in one pose of the other joints gravity is a force over position too"
@@ -215,6 +216,6 @@ def shared_parameters(winner: Hypothesis, after: Model) -> dict[str, str]:
         else:
             continue
         if name in after.parameters:
-            shared = f"{effect.name} at {effect.where} shares it"
-            out[name] = f"{name} is no measured {what}: {why}, and {shared}"
+            shared = f"{effect.name} at {effect.where} shares it; its interval includes all of both"
+            out[name] = used, f"{name} is no measured {what}: {why}, and {shared}"
     return out
