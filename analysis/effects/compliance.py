@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from analysis.terms.base import (
     V_ROD,
     Coefficient,
     Columns,
-    Kernel,
     equation,
     kernel,
 )
@@ -38,6 +37,17 @@ MOST_VOLUME: Final = 10.0  # of the oil in pipe and chamber at mid-stroke
 HOSE, STIFFEST = 3.0, 10.0
 
 
+@kernel
+def _air(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        n = par[1]
+        for i in range(x.shape[1]):
+            cap = max(x[P_CAP, i], -DEEPEST) + ATMOSPHERE
+            rod = max(x[P_ROD, i], -DEEPEST) + ATMOSPHERE
+            out[COMP_CAP, i] += par[0] * x[V_CAP, i] * (ATMOSPHERE / cap) ** (1 / n) / (n * cap)
+            out[COMP_ROD, i] += par[0] * x[V_ROD, i] * (ATMOSPHERE / rod) ** (1 / n) / (n * rod)
+
+
 @dataclass(frozen=True)
 class EntrainedAir(Effect):
     """A share alpha of free air at atmospheric pressure p0 makes the oil softer at low pressure.
@@ -47,23 +57,19 @@ class EntrainedAir(Effect):
     Streeter 1993). Linear in alpha.
     """
 
-    mechanism: ClassVar[str] = "bulk_modulus_curve"
-    element: ClassVar[str] = "chamber"
-    name: ClassVar[str] = "entrained_air"
-    least: ClassVar[tuple[float, ...]] = (3e-3,)  # of the volume, at one atmosphere
-    hydraulic: ClassVar[bool] = True
-    family: ClassVar[str] = "fluid"
-    variable: ClassVar[str] = "the pressure rate at low chamber pressure"
-    quantity: ClassVar[str] = "pressure"
-    confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag", "channel_delay")
-    separated_by: ClassVar[str] = (
+    mechanism = "bulk_modulus_curve"
+    element = "chamber"
+    name = "entrained_air"
+    least = (3e-3,)  # of the volume, at one atmosphere
+    hydraulic = True
+    family = "fluid"
+    variable = "the pressure rate at low chamber pressure"
+    quantity = "pressure"
+    confounders = ("dead_volume", "spool_lag", "channel_delay")
+    separated_by = (
         "fast pressure changes at low and at high chamber pressure: dead volume acts alike at both"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _air
+    kernel = _air
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -124,6 +130,14 @@ class EntrainedAir(Effect):
         return out
 
 
+@kernel
+def _dead(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        x[V_CAP, i] += par[1] / (1.0 + par[3] * max(x[P_CAP, i], 0.0))
+        x[V_ROD, i] += par[2] / (1.0 + par[3] * max(x[P_ROD, i], 0.0))
+
+
 @dataclass(frozen=True)
 class DeadVolume(Effect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
@@ -137,27 +151,21 @@ class DeadVolume(Effect):
     piston.
     """
 
-    mechanism: ClassVar[str] = "chamber_volume"
-    element: ClassVar[str] = "chamber"
-    name: ClassVar[str] = "dead_volume"
-    least_shape: ClassVar[tuple[float, ...]] = (20e-6,)  # [m^3]
-    prepares: ClassVar[bool] = True
-    hydraulic: ClassVar[bool] = True
-    family: ClassVar[str] = "fluid"
-    stage: ClassVar[int] = VOLUME
-    alters: ClassVar[tuple[str, ...]] = ("fluid",)
-    variable: ClassVar[str] = "the chamber's pressure rate"
-    quantity: ClassVar[str] = "pressure rate"
-    confounders: ClassVar[tuple[str, ...]] = ("entrained_air", "spool_lag", "channel_delay")
-    separated_by: ClassVar[str] = (
-        "fast pressure changes near both ends of the stroke, of several chambers"
-    )
+    mechanism = "chamber_volume"
+    element = "chamber"
+    name = "dead_volume"
+    least_shape = (20e-6,)  # [m^3]
+    prepares = True
+    hydraulic = True
+    family = "fluid"
+    stage = VOLUME
+    alters = ("fluid",)
+    variable = "the chamber's pressure rate"
+    quantity = "pressure rate"
+    confounders = ("entrained_air", "spool_lag", "channel_delay")
+    separated_by = "fast pressure changes near both ends of the stroke, of several chambers"
+    kernel = _dead
     where: str = "joint 1 cap"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _dead
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -247,25 +255,6 @@ class DeadVolume(Effect):
         """Return the chamber's pressure rate [Pa/s]."""
         rate = signals.pd_cap if self.side == "cap" else signals.pd_rod
         return {equation(f"flow_{self.side}", self.joint): rate[:, self.joint]}
-
-
-@kernel
-def _air(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        n = par[1]
-        for i in range(x.shape[1]):
-            cap = max(x[P_CAP, i], -DEEPEST) + ATMOSPHERE
-            rod = max(x[P_ROD, i], -DEEPEST) + ATMOSPHERE
-            out[COMP_CAP, i] += par[0] * x[V_CAP, i] * (ATMOSPHERE / cap) ** (1 / n) / (n * cap)
-            out[COMP_ROD, i] += par[0] * x[V_ROD, i] * (ATMOSPHERE / rod) ** (1 / n) / (n * rod)
-
-
-@kernel
-def _dead(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        i = int(par[0])
-        x[V_CAP, i] += par[1] / (1.0 + par[3] * max(x[P_CAP, i], 0.0))
-        x[V_ROD, i] += par[2] / (1.0 + par[3] * max(x[P_ROD, i], 0.0))
 
 
 TERMS = (EntrainedAir, DeadVolume)

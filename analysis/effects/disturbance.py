@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from analysis.terms.base import (
     TORQUE,
     Coefficient,
     Columns,
-    Kernel,
     equation,
     kernel,
 )
@@ -30,6 +29,13 @@ BAND: Final = 0.4  # of the rows' rate: what stands above is their filter's edge
 FINE: Final = 4  # frequencies looked at within one over the record's length
 
 
+@kernel
+def _wave(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        angle = par[3] * bench[TIME]
+        out[TORQUE, int(par[0])] += par[1] * math.sin(angle) + par[2] * math.cos(angle)
+
+
 @dataclass(frozen=True)
 class PeriodicDisturbance(Effect):
     """Torque T_sin sin(2 pi f t) + T_cos cos(2 pi f t) on the joint, t since the record began.
@@ -39,23 +45,19 @@ class PeriodicDisturbance(Effect):
     them; its amplitude is then reported, and no model or free run contains it.
     """
 
-    mechanism: ClassVar[str] = "disturbance"
-    name: ClassVar[str] = "periodic_disturbance"
-    least: ClassVar[tuple[float, ...]] = (1.0, 0.0)  # [N m]
-    family: ClassVar[str] = "mechanics"
-    variable: ClassVar[str] = "time, at one frequency"
-    quantity: ClassVar[str] = "time"
-    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring")
-    separated_by: ClassVar[str] = (
+    mechanism = "disturbance"
+    name = "periodic_disturbance"
+    least = (1.0, 0.0)  # [N m]
+    family = "mechanics"
+    variable = "time, at one frequency"
+    quantity = "time"
+    confounders = ("torque_offset", "joint_spring")
+    separated_by = (
         "another excitation, which changes effects of the joint's motion but not this one"
     )
-    by_data: ClassVar[bool] = True
+    by_data = True
+    kernel = _wave
     where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _wave
 
     def _names(self) -> tuple[str, str]:
         return f"T_sin_{self.joint + 1}", f"T_cos_{self.joint + 1}"
@@ -118,13 +120,6 @@ class PeriodicDisturbance(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return time [s]."""
         return {equation("torque", self.joint): signals.t}
-
-
-@kernel
-def _wave(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        angle = par[3] * bench[TIME]
-        out[TORQUE, int(par[0])] += par[1] * math.sin(angle) + par[2] * math.cos(angle)
 
 
 TERMS = (PeriodicDisturbance,)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from analysis.terms.base import (
     V_ROD,
     Coefficient,
     Columns,
-    Kernel,
     U,
     equation,
     kernel,
@@ -57,6 +56,26 @@ BACKWARDS: Final = 0.05  # of its largest flow that an edge may reverse: uncerta
 EDGES: Final = ("pp", "pm", "mp", "mm")
 
 
+@kernel
+def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i = int(par[0])
+    u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
+    if u > 0.0:
+        out[FLOW_CAP, i] += curve_at(u, par, 1, OPENINGS) * signed_root(bench[P_S] - cap)
+        out[FLOW_ROD, i] -= curve_at(u, par, 1 + 2 * PACKED, OPENINGS) * signed_root(
+            rod - bench[P_TANK]
+        )
+    elif u < 0.0:
+        out[FLOW_CAP, i] -= curve_at(-u, par, 1 + PACKED, OPENINGS) * signed_root(
+            cap - bench[P_TANK]
+        )
+        out[FLOW_ROD, i] += curve_at(-u, par, 1 + 3 * PACKED, OPENINGS) * signed_root(
+            bench[P_S] - rod
+        )
+
+
 @dataclass(frozen=True)
 class MeteringCurve(Effect):
     """Each edge passes (C |u| + f(|u|)) sqrt(dp): an edge's form over the spool, f a curve.
@@ -64,23 +83,19 @@ class MeteringCurve(Effect):
     f is zero at the null and at the largest opening of the records, where C is the whole edge.
     """
 
-    name: ClassVar[str] = "metering_curve"
-    family: ClassVar[str] = "valve"
-    mechanism: ClassVar[str] = "metering_curve"
-    element: ClassVar[str] = "valve"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    hydraulic: ClassVar[bool] = True
-    variable: ClassVar[str] = "the spool"
-    quantity: ClassVar[str] = "spool"
-    confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "supply_sag", "tank_pressure")
-    separated_by: ClassVar[str] = "the same opening at several pressures across the edge"
+    name = "metering_curve"
+    family = "valve"
+    mechanism = "metering_curve"
+    element = "valve"
+    free = True
+    by_data = True
+    hydraulic = True
+    variable = "the spool"
+    quantity = "spool"
+    confounders = ("leakage_curve", "supply_sag", "tank_pressure")
+    separated_by = "the same opening at several pressures across the edge"
+    kernel = _edges
     where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _edges
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots."""
@@ -174,6 +189,14 @@ class MeteringCurve(Effect):
         return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
 
 
+@kernel
+def _softness(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            out[COMP_CAP, i] += x[V_CAP, i] * curve_at(x[P_CAP, i], par, 0, 4)
+            out[COMP_ROD, i] += x[V_ROD, i] * curve_at(x[P_ROD, i], par, 0, 4)
+
+
 @dataclass(frozen=True)
 class BulkModulusCurve(Effect):
     """1/b_eff = 1/b + f(p): the oil's compressibility over its pressure, f a curve.
@@ -181,22 +204,18 @@ class BulkModulusCurve(Effect):
     f is zero at the highest pressure of the records, where b is the whole modulus.
     """
 
-    name: ClassVar[str] = "bulk_modulus_curve"
-    family: ClassVar[str] = "fluid"
-    mechanism: ClassVar[str] = "bulk_modulus_curve"
-    element: ClassVar[str] = "chamber"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    hydraulic: ClassVar[bool] = True
-    variable: ClassVar[str] = "the pressure rate, by the pressure"
-    quantity: ClassVar[str] = "pressure"
-    confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag")
-    separated_by: ClassVar[str] = "fast pressure changes at low and at high chamber pressure"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _softness
+    name = "bulk_modulus_curve"
+    family = "fluid"
+    mechanism = "bulk_modulus_curve"
+    element = "chamber"
+    free = True
+    by_data = True
+    hydraulic = True
+    variable = "the pressure rate, by the pressure"
+    quantity = "pressure"
+    confounders = ("dead_volume", "spool_lag")
+    separated_by = "fast pressure changes at low and at high chamber pressure"
+    kernel = _softness
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -271,34 +290,6 @@ class BulkModulusCurve(Effect):
             out[equation("flow_cap", i)] = signals.p_cap[:, i]
             out[equation("flow_rod", i)] = signals.p_rod[:, i]
         return out
-
-
-@kernel
-def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    i = int(par[0])
-    u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
-    if u > 0.0:
-        out[FLOW_CAP, i] += curve_at(u, par, 1, OPENINGS) * signed_root(bench[P_S] - cap)
-        out[FLOW_ROD, i] -= curve_at(u, par, 1 + 2 * PACKED, OPENINGS) * signed_root(
-            rod - bench[P_TANK]
-        )
-    elif u < 0.0:
-        out[FLOW_CAP, i] -= curve_at(-u, par, 1 + PACKED, OPENINGS) * signed_root(
-            cap - bench[P_TANK]
-        )
-        out[FLOW_ROD, i] += curve_at(-u, par, 1 + 3 * PACKED, OPENINGS) * signed_root(
-            bench[P_S] - rod
-        )
-
-
-@kernel
-def _softness(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        for i in range(x.shape[1]):
-            out[COMP_CAP, i] += x[V_CAP, i] * curve_at(x[P_CAP, i], par, 0, 4)
-            out[COMP_ROD, i] += x[V_ROD, i] * curve_at(x[P_ROD, i], par, 0, 4)
 
 
 TERMS = (MeteringCurve, BulkModulusCurve)

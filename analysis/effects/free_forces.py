@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -34,7 +34,6 @@ from analysis.terms.base import (
     Coefficient,
     Columns,
     G,
-    Kernel,
     S,
     equation,
     kernel,
@@ -58,6 +57,16 @@ def _refuse_large_force(rig: Rig, joint: int, y: Array, what: str) -> str:
     return refuse_large(y, force_limit(rig, joint), what, force_unit(rig, joint))
 
 
+@kernel
+def _over_speed(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v = x[SD, i]
+        state, dz[0] = slide(v, z[0], par[1], 0.0, par[2])
+        force = state * curve_at(abs(v), par, 3, 4) + abs(state) * curve_at(abs(v), par, 15, 4)
+        out[TORQUE, i] -= x[G, i] * force * max(0.0, 1.0 + par[27] * (x[S, i] - par[28]))
+
+
 @dataclass(frozen=True)
 class FrictionCurve(Friction):
     """F_f = max(0, 1 + k x) (z f(|s'|) + |z| g(|s'|)): friction over speed by direction.
@@ -68,21 +77,17 @@ class FrictionCurve(Friction):
     a bore or a seal that is tighter towards one end, and free where 1 + k x is below 0.
     """
 
-    name: ClassVar[str] = "friction_curve"
-    mechanism: ClassVar[str] = "friction_curve"
-    element: ClassVar[str] = "piston"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    variable: ClassVar[str] = "the piston's velocity"
-    confounders: ClassVar[tuple[str, ...]] = ("position_force",)
-    separated_by: ClassVar[str] = "slow and fast motion about several places of the stroke"
-    before: ClassVar[int] = SPEEDS
-    after: ClassVar[int] = 1
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _over_speed
+    name = "friction_curve"
+    mechanism = "friction_curve"
+    element = "piston"
+    free = True
+    by_data = True
+    variable = "the piston's velocity"
+    confounders = ("position_force",)
+    separated_by = "slow and fast motion about several places of the stroke"
+    before = SPEEDS
+    after = 1
+    kernel = _over_speed
 
     def knot_names(self) -> tuple[str, ...]:
         """Name the knots."""
@@ -211,13 +216,10 @@ class FrictionCurve(Friction):
 
 
 @kernel
-def _over_speed(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+def _over_position(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        v = x[SD, i]
-        state, dz[0] = slide(v, z[0], par[1], 0.0, par[2])
-        force = state * curve_at(abs(v), par, 3, 4) + abs(state) * curve_at(abs(v), par, 15, 4)
-        out[TORQUE, i] -= x[G, i] * force * max(0.0, 1.0 + par[27] * (x[S, i] - par[28]))
+        out[TORQUE, i] -= x[G, i] * curve_at(x[S, i], par, 1, 6)
 
 
 @dataclass(frozen=True)
@@ -229,21 +231,17 @@ class PositionForce(Effect):
     curve is the remainder; elsewhere the highest divided difference is zero.
     """
 
-    name: ClassVar[str] = "position_force"
-    family: ClassVar[str] = "mechanics"
-    mechanism: ClassVar[str] = "position_force"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    variable: ClassVar[str] = "the piston's position"
-    quantity: ClassVar[str] = "position"
-    confounders: ClassVar[tuple[str, ...]] = ("friction_curve",)
-    separated_by: ClassVar[str] = "slow motion over the whole stroke at two poses of other joints"
+    name = "position_force"
+    family = "mechanics"
+    mechanism = "position_force"
+    free = True
+    by_data = True
+    variable = "the piston's position"
+    quantity = "position"
+    confounders = ("friction_curve",)
+    separated_by = "slow motion over the whole stroke at two poses of other joints"
+    kernel = _over_position
     where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _over_position
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots."""
@@ -330,13 +328,6 @@ class PositionForce(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's position [m]."""
         return {equation("torque", self.joint): signals.s[:, self.joint]}
-
-
-@kernel
-def _over_position(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        out[TORQUE, i] -= x[G, i] * curve_at(x[S, i], par, 1, 6)
 
 
 TERMS = (FrictionCurve, PositionForce)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -33,7 +33,6 @@ from analysis.terms.base import (
     P_TANK,
     Coefficient,
     Columns,
-    Kernel,
     S,
     equation,
     kernel,
@@ -47,12 +46,12 @@ BACKWARDS: Final = 0.05  # of its largest flow that a leak may reverse: its unce
 
 @dataclass(frozen=True)
 class _FreeLeakage(Effect):
-    family: ClassVar[str] = "fluid"
-    mechanism: ClassVar[str] = "leakage_curve"
-    element: ClassVar[str] = "piston"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    hydraulic: ClassVar[bool] = True
+    family = "fluid"
+    mechanism = "leakage_curve"
+    element = "piston"
+    free = True
+    by_data = True
+    hydraulic = True
     where: str = "joint 1"
 
     def _refused(self, rig: Rig, flow: Array) -> str:
@@ -62,6 +61,25 @@ class _FreeLeakage(Effect):
         return refuse_large(flow, 0.5 * rig.supply.flow, "the leak", "m³/s")
 
 
+@kernel
+def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i = int(par[0])
+    side = int(par[1])
+    cap, rod = x[P_CAP, i], x[P_ROD, i]
+    drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
+    flow = curve_at(abs(drop), par, 2, 5)
+    flow = flow if drop > 0.0 else -flow
+    if side == 0:
+        out[FLOW_CAP, i] -= flow
+        out[FLOW_ROD, i] += flow
+    elif side == 1:
+        out[FLOW_CAP, i] -= flow
+    else:
+        out[FLOW_ROD, i] -= flow
+
+
 @dataclass(frozen=True)
 class LeakageCurve(_FreeLeakage):
     """Q = f(|dp|) sign(dp): a leak over the pressure across it, f a curve with f(0) = 0.
@@ -69,18 +87,12 @@ class LeakageCurve(_FreeLeakage):
     Between the chambers, or out of one of them to the tank.
     """
 
-    name: ClassVar[str] = "leakage_curve"
-    variable: ClassVar[str] = "the pressure across the leak"
-    quantity: ClassVar[str] = "pressure across the leak"
-    confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
-    separated_by: ClassVar[str] = (
-        "a load that drives the pressures far apart while the piston hardly moves"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _leak
+    name = "leakage_curve"
+    variable = "the pressure across the leak"
+    quantity = "pressure across the leak"
+    confounders = ("metering_curve", "underlap_leakage")
+    separated_by = "a load that drives the pressures far apart while the piston hardly moves"
+    kernel = _leak
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -155,6 +167,16 @@ class LeakageCurve(_FreeLeakage):
         return {equation(kind, self.joint): self.across(signals) for kind in kinds}
 
 
+@kernel
+def _along_stroke(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        place = min(max(x[S, i], par[1]), par[PLACES])
+        flow = curve_at(place, par, 1, PLACES) * (x[P_CAP, i] - x[P_ROD, i])
+        out[FLOW_CAP, i] -= flow
+        out[FLOW_ROD, i] += flow
+
+
 @dataclass(frozen=True)
 class LeakageAlongStroke(_FreeLeakage):
     """Q = f(s) dp: a laminar leak past the piston over its position, f a curve (`curve`).
@@ -163,16 +185,12 @@ class LeakageAlongStroke(_FreeLeakage):
     its value there: a straight line would soon pump.
     """
 
-    name: ClassVar[str] = "leakage_along_stroke"
-    variable: ClassVar[str] = "the pressure difference across the piston, by its position"
-    quantity: ClassVar[str] = "position"
-    confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "internal_leakage")
-    separated_by: ClassVar[str] = "the same motion about several places of the stroke"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _along_stroke
+    name = "leakage_along_stroke"
+    variable = "the pressure difference across the piston, by its position"
+    quantity = "position"
+    confounders = ("leakage_curve", "internal_leakage")
+    separated_by = "the same motion about several places of the stroke"
+    kernel = _along_stroke
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots."""
@@ -231,35 +249,6 @@ class LeakageAlongStroke(_FreeLeakage):
         """Return the piston's position [m]."""
         place = signals.s[:, self.joint]
         return {equation(kind, self.joint): place for kind in ("flow_cap", "flow_rod")}
-
-
-@kernel
-def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    i = int(par[0])
-    side = int(par[1])
-    cap, rod = x[P_CAP, i], x[P_ROD, i]
-    drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
-    flow = curve_at(abs(drop), par, 2, 5)
-    flow = flow if drop > 0.0 else -flow
-    if side == 0:
-        out[FLOW_CAP, i] -= flow
-        out[FLOW_ROD, i] += flow
-    elif side == 1:
-        out[FLOW_CAP, i] -= flow
-    else:
-        out[FLOW_ROD, i] -= flow
-
-
-@kernel
-def _along_stroke(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        place = min(max(x[S, i], par[1]), par[PLACES])
-        flow = curve_at(place, par, 1, PLACES) * (x[P_CAP, i] - x[P_ROD, i])
-        out[FLOW_CAP, i] -= flow
-        out[FLOW_ROD, i] += flow
 
 
 TERMS = (LeakageCurve, LeakageAlongStroke)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -21,11 +21,36 @@ from analysis.effects.curve import (
 )
 from analysis.effects.supply import PortEffect, edge_gains, port_flow
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, Kernel, U, equation, kernel
+from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, U, equation, kernel
 from rig.model.rig import Rig
 
 FLOWS: Final = 3  # knots of the flow, the first at zero, without a drop
 LOOKS: Final = (0.05, 0.2)  # of the supply pressure, lost at the pump's flow, of first look
+
+
+@kernel
+def _lost(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The flow through the line is what the open edges take at what is left of the pressure.
+    if phase == PREPARE:
+        low, high = 0.0, 0.0
+        for i in range(x.shape[1]):
+            u = x[U, i]
+            p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
+            gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
+            high += gain * abs(u) * math.sqrt(max(bench[P_S] - p, 0.0))
+        for _ in range(48):
+            flow = 0.5 * (low + high)
+            port, taken = bench[P_S] - curve_at(flow, par, 0, 3), 0.0
+            for i in range(x.shape[1]):
+                u = x[U, i]
+                p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
+                gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
+                taken += gain * abs(u) * math.sqrt(max(port - p, 0.0))
+            if taken > flow:
+                low = flow
+            else:
+                high = flow
+        bench[P_S] -= curve_at(low, par, 0, 3)
 
 
 @dataclass(frozen=True)
@@ -35,20 +60,16 @@ class SupplyCurve(PortEffect):
     Its values at the knots are inside the orifices' roots, so that they are shapes.
     """
 
-    name: ClassVar[str] = "supply_curve"
-    mechanism: ClassVar[str] = "supply_curve"
-    element: ClassVar[str] = "supply"
-    free: ClassVar[bool] = True
-    by_data: ClassVar[bool] = True
-    variable: ClassVar[str] = "the flow drawn from the supply"
-    quantity: ClassVar[str] = "flow drawn"
-    confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "tank_pressure")
-    separated_by: ClassVar[str] = "two amplitudes, one and both joints at once"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _lost
+    name = "supply_curve"
+    mechanism = "supply_curve"
+    element = "supply"
+    free = True
+    by_data = True
+    variable = "the flow drawn from the supply"
+    quantity = "flow drawn"
+    confounders = ("metering_curve", "tank_pressure")
+    separated_by = "two amplitudes, one and both joints at once"
+    kernel = _lost
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots, then the drops at those above zero."""
@@ -107,31 +128,6 @@ class SupplyCurve(PortEffect):
         """Return the flow drawn [m^3/s]."""
         flow, kinds = port_flow(rig, signals, drawn=True), ("flow_cap", "flow_rod")
         return {equation(kind, i): flow for i in range(signals.joints) for kind in kinds}
-
-
-@kernel
-def _lost(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The flow through the line is what the open edges take at what is left of the pressure.
-    if phase == PREPARE:
-        low, high = 0.0, 0.0
-        for i in range(x.shape[1]):
-            u = x[U, i]
-            p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
-            gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
-            high += gain * abs(u) * math.sqrt(max(bench[P_S] - p, 0.0))
-        for _ in range(48):
-            flow = 0.5 * (low + high)
-            port, taken = bench[P_S] - curve_at(flow, par, 0, 3), 0.0
-            for i in range(x.shape[1]):
-                u = x[U, i]
-                p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
-                gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
-                taken += gain * abs(u) * math.sqrt(max(port - p, 0.0))
-            if taken > flow:
-                low = flow
-            else:
-                high = flow
-        bench[P_S] -= curve_at(low, par, 0, 3)
 
 
 TERMS = (SupplyCurve,)

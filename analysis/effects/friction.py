@@ -47,7 +47,6 @@ from analysis.terms.base import (
     Coefficient,
     Columns,
     G,
-    Kernel,
     Used,
     equation,
     kernel,
@@ -71,10 +70,10 @@ class Friction(Effect):
     `after` count the shape parameters before and after the contact's own.
     """
 
-    mechanism: ClassVar[str] = "friction_curve"
-    element: ClassVar[str] = "piston"
-    family: ClassVar[str] = "friction"
-    quantity: ClassVar[str] = "velocity"
+    mechanism = "friction_curve"
+    element = "piston"
+    family = "friction"
+    quantity = "velocity"
     stiffens: ClassVar[bool] = False
     before: ClassVar[int] = 0
     after: ClassVar[int] = 0
@@ -208,6 +207,14 @@ def force_unit(rig: Rig, joint: int) -> str:
 FALLS: Final = 0.5  # of the level, up to the joint's speed limit: a level by Coulomb does not fall
 
 
+@kernel
+def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3], par[4])
+        out[TORQUE, i] -= par[1] * x[G, i] * state
+
+
 @dataclass(frozen=True)
 class CoulombFriction(Friction):
     """F_f = Fc z: dry friction of one level (Coulomb 1785; the contact's state z, see the module).
@@ -215,23 +222,15 @@ class CoulombFriction(Friction):
     Without it the viscous friction is biased: 80 N on the seed bench make Fv2 110 % too large.
     """
 
-    name: ClassVar[str] = "coulomb_friction"
-    least: ClassVar[tuple[float, ...]] = (15.0,)  # [N]
-    stiffens: ClassVar[bool] = True
-    variable: ClassVar[str] = "the sign of the piston's velocity"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "stribeck_friction",
-        "asymmetric_friction",
-        "pressure_dependent_friction",
-    )
-    separated_by: ClassVar[str] = (
+    name = "coulomb_friction"
+    least = (15.0,)  # [N]
+    stiffens = True
+    variable = "the sign of the piston's velocity"
+    confounders = ("stribeck_friction", "asymmetric_friction", "pressure_dependent_friction")
+    separated_by = (
         "the same motion at two speeds and at two levels of chamber pressure: its level is the same"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _coulomb
+    kernel = _coulomb
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return Fc [N]."""
@@ -252,6 +251,19 @@ class CoulombFriction(Friction):
         return beyond(name, level, "N", force_limit(rig, self.joint))
 
 
+@kernel
+def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The hidden state is w times d [m].
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        level = math.exp(-(abs(x[SD, i] / par[2]) ** par[5]))
+        if par[3] > 0.0:
+            level = max(level, LEAST_LEVEL)
+        # At a constant stiffness the distance goes with the level.
+        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0, par[4])
+        out[TORQUE, i] -= par[1] * level * x[G, i] * state
+
+
 @dataclass(frozen=True)
 class StribeckFriction(Friction):
     """F_f = Fs w: breakaway above Coulomb's level (Armstrong-Helouvry et al. 1994).
@@ -262,22 +274,18 @@ class StribeckFriction(Friction):
     with speed; together with `coulomb_friction` it is the whole Stribeck curve.
     """
 
-    name: ClassVar[str] = "stribeck_friction"
-    least: ClassVar[tuple[float, ...]] = (30.0,)  # [N]
-    variable: ClassVar[str] = "the piston's velocity near zero"
-    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
-    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # at a high Stribeck speed
-    beside: ClassVar[bool] = True
-    before: ClassVar[int] = 1
-    after: ClassVar[int] = 1
-    separated_by: ClassVar[str] = (
+    name = "stribeck_friction"
+    least = (30.0,)  # [N]
+    variable = "the piston's velocity near zero"
+    confounders = ("coulomb_friction", "asymmetric_friction")
+    includes = ("coulomb_friction",)  # at a high Stribeck speed
+    beside = True
+    before = 1
+    after = 1
+    separated_by = (
         "slow sweeps through zero velocity beside fast ones: it is gone above the Stribeck speed"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _stribeck
+    kernel = _stribeck
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return Fs [N]."""
@@ -387,27 +395,6 @@ class StribeckFriction(Friction):
             f"{fall:.3g} {own.unit}: that is no breakaway of {own.parameter} = "
             f"{values[own.parameter]:.3g}"
         )
-
-
-@kernel
-def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3], par[4])
-        out[TORQUE, i] -= par[1] * x[G, i] * state
-
-
-@kernel
-def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The hidden state is w times d [m].
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        level = math.exp(-(abs(x[SD, i] / par[2]) ** par[5]))
-        if par[3] > 0.0:
-            level = max(level, LEAST_LEVEL)
-        # At a constant stiffness the distance goes with the level.
-        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0, par[4])
-        out[TORQUE, i] -= par[1] * level * x[G, i] * state
 
 
 TERMS = (CoulombFriction, StribeckFriction)

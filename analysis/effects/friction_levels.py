@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from analysis.terms.base import (
     Coefficient,
     Columns,
     G,
-    Kernel,
     kernel,
 )
 from rig.model.rig import Rig
@@ -39,6 +38,23 @@ DIFFERENCE: Final = 0.1  # of the mean level: with a smaller difference it is no
 LEAST_SHARE: Final = 0.02  # of the other level: below, friction acts in one direction only
 SUM: Final = 1.0  # weight of the rod pressure in the load where each seal has one pressure
 DIFFERENCE_LOAD: Final = -1.0  # the same where the difference presses the piston's seal
+
+
+@kernel
+def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The hidden state is the force over the sum of both levels, times the first distance [m].
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v = x[SD, i]
+        if par[3] <= 0.0:
+            state = math.erf(v / par[5])
+            out[TORQUE, i] -= (par[1] if state > 0.0 else par[2]) * x[G, i] * state
+            return
+        scale = (par[1] + par[2]) / par[3]
+        level, distance = (par[1], par[3]) if v > 0.0 else (-par[2], par[4])
+        relax = abs(v) / distance
+        dz[0] = relax * (level / scale - z[0]) / (1.0 + relax / FASTEST)
+        out[TORQUE, i] -= scale * z[0] * x[G, i]
 
 
 @dataclass(frozen=True)
@@ -53,22 +69,18 @@ class AsymmetricFriction(Friction):
     with a `torque_offset` of (F_ext - F_ret)/2 wherever it slides, and is named as those.
     """
 
-    hydraulic: ClassVar[bool] = True
-    name: ClassVar[str] = "asymmetric_friction"
-    least: ClassVar[tuple[float, ...]] = (30.0, 10.0)  # [N] either way
-    variable: ClassVar[str] = "the direction of the piston's motion"
-    confounders: ClassVar[tuple[str, ...]] = (
+    hydraulic = True
+    name = "asymmetric_friction"
+    least = (30.0, 10.0)  # [N] either way
+    variable = "the direction of the piston's motion"
+    confounders = (
         "coulomb_friction", "torque_offset", "sensor_offset", "sensor_gain", "base_inclination",
     )  # fmt: skip
-    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # where both levels are equal
-    separated_by: ClassVar[str] = (
+    includes = ("coulomb_friction",)  # where both levels are equal
+    separated_by = (
         "motion about several places of the stroke: an offset torque does not change with G"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _asymmetric
+    kernel = _asymmetric
 
     def _names(self) -> tuple[str, str]:
         return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
@@ -136,6 +148,23 @@ class AsymmetricFriction(Friction):
         return ahead[1] < back[0] or back[1] < ahead[0]
 
 
+@kernel
+def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The hidden state is w times d over p_S [m], at a constant distance z d.
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v, load = x[SD, i], abs(x[P_CAP, i] + par[6] * x[P_ROD, i])
+        if par[2] <= 0.0 or par[5] <= 0.0:
+            state, dz[0] = slide(v, z[0], par[2], par[3], par[4])
+            out[TORQUE, i] -= par[1] * load * x[G, i] * state
+            return
+        stiffness = par[5] / par[2]
+        pace = 1.0 + par[3] * abs(v)
+        relax = abs(v) * stiffness / max(load, 1.0)
+        dz[0] = pace * (v - relax * z[0]) / (1.0 + pace * relax / FASTEST)
+        out[TORQUE, i] -= par[1] * stiffness * z[0] * x[G, i]
+
+
 @dataclass(frozen=True)
 class PressureDependentFriction(Friction):
     """F_f = k w: seals pressed on by the chamber pressures (Jelali and Kroll 2003).
@@ -149,21 +178,17 @@ class PressureDependentFriction(Friction):
     (sign(s') - z) / d.
     """
 
-    hydraulic: ClassVar[bool] = True
-    name: ClassVar[str] = "pressure_dependent_friction"
-    least: ClassVar[tuple[float, ...]] = (5e-6,)  # [m^2]
-    stiffens: ClassVar[bool] = True
-    after: ClassVar[int] = 2
-    variable: ClassVar[str] = "the chamber pressures, with the velocity's sign"
-    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
-    separated_by: ClassVar[str] = (
+    hydraulic = True
+    name = "pressure_dependent_friction"
+    least = (5e-6,)  # [m^2]
+    stiffens = True
+    after = 2
+    variable = "the chamber pressures, with the velocity's sign"
+    confounders = ("coulomb_friction", "asymmetric_friction")
+    separated_by = (
         "the same motion at two levels of chamber pressure (supply setting, load or inclination)"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _by_pressure
+    kernel = _by_pressure
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return k [m^2]."""
@@ -256,40 +281,6 @@ class PressureDependentFriction(Friction):
         """Reject friction that drives, and more than half of the cylinder's force."""
         name = f"k_friction_{self.joint + 1}"
         return beyond(name, values[name], "m^2", 0.5 * rig.joints[self.joint].cylinder.cap_area)
-
-
-@kernel
-def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The hidden state is the force over the sum of both levels, times the first distance [m].
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        v = x[SD, i]
-        if par[3] <= 0.0:
-            state = math.erf(v / par[5])
-            out[TORQUE, i] -= (par[1] if state > 0.0 else par[2]) * x[G, i] * state
-            return
-        scale = (par[1] + par[2]) / par[3]
-        level, distance = (par[1], par[3]) if v > 0.0 else (-par[2], par[4])
-        relax = abs(v) / distance
-        dz[0] = relax * (level / scale - z[0]) / (1.0 + relax / FASTEST)
-        out[TORQUE, i] -= scale * z[0] * x[G, i]
-
-
-@kernel
-def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The hidden state is w times d over p_S [m], at a constant distance z d.
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        v, load = x[SD, i], abs(x[P_CAP, i] + par[6] * x[P_ROD, i])
-        if par[2] <= 0.0 or par[5] <= 0.0:
-            state, dz[0] = slide(v, z[0], par[2], par[3], par[4])
-            out[TORQUE, i] -= par[1] * load * x[G, i] * state
-            return
-        stiffness = par[5] / par[2]
-        pace = 1.0 + par[3] * abs(v)
-        relax = abs(v) * stiffness / max(load, 1.0)
-        dz[0] = pace * (v - relax * z[0]) / (1.0 + pace * relax / FASTEST)
-        out[TORQUE, i] -= par[1] * stiffness * z[0] * x[G, i]
 
 
 TERMS = (AsymmetricFriction, PressureDependentFriction)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numba import njit
@@ -18,7 +18,7 @@ from numba import njit
 from analysis.effects.base import NULL, Array, Shape
 from analysis.effects.valve import ValveEffect
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import PREPARE, Kernel, U, kernel
+from analysis.terms.base import PREPARE, U, kernel
 from rig.model.rig import Rig
 
 TAKEN_UP: Final = 5e-4  # [s] time constant of the play in simulation
@@ -28,6 +28,19 @@ OPERATORS: Final = 8  # of play, where their widths spread
 _ENDS: Final = -np.log1p(-np.arange(OPERATORS) / OPERATORS)
 _MOMENTS: Final = np.append((1.0 + _ENDS) * np.exp(-_ENDS), 0.0)
 WIDTHS: Final = -OPERATORS * np.diff(_MOMENTS)
+
+
+@kernel
+def _play(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        u = x[U, i]
+        mean = 0.0
+        for k in range(OPERATORS):
+            pushed = min(max(z[k], u - par[2 + k]), u + par[2 + k])
+            dz[k] = (pushed - z[k]) / TAKEN_UP
+            mean += pushed / OPERATORS
+        x[U, i] = mean + par[1] * (mean - u)
 
 
 @dataclass(frozen=True)
@@ -40,20 +53,16 @@ class SpoolHysteresis(ValveEffect):
     opening moves against the spool where it is above 1. The operators' outputs are hidden states.
     """
 
-    name: ClassVar[str] = "spool_hysteresis"
-    least_shape: ClassVar[tuple[float, ...]] = (2e-3,)  # [V]
-    mechanism: ClassVar[str] = "spool_dynamics"
-    stage: ClassVar[int] = NULL  # before the lag: a pilot has friction, the stage behind it lags
-    variable: ClassVar[str] = "the sign of the spool's velocity"
-    confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "valve_deadband", "channel_delay")
-    separated_by: ClassVar[str] = (
+    name = "spool_hysteresis"
+    least_shape = (2e-3,)  # [V]
+    mechanism = "spool_dynamics"
+    stage = NULL  # before the lag: a pilot has friction, the stage behind it lags
+    variable = "the sign of the spool's velocity"
+    confounders = ("spool_lag", "valve_deadband", "channel_delay")
+    separated_by = (
         "two frequencies of one amplitude: hysteresis stays the same, a lag grows with the rate"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _play
+    kernel = _play
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the width, its spread and the steepness of a reversal."""
@@ -124,19 +133,6 @@ def play_output(u, half):  # type: ignore[no-untyped-def]
     for k in range(1, len(u)):
         x[k] = min(max(x[k - 1], u[k] - half), u[k] + half)
     return x
-
-
-@kernel
-def _play(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        i = int(par[0])
-        u = x[U, i]
-        mean = 0.0
-        for k in range(OPERATORS):
-            pushed = min(max(z[k], u - par[2 + k]), u + par[2 + k])
-            dz[k] = (pushed - z[k]) / TAKEN_UP
-            mean += pushed / OPERATORS
-        x[U, i] = mean + par[1] * (mean - u)
 
 
 TERMS = (SpoolHysteresis,)

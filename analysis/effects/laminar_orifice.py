@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numba import njit
@@ -21,7 +21,6 @@ from analysis.terms.base import (
     P_TANK,
     Coefficient,
     Columns,
-    Kernel,
     U,
     equation,
     kernel,
@@ -34,6 +33,21 @@ SHARPNESS: Final = "sharpness"
 SUM: Final = 1.0  # the sharpness of a form that has none: the drops add
 
 
+@kernel
+def _laminar(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    p_s, p_t, t, n = bench[P_S], bench[P_TANK], par[0], par[1]
+    for i in range(x.shape[1]):
+        u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
+        if u > 0.0:
+            out[FLOW_CAP, i] += par[2 + 4 * i] * lost_root(p_s - cap, t, n) * u
+            out[FLOW_ROD, i] -= par[4 + 4 * i] * lost_root(rod - p_t, t, n) * u
+        else:
+            out[FLOW_CAP, i] += par[3 + 4 * i] * lost_root(cap - p_t, t, n) * u
+            out[FLOW_ROD, i] -= par[5 + 4 * i] * lost_root(p_s - rod, t, n) * u
+
+
 @dataclass(frozen=True)
 class LaminarOrifice(Effect):
     """Edges that are laminar at small drops: dp^n = (Q / C u)^2n + (dp_t^(1/2) Q / C u)^n.
@@ -44,25 +58,19 @@ class LaminarOrifice(Effect):
     under the orifices' own gains, which are too small without it.
     """
 
-    name: ClassVar[str] = "laminar_orifice"
-    family: ClassVar[str] = "valve"
-    mechanism: ClassVar[str] = "metering_curve"
-    element: ClassVar[str] = "valve"
-    hydraulic: ClassVar[bool] = True
-    adds_to_gains: ClassVar[bool] = True
-    alters: ClassVar[tuple[str, ...]] = ("fluid",)
-    least_shape: ClassVar[tuple[float, ...]] = (0.1e6,)  # [Pa]
-    variable: ClassVar[str] = "the pressure drop across the metering edges"
-    quantity: ClassVar[str] = "pressure"
-    confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag", "sensor_offset")
-    separated_by: ClassVar[str] = (
-        "loads that leave a small drop across each edge in turn, at several openings"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _laminar
+    name = "laminar_orifice"
+    family = "valve"
+    mechanism = "metering_curve"
+    element = "valve"
+    hydraulic = True
+    adds_to_gains = True
+    alters = ("fluid",)
+    least_shape = (0.1e6,)  # [Pa]
+    variable = "the pressure drop across the metering edges"
+    quantity = "pressure"
+    confounders = ("tank_pressure", "supply_sag", "sensor_offset")
+    separated_by = "loads that leave a small drop across each edge in turn, at several openings"
+    kernel = _laminar
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -127,21 +135,6 @@ def share_of_root(size, transition, sharpness):  # type: ignore[no-untyped-def]
 def lost_root(drop, transition, sharpness):  # type: ignore[no-untyped-def]
     """Return what laminar flow takes from the signed root [Pa^0.5] of one drop [Pa]."""
     return signed_root(drop) * (share_of_root(max(abs(drop), 1.0), transition, sharpness) - 1.0)
-
-
-@kernel
-def _laminar(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    p_s, p_t, t, n = bench[P_S], bench[P_TANK], par[0], par[1]
-    for i in range(x.shape[1]):
-        u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
-        if u > 0.0:
-            out[FLOW_CAP, i] += par[2 + 4 * i] * lost_root(p_s - cap, t, n) * u
-            out[FLOW_ROD, i] -= par[4 + 4 * i] * lost_root(rod - p_t, t, n) * u
-        else:
-            out[FLOW_CAP, i] += par[3 + 4 * i] * lost_root(cap - p_t, t, n) * u
-            out[FLOW_ROD, i] -= par[5 + 4 * i] * lost_root(p_s - rod, t, n) * u
 
 
 TERMS = (LaminarOrifice,)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numba import njit
@@ -29,7 +29,6 @@ from analysis.terms.base import (
     P_TANK,
     Coefficient,
     Columns,
-    Kernel,
     equation,
     kernel,
 )
@@ -44,10 +43,10 @@ FINITE: Final = 1e3  # [Pa] below it the flow is in proportion to dp
 
 @dataclass(frozen=True)
 class _Leakage(Effect):
-    mechanism: ClassVar[str] = "leakage_curve"
-    element: ClassVar[str] = "piston"
-    family: ClassVar[str] = "fluid"
-    hydraulic: ClassVar[bool] = True
+    mechanism = "leakage_curve"
+    element = "piston"
+    family = "fluid"
+    hydraulic = True
     where: str = "joint 1"
 
     @property
@@ -101,6 +100,15 @@ def flow_form(drop, n):  # type: ignore[no-untyped-def]
     return drop * ((drop * drop + FINITE**2) / REFERENCE**2) ** (0.5 * (n - 1.0))
 
 
+@kernel
+def _internal(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        flow = par[1] * flow_form(x[P_CAP, i] - x[P_ROD, i], par[2])
+        out[FLOW_CAP, i] -= flow
+        out[FLOW_ROD, i] += flow
+
+
 @dataclass(frozen=True)
 class InternalLeakage(_Leakage):
     """Leak over dp = p_cap - p_rod past the piston, out of the cap side and into the rod side.
@@ -109,24 +117,13 @@ class InternalLeakage(_Leakage):
     large.
     """
 
-    name: ClassVar[str] = "internal_leakage"
-    least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
-    variable: ClassVar[str] = "the pressure difference across the piston"
-    quantity: ClassVar[str] = "pressure difference"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "external_leakage",
-        "underlap_leakage",
-        "spool_offset",
-        "sensor_offset",
-    )
-    separated_by: ClassVar[str] = (
-        "a load that drives the pressures far apart while the piston rests or creeps"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _internal
+    name = "internal_leakage"
+    least = (3e-13,)  # [m^3/(s Pa)]
+    variable = "the pressure difference across the piston"
+    quantity = "pressure difference"
+    confounders = ("external_leakage", "underlap_leakage", "spool_offset", "sensor_offset")
+    separated_by = "a load that drives the pressures far apart while the piston rests or creeps"
+    kernel = _internal
 
     @property
     def _mark(self) -> str:
@@ -148,28 +145,28 @@ class InternalLeakage(_Leakage):
         return {equation(kind, self.joint): across for kind in ("flow_cap", "flow_rod")}
 
 
+@kernel
+def _external(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        out[FLOW_CAP, i] -= par[1] * flow_form(x[P_CAP, i] - bench[P_TANK], par[3])
+        out[FLOW_ROD, i] -= par[2] * flow_form(x[P_ROD, i] - bench[P_TANK], par[3])
+
+
 @dataclass(frozen=True)
 class ExternalLeakage(_Leakage):
     """Leak over dp = p - p_tank out of one chamber, or of both with one c if `where` names none."""
 
-    name: ClassVar[str] = "external_leakage"
-    element: ClassVar[str] = "chamber"
-    least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
-    variable: ClassVar[str] = "the chamber's pressure"
-    quantity: ClassVar[str] = "pressure"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "internal_leakage",
-        "underlap_leakage",
-        "sensor_offset",
-    )
-    separated_by: ClassVar[str] = (
+    name = "external_leakage"
+    element = "chamber"
+    least = (3e-13,)  # [m^3/(s Pa)]
+    variable = "the chamber's pressure"
+    quantity = "pressure"
+    confounders = ("internal_leakage", "underlap_leakage", "sensor_offset")
+    separated_by = (
         "slow motion at two levels of chamber pressure: rod-side rows show which leak it is"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _external
+    kernel = _external
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -207,23 +204,6 @@ class ExternalLeakage(_Leakage):
             equation(f"flow_{side}", self.joint): pressures[side][:, self.joint]
             for side in self._chambers
         }
-
-
-@kernel
-def _internal(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        flow = par[1] * flow_form(x[P_CAP, i] - x[P_ROD, i], par[2])
-        out[FLOW_CAP, i] -= flow
-        out[FLOW_ROD, i] += flow
-
-
-@kernel
-def _external(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        out[FLOW_CAP, i] -= par[1] * flow_form(x[P_CAP, i] - bench[P_TANK], par[3])
-        out[FLOW_ROD, i] -= par[2] * flow_form(x[P_ROD, i] - bench[P_TANK], par[3])
 
 
 TERMS = (InternalLeakage, ExternalLeakage)

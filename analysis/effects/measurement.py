@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
 from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
+from analysis.terms.base import Coefficient, Columns, Used, equation
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -33,17 +33,13 @@ KINDS: Final = {**HYDRAULIC, **ELECTRIC}
 class Sensor(Effect):
     """Common parts of sensor effects: the channel, and the signals that follow from it."""
 
-    mechanism: ClassVar[str] = "sensor"
-    element: ClassVar[str] = "sensor"
-    hydraulic: ClassVar[bool] = True
-    family: ClassVar[str] = "measurement"
-    stage: ClassVar[int] = SENSOR
+    mechanism = "sensor"
+    element = "sensor"
+    hydraulic = True
+    family = "measurement"
+    stage = SENSOR
+    kernel = NO_KERNEL
     where: str = "joint 1 piston"
-
-    @property
-    def kernel(self) -> Kernel:
-        """Return a kernel that does nothing: sensors do not act on the plant."""
-        return NO_KERNEL
 
     @property
     def shared(self) -> str:

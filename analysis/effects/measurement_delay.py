@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -29,7 +29,7 @@ MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
 class Late(Sensor):
     """Common parts of delays and lags, which may act on all channels of a kind."""
 
-    hydraulic: ClassVar[bool] = False
+    hydraulic = False
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -63,17 +63,12 @@ class Late(Sensor):
 class ChannelDelay(Late):
     """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
 
-    name: ClassVar[str] = "channel_delay"
-    exact: ClassVar[bool] = True
-    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
-    variable: ClassVar[str] = "the channel's rate"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "sensor_lag",
-        "spool_lag",
-        "entrained_air",
-        "dead_volume",
-    )
-    separated_by: ClassVar[str] = (
+    name = "channel_delay"
+    exact = True
+    least_shape = (1e-3,)  # [s]
+    variable = "the channel's rate"
+    confounders = ("sensor_lag", "spool_lag", "entrained_air", "dead_volume")
+    separated_by = (
         "a wide band: a delay turns the phase in proportion to frequency and leaves the amplitude"
     )
 
@@ -97,14 +92,12 @@ class ChannelDelay(Late):
 class SensorLag(Late):
     """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter."""
 
-    name: ClassVar[str] = "sensor_lag"
-    amplifies: ClassVar[bool] = True
-    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
-    variable: ClassVar[str] = "the channel's rate"
-    confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "spool_lag", "dead_volume")
-    separated_by: ClassVar[str] = (
-        "a wide band: a lag loses amplitude at high frequencies, a delay only phase"
-    )
+    name = "sensor_lag"
+    amplifies = True
+    least_shape = (1e-3,)  # [s]
+    variable = "the channel's rate"
+    confounders = ("channel_delay", "spool_lag", "dead_volume")
+    separated_by = "a wide band: a lag loses amplitude at high frequencies, a delay only phase"
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the time constant."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -27,19 +26,13 @@ from rig.model.units import plain
 class SensorCrosstalk(Sensor):
     """reading of one chamber's pressure = p + k times the other chamber's (electrical coupling)."""
 
-    rescales: ClassVar[bool] = True
-    name: ClassVar[str] = "sensor_crosstalk"
-    exact: ClassVar[bool] = True
-    least_shape: ClassVar[tuple[float, ...]] = (0.01,)
-    variable: ClassVar[str] = "the other chamber's pressure"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "sensor_gain",
-        "sensor_offset",
-        "pressure_dependent_friction",
-    )
-    separated_by: ClassVar[str] = (
-        "loads at which one chamber's pressure changes and the other does not"
-    )
+    rescales = True
+    name = "sensor_crosstalk"
+    exact = True
+    least_shape = (0.01,)
+    variable = "the other chamber's pressure"
+    confounders = ("sensor_gain", "sensor_offset", "pressure_dependent_friction")
+    separated_by = "loads at which one chamber's pressure changes and the other does not"
     where: str = "joint 1 cap"
 
     @classmethod
@@ -96,20 +89,13 @@ class SensorGain(Sensor):
     relative error at the supply's pressure p_S, and there is none at half of it.
     """
 
-    rescales: ClassVar[bool] = True
-    name: ClassVar[str] = "sensor_gain"
-    exact: ClassVar[bool] = True
-    least_shape: ClassVar[tuple[float, ...]] = (1.01,)
-    variable: ClassVar[str] = "the channel itself"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "sensor_offset",
-        "supply_sag",
-        "tank_pressure",
-        "pressure_dependent_friction",
-    )
-    separated_by: ClassVar[str] = (
-        "two amplitudes and two working points: an offset does not grow with either"
-    )
+    rescales = True
+    name = "sensor_gain"
+    exact = True
+    least_shape = (1.01,)
+    variable = "the channel itself"
+    confounders = ("sensor_offset", "supply_sag", "tank_pressure", "pressure_dependent_friction")
+    separated_by = "two amplitudes and two working points: an offset does not grow with either"
 
     def absorbed(self, rig: Rig) -> str:
         """Return that the flow gains absorb a spool's gain."""
@@ -181,19 +167,17 @@ class SensorOffset(Sensor):
     it is the error of the pressure that the rig file states.
     """
 
-    name: ClassVar[str] = "sensor_offset"
-    exact: ClassVar[bool] = True
-    variable: ClassVar[str] = "nothing: it is constant"
-    confounders: ClassVar[tuple[str, ...]] = (
+    name = "sensor_offset"
+    exact = True
+    variable = "nothing: it is constant"
+    confounders = (
         "torque_offset",
         "sensor_gain",
         "base_inclination",
         "internal_leakage",
         "tank_pressure",
     )
-    separated_by: ClassVar[str] = (
-        "working points far apart: low and high pressure, both ends of the stroke"
-    )
+    separated_by = "working points far apart: low and high pressure, both ends of the stroke"
 
     def least_shapes(self) -> tuple[float, ...]:
         """Return the offset of interest of a pressure or a piston, none of other channels."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from analysis.terms.base import (
     TORQUE,
     Coefficient,
     Columns,
-    Kernel,
     Q,
     equation,
     kernel,
@@ -32,6 +31,13 @@ def torque_limit(rig: Rig, joint: int) -> float:
     return 0.5 * abs(float(lever)) * rig.largest_force(joint)
 
 
+@kernel
+def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        for i in range(x.shape[1]):
+            x[THETA, i] += par[0]
+
+
 @dataclass(frozen=True)
 class BaseInclination(Effect):
     """All absolute angles turned by one angle alpha: link k pulls W_k g sin(theta_k + alpha).
@@ -41,25 +47,19 @@ class BaseInclination(Effect):
     a shape and not N linear unknowns.
     """
 
-    mechanism: ClassVar[str] = "gravity"
-    element: ClassVar[str] = "base"
-    name: ClassVar[str] = "base_inclination"
-    exact: ClassVar[bool] = True
-    least_shape: ClassVar[tuple[float, ...]] = (0.017,)  # [rad]
-    prepares: ClassVar[bool] = True
-    family: ClassVar[str] = "mechanics"
-    alters: ClassVar[tuple[str, ...]] = ("mechanical",)
-    variable: ClassVar[str] = "the cosine of the absolute angles"
-    quantity: ClassVar[str] = "absolute angle"
-    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring", "sensor_offset")
-    separated_by: ClassVar[str] = (
-        "slow motion of every joint over its whole stroke at several poses of the others"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _inclination
+    mechanism = "gravity"
+    element = "base"
+    name = "base_inclination"
+    exact = True
+    least_shape = (0.017,)  # [rad]
+    prepares = True
+    family = "mechanics"
+    alters = ("mechanical",)
+    variable = "the cosine of the absolute angles"
+    quantity = "absolute angle"
+    confounders = ("torque_offset", "joint_spring", "sensor_offset")
+    separated_by = "slow motion of every joint over its whole stroke at several poses of the others"
+    kernel = _inclination
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -96,16 +96,16 @@ class BaseInclination(Effect):
         return {equation("torque", i): signals.theta[:, i] for i in range(signals.joints)}
 
 
-@kernel
-def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        for i in range(x.shape[1]):
-            x[THETA, i] += par[0]
-
-
 LEAST_REACH: Final = 0.1  # of the joint's range: against a stiffer spring it cannot move so far
 RESTS: Final = 5  # rest angles to start from, evenly in the joint's range
 PRELOAD: Final = 8.0  # ranges of the joint: a long gas spring changes its force by a tenth over it
+
+
+@kernel
+def _spring(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        out[TORQUE, i] -= par[1] * (x[Q, i] - par[2])
 
 
 @dataclass(frozen=True)
@@ -115,24 +115,20 @@ class JointSpring(Effect):
     The rest angle is a shape; where the records do not determine it, mid-stroke is used.
     """
 
-    mechanism: ClassVar[str] = "position_force"
-    name: ClassVar[str] = "joint_spring"
-    least: ClassVar[tuple[float, ...]] = (20.0,)  # [N m/rad]
-    family: ClassVar[str] = "mechanics"
-    variable: ClassVar[str] = "the joint's angle"
-    quantity: ClassVar[str] = "joint position"
-    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination", "sensor_offset")
-    includes: ClassVar[tuple[str, ...]] = ("torque_offset",)  # at a rest angle far away
-    separated_by: ClassVar[str] = (
+    mechanism = "position_force"
+    name = "joint_spring"
+    least = (20.0,)  # [N m/rad]
+    family = "mechanics"
+    variable = "the joint's angle"
+    quantity = "joint position"
+    confounders = ("torque_offset", "base_inclination", "sensor_offset")
+    includes = ("torque_offset",)  # at a rest angle far away
+    separated_by = (
         "slow motion over the whole stroke at two poses of the other joints: gravity "
         "depends on the absolute angle, the spring on the joint's angle"
     )
+    kernel = _spring
     where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _spring
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return k [N m/rad]."""
@@ -186,10 +182,9 @@ def _reach(rig: Rig, joint: int) -> tuple[float, float]:
 
 
 @kernel
-def _spring(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+def _torque(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
-        i = int(par[0])
-        out[TORQUE, i] -= par[1] * (x[Q, i] - par[2])
+        out[TORQUE, int(par[0])] -= par[1]
 
 
 @dataclass(frozen=True)
@@ -199,29 +194,20 @@ class TorqueOffset(Effect):
     Of an electric joint the benchmark's sign and name are kept: M q'' + ... + offset = torque.
     """
 
-    mechanism: ClassVar[str] = "position_force"
-    name: ClassVar[str] = "torque_offset"
-    exact: ClassVar[bool] = True
-    least: ClassVar[tuple[float, ...]] = (2.0,)  # [N m]
-    family: ClassVar[str] = "mechanics"
-    variable: ClassVar[str] = "nothing: it is constant"
-    quantity: ClassVar[str] = "joint position"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "asymmetric_friction",
-        "base_inclination",
-        "joint_spring",
-        "sensor_offset",
-    )
-    separated_by: ClassVar[str] = (
+    mechanism = "position_force"
+    name = "torque_offset"
+    exact = True
+    least = (2.0,)  # [N m]
+    family = "mechanics"
+    variable = "nothing: it is constant"
+    quantity = "joint position"
+    confounders = ("asymmetric_friction", "base_inclination", "joint_spring", "sensor_offset")
+    separated_by = (
         "slow motion over the whole stroke: torques of gravity, a spring and a pressure's offset "
         "change with it"
     )
+    kernel = _torque
     where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _torque
 
     def _name(self, rig: Rig) -> tuple[str, float]:
         if rig.electric:
@@ -252,12 +238,6 @@ class TorqueOffset(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the joint's angle [rad], over which the offset is constant."""
         return {equation("torque", self.joint): signals.q[:, self.joint]}
-
-
-@kernel
-def _torque(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        out[TORQUE, int(par[0])] -= par[1]
 
 
 TERMS = (BaseInclination, JointSpring, TorqueOffset)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from scipy.constants import g as standard_gravity
@@ -19,7 +18,6 @@ from analysis.terms.base import (
     TORQUE,
     Coefficient,
     Columns,
-    Kernel,
     equation,
     kernel,
 )
@@ -28,6 +26,35 @@ from analysis.terms.inertia import Inertia, inertia_map
 from analysis.terms.sine_cosine import sine_cosine
 from rig.model.parameters import inertia_names
 from rig.model.rig import Rig
+
+
+@kernel
+def _payload(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The tip's Jacobian to joint i is the sum of l_k (cos, sin)(theta_k) over links k >= i; its
+    # acceleration at rest of the joints is the sum of l_k theta_k'^2 (-sin, cos)(theta_k).
+    if phase != CONTRIBUTE:
+        return
+    N = x.shape[1]
+    m, g = par[0], par[1]
+    ax, ay, rate = 0.0, 0.0, 0.0
+    for k in range(N):
+        rate += x[QD, k]
+        sine, cosine = sine_cosine(x[THETA, k])
+        ax -= par[2 + k] * rate * rate * sine
+        ay += par[2 + k] * rate * rate * cosine
+    jx_i, jy_i = 0.0, 0.0
+    for i in range(N - 1, -1, -1):
+        sine, cosine = sine_cosine(x[THETA, i])
+        jx_i += par[2 + i] * cosine
+        jy_i += par[2 + i] * sine
+        # theta = 0 hangs straight down: the tip's height grows by jy per unit of angle.
+        out[TORQUE, i] -= m * (jx_i * ax + jy_i * (ay + g))
+        jx_j, jy_j = 0.0, 0.0
+        for j in range(N - 1, -1, -1):
+            sine, cosine = sine_cosine(x[THETA, j])
+            jx_j += par[2 + j] * cosine
+            jy_j += par[2 + j] * sine
+            M[i, j] += m * (jx_i * jx_j + jy_i * jy_j)
 
 
 @dataclass(frozen=True)
@@ -40,22 +67,18 @@ class Payload(Effect):
     identified without it, whose M, R and W are held.
     """
 
-    mechanism: ClassVar[str] = "gravity"
-    element: ClassVar[str] = "load"
-    name: ClassVar[str] = "payload"
-    exact: ClassVar[bool] = True
-    family: ClassVar[str] = "mechanics"
-    variable: ClassVar[str] = "gravity and inertia alike"
-    quantity: ClassVar[str] = "absolute angle"
-    confounders: ClassVar[tuple[str, ...]] = ()
-    separated_by: ClassVar[str] = (
+    mechanism = "gravity"
+    element = "load"
+    name = "payload"
+    exact = True
+    family = "mechanics"
+    variable = "gravity and inertia alike"
+    quantity = "absolute angle"
+    confounders = ()
+    separated_by = (
         "records with and without the payload, or a model identified without it as reference"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _payload
+    kernel = _payload
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -115,35 +138,6 @@ def growth(rig: Rig) -> dict[str, float]:
     shares = np.linalg.lstsq(patterns.T, np.outer(lengths, lengths).ravel(), rcond=None)[0]
     weights = {f"W{i}": float(length) for i, length in enumerate(lengths, start=1)}
     return dict(zip(names, map(float, shares), strict=True)) | weights
-
-
-@kernel
-def _payload(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The tip's Jacobian to joint i is the sum of l_k (cos, sin)(theta_k) over links k >= i; its
-    # acceleration at rest of the joints is the sum of l_k theta_k'^2 (-sin, cos)(theta_k).
-    if phase != CONTRIBUTE:
-        return
-    N = x.shape[1]
-    m, g = par[0], par[1]
-    ax, ay, rate = 0.0, 0.0, 0.0
-    for k in range(N):
-        rate += x[QD, k]
-        sine, cosine = sine_cosine(x[THETA, k])
-        ax -= par[2 + k] * rate * rate * sine
-        ay += par[2 + k] * rate * rate * cosine
-    jx_i, jy_i = 0.0, 0.0
-    for i in range(N - 1, -1, -1):
-        sine, cosine = sine_cosine(x[THETA, i])
-        jx_i += par[2 + i] * cosine
-        jy_i += par[2 + i] * sine
-        # theta = 0 hangs straight down: the tip's height grows by jy per unit of angle.
-        out[TORQUE, i] -= m * (jx_i * ax + jy_i * (ay + g))
-        jx_j, jy_j = 0.0, 0.0
-        for j in range(N - 1, -1, -1):
-            sine, cosine = sine_cosine(x[THETA, j])
-            jx_j += par[2 + j] * cosine
-            jy_j += par[2 + j] * sine
-            M[i, j] += m * (jx_i * jx_j + jy_i * jy_j)
 
 
 TERMS = (Payload,)

@@ -26,7 +26,6 @@ from analysis.terms.base import (
     PREPARE,
     Coefficient,
     Columns,
-    Kernel,
     U,
     equation,
     kernel,
@@ -55,11 +54,11 @@ NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
 class PortEffect(Effect):
     """An effect on the pressure at all valves' ports, with shapes only."""
 
-    hydraulic: ClassVar[bool] = True
-    family: ClassVar[str] = "fluid"
-    alters: ClassVar[tuple[str, ...]] = ("fluid",)
-    prepares: ClassVar[bool] = True
-    stage: ClassVar[int] = SUPPLY
+    hydraulic = True
+    family = "fluid"
+    alters = ("fluid",)
+    prepares = True
+    stage = SUPPLY
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -144,7 +143,7 @@ class LineDrop(PortEffect):
     which the shapes searched scale with the pump's flow over the largest of the records.
     """
 
-    by_data: ClassVar[bool] = True
+    by_data = True
     drawn: ClassVar[bool]
     powers: ClassVar[tuple[int, ...]]
 
@@ -213,6 +212,13 @@ class LineDrop(PortEffect):
         return _everywhere(signals, port_flow(rig, signals, self.drawn))
 
 
+@kernel
+def _sag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE and par[0] > 0.0:
+        Q = _valve_flow(x, bench[P_S], 1.0, par[0], par[1], par, True)
+        bench[P_S] -= drop_and_slope(Q, par[0], par[1])[0]
+
+
 @dataclass(frozen=True)
 class SupplySag(LineDrop):
     """The valves see p_s - dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3), r = Q / Q_pump.
@@ -227,23 +233,19 @@ class SupplySag(LineDrop):
     r_t.
     """
 
-    mechanism: ClassVar[str] = "supply_curve"
-    element: ClassVar[str] = "supply"
-    name: ClassVar[str] = "supply_sag"
-    drawn: ClassVar[bool] = True
-    powers: ClassVar[tuple[int, ...]] = (2, -1, -1)
-    least_shape: ClassVar[tuple[float, ...]] = (0.2e6, LEAST_SHARE, 0.0)  # [Pa] at the rated flow
-    variable: ClassVar[str] = "the flow drawn from the supply"
-    quantity: ClassVar[str] = "flow drawn"
-    confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
-    separated_by: ClassVar[str] = (
+    mechanism = "supply_curve"
+    element = "supply"
+    name = "supply_sag"
+    drawn = True
+    powers = (2, -1, -1)
+    least_shape = (0.2e6, LEAST_SHARE, 0.0)  # [Pa] at the rated flow
+    variable = "the flow drawn from the supply"
+    quantity = "flow drawn"
+    confounders = ("tank_pressure", "sensor_gain", "sensor_offset")
+    separated_by = (
         "two amplitudes, one and both joints at once: the drop depends on the whole bench's flow"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _sag
+    kernel = _sag
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the drop, its laminar share and the oil volume."""
@@ -275,6 +277,15 @@ class SupplySag(LineDrop):
         )
 
 
+@kernel
+def _tank(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        bench[P_TANK] += par[0]
+        if par[1] > 0.0:
+            Q = _valve_flow(x, bench[P_TANK], -1.0, par[1], 0.0, par, False)
+            bench[P_TANK] += par[1] * Q * Q
+
+
 @dataclass(frozen=True)
 class TankPressure(PortEffect):
     """The return pressure is p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
@@ -282,21 +293,17 @@ class TankPressure(PortEffect):
     The line's part is turbulent; Q is the flow that the valves return.
     """
 
-    mechanism: ClassVar[str] = "return_line"
-    element: ClassVar[str] = "tank"
-    name: ClassVar[str] = "tank_pressure"
-    least_shape: ClassVar[tuple[float, ...]] = (0.1e6, 0.0)  # [Pa]
-    variable: ClassVar[str] = "the pressure left across the edge to the tank"
-    quantity: ClassVar[str] = "pressure"
-    confounders: ClassVar[tuple[str, ...]] = ("supply_sag", "sensor_offset", "external_leakage")
-    separated_by: ClassVar[str] = (
+    mechanism = "return_line"
+    element = "tank"
+    name = "tank_pressure"
+    least_shape = (0.1e6, 0.0)  # [Pa]
+    variable = "the pressure left across the edge to the tank"
+    quantity = "pressure"
+    confounders = ("supply_sag", "sensor_offset", "external_leakage")
+    separated_by = (
         "motion at low chamber pressure, where the drop across the edge to the tank is small"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _tank
+    kernel = _tank
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the constant pressure and the line's part."""
@@ -341,6 +348,13 @@ class TankPressure(PortEffect):
         return out
 
 
+@kernel
+def _return_line(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE and par[0] > 0.0:
+        Q = _valve_flow(x, bench[P_TANK], -1.0, par[0], par[1], par, False)
+        bench[P_TANK] += drop_and_slope(Q, par[0], par[1])[0]
+
+
 @dataclass(frozen=True)
 class ReturnLine(LineDrop):
     """The return pressure is its line's drop, dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3).
@@ -350,23 +364,17 @@ class ReturnLine(LineDrop):
     is `tank_pressure`.
     """
 
-    name: ClassVar[str] = "return_line"
-    drawn: ClassVar[bool] = False
-    powers: ClassVar[tuple[int, ...]] = (2,)
-    mechanism: ClassVar[str] = "return_line"
-    element: ClassVar[str] = "tank"
-    least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
-    variable: ClassVar[str] = "the flow returned to the tank"
-    quantity: ClassVar[str] = "flow returned"
-    confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag")
-    separated_by: ClassVar[str] = (
-        "two amplitudes: a tank's own pressure stays the same, the line's grows"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _return_line
+    name = "return_line"
+    drawn = False
+    powers = (2,)
+    mechanism = "return_line"
+    element = "tank"
+    least_shape = (0.2e6,)  # [Pa] at the rated flow
+    variable = "the flow returned to the tank"
+    quantity = "flow returned"
+    confounders = ("tank_pressure", "supply_sag")
+    separated_by = "two amplitudes: a tank's own pressure stays the same, the line's grows"
+    kernel = _return_line
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the drop and its laminar share."""
@@ -456,29 +464,6 @@ def _valve_flow(x, level, sign, turbulent, turning, par, drawn):  # type: ignore
         if abs(step) < 1e-10:
             break
     return Q
-
-
-@kernel
-def _sag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE and par[0] > 0.0:
-        Q = _valve_flow(x, bench[P_S], 1.0, par[0], par[1], par, True)
-        bench[P_S] -= drop_and_slope(Q, par[0], par[1])[0]
-
-
-@kernel
-def _tank(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        bench[P_TANK] += par[0]
-        if par[1] > 0.0:
-            Q = _valve_flow(x, bench[P_TANK], -1.0, par[1], 0.0, par, False)
-            bench[P_TANK] += par[1] * Q * Q
-
-
-@kernel
-def _return_line(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE and par[0] > 0.0:
-        Q = _valve_flow(x, bench[P_TANK], -1.0, par[0], par[1], par, False)
-        bench[P_TANK] += drop_and_slope(Q, par[0], par[1])[0]
 
 
 TERMS = (SupplySag, TankPressure, ReturnLine)

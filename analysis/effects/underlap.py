@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from analysis.terms.base import (
     P_TANK,
     Coefficient,
     Columns,
-    Kernel,
     U,
     equation,
     kernel,
@@ -30,6 +28,23 @@ from analysis.terms.base import (
 from analysis.terms.orifice import root_of_drop, signed_root
 from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
+
+
+@kernel
+def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i = int(par[0])
+    u, w = x[U, i], par[5]
+    ahead = edge(u + w, par[6], par[7]) - max(u, 0.0)
+    astern = edge(w - u, par[6], par[7]) - max(-u, 0.0)
+    cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
+    out[FLOW_CAP, i] += par[1] * ahead * signed_root(p_s - cap) - par[2] * astern * signed_root(
+        cap - p_t
+    )
+    out[FLOW_ROD, i] += par[4] * astern * signed_root(p_s - rod) - par[3] * ahead * signed_root(
+        rod - p_t
+    )
 
 
 @dataclass(frozen=True)
@@ -42,25 +57,17 @@ class UnderlapLeakage(ValveEffect):
     whose columns they add to.
     """
 
-    name: ClassVar[str] = "underlap_leakage"
-    least_shape: ClassVar[tuple[float, ...]] = (4e-3,)  # [V]
-    prepares: ClassVar[bool] = False
-    adds_to_gains: ClassVar[bool] = True
-    variable: ClassVar[str] = "the spool near its null and the chamber pressures"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "valve_deadband",
-        "internal_leakage",
-        "external_leakage",
-    )
-    separated_by: ClassVar[str] = (
+    name = "underlap_leakage"
+    least_shape = (4e-3,)  # [V]
+    prepares = False
+    adds_to_gains = True
+    variable = "the spool near its null and the chamber pressures"
+    confounders = ("valve_deadband", "internal_leakage", "external_leakage")
+    separated_by = (
         "small spool amplitudes about the null beside large ones: leakage of seals does not depend "
         "on the spool"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _underlap
+    kernel = _underlap
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the joint's four gains, which `orifice` owns."""
@@ -102,23 +109,6 @@ class UnderlapLeakage(ValveEffect):
         """Return joint, gains, underlap, rounding, corner."""
         gains = [values[name] for name in gain_names(self.joint + 1)]
         return np.array([self.joint, *gains, *self.whole(rig, shape)])
-
-
-@kernel
-def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    i = int(par[0])
-    u, w = x[U, i], par[5]
-    ahead = edge(u + w, par[6], par[7]) - max(u, 0.0)
-    astern = edge(w - u, par[6], par[7]) - max(-u, 0.0)
-    cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
-    out[FLOW_CAP, i] += par[1] * ahead * signed_root(p_s - cap) - par[2] * astern * signed_root(
-        cap - p_t
-    )
-    out[FLOW_ROD, i] += par[4] * astern * signed_root(p_s - rod) - par[3] * ahead * signed_root(
-        rod - p_t
-    )
 
 
 TERMS = (UnderlapLeakage,)

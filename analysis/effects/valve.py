@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numba import njit
@@ -31,7 +31,6 @@ from analysis.terms.base import (
     PREPARE,
     Coefficient,
     Columns,
-    Kernel,
     U,
     equation,
     kernel,
@@ -43,13 +42,13 @@ from rig.model.rig import Rig
 class ValveEffect(Effect):
     """Common parts of valve effects: a hydraulic joint, no linear unknown, spool as abscissa."""
 
-    mechanism: ClassVar[str] = "metering_curve"
-    element: ClassVar[str] = "valve"
-    hydraulic: ClassVar[bool] = True
-    family: ClassVar[str] = "valve"
-    quantity: ClassVar[str] = "spool"
-    alters: ClassVar[tuple[str, ...]] = ("fluid",)
-    prepares: ClassVar[bool] = True
+    mechanism = "metering_curve"
+    element = "valve"
+    hydraulic = True
+    family = "valve"
+    quantity = "spool"
+    alters = ("fluid",)
+    prepares = True
     where: str = "joint 1"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
@@ -88,6 +87,14 @@ MOST_ROUND: Final = 1.7
 OPEN_AT_NULL: Final = 0.1
 
 
+@kernel
+def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        ahead = edge(x[U, i] - par[1], par[3], par[4])
+        x[U, i] = ahead - edge(-x[U, i] - par[2], par[3], par[4])
+
+
 @dataclass(frozen=True)
 class ValveDeadband(ValveEffect):
     """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the edge beyond.
@@ -98,20 +105,14 @@ class ValveDeadband(ValveEffect):
     Without it the flow gains are biased: 10 mV make those of the seed bench 12 to 17 % too small.
     """
 
-    name: ClassVar[str] = "valve_deadband"
-    least_shape: ClassVar[tuple[float, ...]] = (2e-3, 2e-3)  # [V]
-    stage: ClassVar[int] = EDGES
-    variable: ClassVar[str] = "the spool near its null"
-    confounders: ClassVar[tuple[str, ...]] = ("spool_offset", "underlap_leakage", "spool_lag")
-    excludes: ClassVar[tuple[str, ...]] = ("underlap_leakage",)
-    separated_by: ClassVar[str] = (
-        "small spool amplitudes about the null beside large ones, both edges reached"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _deadband
+    name = "valve_deadband"
+    least_shape = (2e-3, 2e-3)  # [V]
+    stage = EDGES
+    variable = "the spool near its null"
+    confounders = ("spool_offset", "underlap_leakage", "spool_lag")
+    excludes = ("underlap_leakage",)
+    separated_by = "small spool amplitudes about the null beside large ones, both edges reached"
+    kernel = _deadband
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the two edges, their rounding and their corner."""
@@ -158,6 +159,12 @@ class ValveDeadband(ValveEffect):
         )
 
 
+@kernel
+def _offset(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        x[U, int(par[0])] -= par[1]
+
+
 @dataclass(frozen=True)
 class SpoolOffset(ValveEffect):
     """The edges' null is at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
@@ -166,20 +173,16 @@ class SpoolOffset(ValveEffect):
     seed bench).
     """
 
-    name: ClassVar[str] = "spool_offset"
-    exact: ClassVar[bool] = True
-    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [V]
-    stage: ClassVar[int] = NULL
-    variable: ClassVar[str] = "the spool's sign"
-    confounders: ClassVar[tuple[str, ...]] = ("valve_deadband", "internal_leakage")
-    separated_by: ClassVar[str] = (
+    name = "spool_offset"
+    exact = True
+    least_shape = (1e-3,)  # [V]
+    stage = NULL
+    variable = "the spool's sign"
+    confounders = ("valve_deadband", "internal_leakage")
+    separated_by = (
         "two spool amplitudes: the flow error stays the same, that of a gain grows with them"
     )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _offset
+    kernel = _offset
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the null."""
@@ -207,6 +210,20 @@ DAMPING_BOUNDS: Final = (0.3, 1.5)
 DAMPING_START: Final = 0.8
 
 
+@kernel
+def _lag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        if par[2] > 0.0:
+            frequency = 2.0 * par[2] / par[1]
+            dz[0] = z[1]
+            dz[1] = frequency * (frequency * (x[U, i] - z[0]) - 2.0 * par[2] * z[1])
+        else:
+            dz[0] = (x[U, i] - z[0]) / par[1]
+            dz[1] = -z[1] / par[1]
+        x[U, i] = z[0] - par[3] / 2.0 * dz[0] + par[3] ** 2 / 6.0 * dz[1]
+
+
 @dataclass(frozen=True)
 class SpoolLag(ValveEffect):
     """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003).
@@ -220,22 +237,16 @@ class SpoolLag(ValveEffect):
     applied to x, of first order without the last of these.
     """
 
-    mechanism: ClassVar[str] = "spool_dynamics"
-    element: ClassVar[str] = "valve"
-    name: ClassVar[str] = "spool_lag"
-    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
-    stage: ClassVar[int] = LAG
-    variable: ClassVar[str] = "the spool's velocity"
-    quantity: ClassVar[str] = "spool rate"
-    confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "valve_deadband", "entrained_air")
-    separated_by: ClassVar[str] = (
-        "high frequencies: a lag loses amplitude there, a delay only phase"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled preparation."""
-        return _lag
+    mechanism = "spool_dynamics"
+    element = "valve"
+    name = "spool_lag"
+    least_shape = (1e-3,)  # [s]
+    stage = LAG
+    variable = "the spool's velocity"
+    quantity = "spool rate"
+    confounders = ("channel_delay", "valve_deadband", "entrained_air")
+    separated_by = "high frequencies: a lag loses amplitude there, a delay only phase"
+    kernel = _lag
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the time constant, the damping ratio and whether the input is held (1)."""
@@ -385,34 +396,6 @@ def _second_order(u, step):  # type: ignore[no-untyped-def]
                 + step[i, 2] * u[k - 1] + step[i, 3] * slope
             )  # fmt: skip
     return x
-
-
-@kernel
-def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        i = int(par[0])
-        ahead = edge(x[U, i] - par[1], par[3], par[4])
-        x[U, i] = ahead - edge(-x[U, i] - par[2], par[3], par[4])
-
-
-@kernel
-def _offset(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        x[U, int(par[0])] -= par[1]
-
-
-@kernel
-def _lag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == PREPARE:
-        i = int(par[0])
-        if par[2] > 0.0:
-            frequency = 2.0 * par[2] / par[1]
-            dz[0] = z[1]
-            dz[1] = frequency * (frequency * (x[U, i] - z[0]) - 2.0 * par[2] * z[1])
-        else:
-            dz[0] = (x[U, i] - z[0]) / par[1]
-            dz[1] = -z[1] / par[1]
-        x[U, i] = z[0] - par[3] / 2.0 * dz[0] + par[3] ** 2 / 6.0 * dz[1]
 
 
 TERMS = (ValveDeadband, SpoolOffset, SpoolLag)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from analysis.terms.base import (
     Coefficient,
     Columns,
     G,
-    Kernel,
     equation,
     kernel,
 )
@@ -31,6 +30,14 @@ BESIDE_DRY: Final = 0.1
 DRY: Final = ("Fc", "Fs", "F_ext_", "F_ret_", "k_friction_")  # its numbers, without the joint's
 
 
+@kernel
+def _by_direction(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v = x[SD, i]
+        out[TORQUE, i] -= x[G, i] * v * (par[1] if v > 0.0 else par[2])
+
+
 @dataclass(frozen=True)
 class AsymmetricViscousFriction(Effect):
     """F = c_ext s' extending, c_ret s' retracting, beside the joint's Fv q': slopes by direction.
@@ -41,27 +48,19 @@ class AsymmetricViscousFriction(Effect):
     half the difference.
     """
 
-    mechanism: ClassVar[str] = "friction_curve"
-    element: ClassVar[str] = "piston"
-    name: ClassVar[str] = "asymmetric_viscous_friction"
-    least: ClassVar[tuple[float, ...]] = (50.0, 0.0)  # [N s/m]
-    family: ClassVar[str] = "friction"
-    variable: ClassVar[str] = "the amount of the piston's velocity"
-    quantity: ClassVar[str] = "velocity"
-    confounders: ClassVar[tuple[str, ...]] = (
-        "torque_offset",
-        "asymmetric_friction",
-        "coulomb_friction",
-    )
-    separated_by: ClassVar[str] = (
+    mechanism = "friction_curve"
+    element = "piston"
+    name = "asymmetric_viscous_friction"
+    least = (50.0, 0.0)  # [N s/m]
+    family = "friction"
+    variable = "the amount of the piston's velocity"
+    quantity = "velocity"
+    confounders = ("torque_offset", "asymmetric_friction", "coulomb_friction")
+    separated_by = (
         "two speeds of one motion: offset and difference of levels stay the same, this doubles"
     )
+    kernel = _by_direction
     where: str = "joint 1"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _by_direction
 
     def _names(self, rig: Rig) -> tuple[str, ...]:
         if rig.electric:
@@ -112,14 +111,6 @@ class AsymmetricViscousFriction(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's velocity [m/s]."""
         return {equation("torque", self.joint): signals.sd[:, self.joint]}
-
-
-@kernel
-def _by_direction(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        v = x[SD, i]
-        out[TORQUE, i] -= x[G, i] * v * (par[1] if v > 0.0 else par[2])
 
 
 TERMS = (AsymmetricViscousFriction,)

@@ -116,14 +116,10 @@ class Term:
     """
 
     name: ClassVar[str]
+    kernel: ClassVar[Kernel]  # the compiled contribution in simulation (see the module)
     prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
     rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that simulation needs because of this term
     where: str = "bench"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution in simulation (see the module)."""
-        raise NotImplementedError
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the linear unknowns, in the order of `pack`."""

@@ -24,6 +24,14 @@ from rig.model.parameters import parameter_unit
 from rig.model.rig import Rig
 
 
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            out[COMP_CAP, i] += par[0] * x[V_CAP, i]
+            out[COMP_ROD, i] += par[0] * x[V_ROD, i]
+
+
 @dataclass(frozen=True)
 class Compressibility(Term):
     """- (1/b) V dp/dt in the flow rows of each chamber, linear in 1/b.
@@ -32,11 +40,7 @@ class Compressibility(Term):
     """
 
     name: ClassVar[str] = "compressibility"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _kernel
+    kernel: ClassVar[Kernel] = _kernel
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return b [Pa], the rows' coefficient being 1/b."""
@@ -49,14 +53,6 @@ class Compressibility(Term):
             out[equation("flow_cap", i)] = {"b": -signals.V_cap[:, i] * signals.pd_cap[:, i]}
             out[equation("flow_rod", i)] = {"b": -signals.V_rod[:, i] * signals.pd_rod[:, i]}
         return out
-
-
-@kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        for i in range(x.shape[1]):
-            out[COMP_CAP, i] += par[0] * x[V_CAP, i]
-            out[COMP_ROD, i] += par[0] * x[V_ROD, i]
 
 
 TERMS = (Compressibility,)

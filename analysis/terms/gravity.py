@@ -25,16 +25,22 @@ from analysis.terms.sine_cosine import sine_cosine
 from rig.model.rig import Rig
 
 
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    carried = 0.0
+    for i in range(x.shape[1] - 1, -1, -1):
+        carried += par[i] * sine_cosine(x[THETA, i])[0]
+        out[TORQUE, i] -= carried
+
+
 @dataclass(frozen=True)
 class Gravity(Term):
     """V = - sum_k W_k g cos(theta_k): joint i carries sum_{k>=i} W_k g sin(theta_k)."""
 
     name: ClassVar[str] = "gravity"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _kernel
+    kernel: ClassVar[Kernel] = _kernel
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return W_1 .. W_N [kg m]."""
@@ -52,16 +58,6 @@ class Gravity(Term):
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return W_k g [N m]."""
         return np.array([rig.gravity * values[c.parameter] for c in self.coefficients(rig)])
-
-
-@kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    carried = 0.0
-    for i in range(x.shape[1] - 1, -1, -1):
-        carried += par[i] * sine_cosine(x[THETA, i])[0]
-        out[TORQUE, i] -= carried
 
 
 TERMS = (Gravity,)

@@ -29,6 +29,17 @@ from rig.model.rig import Rig
 PARAMETER = "base_inclination"
 
 
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    N = x.shape[1]
+    carried = 0.0
+    for i in range(N - 1, -1, -1):
+        carried += par[i] * sine_cosine(x[THETA, i] + par[N])[0]
+        out[TORQUE, i] -= carried
+
+
 @dataclass(frozen=True)
 class InclinedGravity(Term):
     """V = - sum_k W_k g cos(theta_k + alpha), in place of `gravity`.
@@ -39,11 +50,7 @@ class InclinedGravity(Term):
     """
 
     name: ClassVar[str] = "inclined_gravity"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _kernel
+    kernel: ClassVar[Kernel] = _kernel
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return W_k cos(alpha), then W_k sin(alpha) [kg m]."""
@@ -98,17 +105,6 @@ class InclinedGravity(Term):
 def _linear(joints: int) -> tuple[str, ...]:
     each = range(1, joints + 1)
     return (*(f"W{i} cos" for i in each), *(f"W{i} sin" for i in each))
-
-
-@kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    N = x.shape[1]
-    carried = 0.0
-    for i in range(N - 1, -1, -1):
-        carried += par[i] * sine_cosine(x[THETA, i] + par[N])[0]
-        out[TORQUE, i] -= carried
 
 
 TERMS = (InclinedGravity,)

@@ -29,6 +29,39 @@ from rig.model.parameters import inertia_names
 from rig.model.rig import Rig
 
 
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    N = x.shape[1]
+    for k in range(N):
+        rate_k = 0.0
+        for m in range(k + 1):
+            rate_k += x[QD, m]
+        for j in range(k, N):
+            R = par[k * N + j]
+            if R == 0.0:
+                continue
+            if j == k:
+                for a in range(k + 1):
+                    for b in range(k + 1):
+                        M[a, b] += R
+                continue
+            rate_j = rate_k
+            for m in range(k + 1, j + 1):
+                rate_j += x[QD, m]
+            sine, cosine = sine_cosine(x[THETA, k] - x[THETA, j])
+            c, s = R * cosine, R * sine
+            # Link k feels + s theta_j'^2, link j feels - s theta_k'^2; joints below carry both.
+            for a in range(j + 1):
+                if a <= k:
+                    out[TORQUE, a] -= s * rate_j * rate_j
+                out[TORQUE, a] += s * rate_k * rate_k
+                for b in range(k + 1):
+                    M[a, b] += c
+                    M[b, a] += c
+
+
 @dataclass(frozen=True)
 class Inertia(Term):
     """T = 1/2 sum_ij R_ij cos(theta_i - theta_j) theta_i' theta_j' (docs/n-joints.md).
@@ -40,11 +73,7 @@ class Inertia(Term):
     """
 
     name: ClassVar[str] = "inertia"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _kernel
+    kernel: ClassVar[Kernel] = _kernel
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return M1 | M1 M2 R12 | R_ij."""
@@ -115,39 +144,6 @@ def mass_matrix(R: Array, q: Array) -> Array:
     turned = R * np.cos(theta[:, None] - theta[None, :])
     partial = np.cumsum(turned[::-1, ::-1], axis=0).cumsum(axis=1)
     return np.asarray(partial[::-1, ::-1])
-
-
-@kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    N = x.shape[1]
-    for k in range(N):
-        rate_k = 0.0
-        for m in range(k + 1):
-            rate_k += x[QD, m]
-        for j in range(k, N):
-            R = par[k * N + j]
-            if R == 0.0:
-                continue
-            if j == k:
-                for a in range(k + 1):
-                    for b in range(k + 1):
-                        M[a, b] += R
-                continue
-            rate_j = rate_k
-            for m in range(k + 1, j + 1):
-                rate_j += x[QD, m]
-            sine, cosine = sine_cosine(x[THETA, k] - x[THETA, j])
-            c, s = R * cosine, R * sine
-            # Link k feels + s theta_j'^2, link j feels - s theta_k'^2; joints below carry both.
-            for a in range(j + 1):
-                if a <= k:
-                    out[TORQUE, a] -= s * rate_j * rate_j
-                out[TORQUE, a] += s * rate_k * rate_k
-                for b in range(k + 1):
-                    M[a, b] += c
-                    M[b, a] += c
 
 
 TERMS = (Inertia,)

@@ -33,6 +33,21 @@ from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
 
 
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    p_s, p_t = bench[P_S], bench[P_TANK]
+    for i in range(x.shape[1]):
+        u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
+        if u > 0.0:
+            out[FLOW_CAP, i] += par[4 * i] * signed_root(p_s - cap) * u
+            out[FLOW_ROD, i] -= par[4 * i + 2] * signed_root(rod - p_t) * u
+        else:
+            out[FLOW_CAP, i] += par[4 * i + 1] * signed_root(cap - p_t) * u
+            out[FLOW_ROD, i] -= par[4 * i + 3] * signed_root(p_s - rod) * u
+
+
 @dataclass(frozen=True)
 class Orifice(Term):
     """Turbulent flow through an opening proportional to the spool (docs/method.md).
@@ -45,11 +60,7 @@ class Orifice(Term):
     """
 
     name: ClassVar[str] = "orifice"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _kernel
+    kernel: ClassVar[Kernel] = _kernel
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return C_pp C_pm C_mp C_mm of each joint."""
@@ -110,21 +121,6 @@ def root_of_drop(drop: Array) -> Array:
     Not compiled: loading compiled code takes longer than the roots of an identification.
     """
     return np.copysign(np.sqrt(np.abs(drop)), drop)
-
-
-@kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase != CONTRIBUTE:
-        return
-    p_s, p_t = bench[P_S], bench[P_TANK]
-    for i in range(x.shape[1]):
-        u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
-        if u > 0.0:
-            out[FLOW_CAP, i] += par[4 * i] * signed_root(p_s - cap) * u
-            out[FLOW_ROD, i] -= par[4 * i + 2] * signed_root(rod - p_t) * u
-        else:
-            out[FLOW_CAP, i] += par[4 * i + 1] * signed_root(cap - p_t) * u
-            out[FLOW_ROD, i] -= par[4 * i + 3] * signed_root(p_s - rod) * u
 
 
 TERMS = (Orifice,)

@@ -21,16 +21,19 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            out[TORQUE, i] -= par[i] * x[QD, i]
+
+
 @dataclass(frozen=True)
 class ViscousFriction(Term):
     """Torque Fv_i q_i' against the motion of joint i (Sakai and Maeshima, section II)."""
 
     name: ClassVar[str] = "viscous_friction"
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _kernel
+    kernel: ClassVar[Kernel] = _kernel
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return Fv_1 .. Fv_N [N m s/rad]."""
@@ -42,13 +45,6 @@ class ViscousFriction(Term):
         return {
             equation("torque", i): {f"Fv{i + 1}": signals.qd[:, i]} for i in range(signals.joints)
         }
-
-
-@kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        for i in range(x.shape[1]):
-            out[TORQUE, i] -= par[i] * x[QD, i]
 
 
 TERMS = (ViscousFriction,)
