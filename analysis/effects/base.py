@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import FAMILIES, Kernel, Term, Used, kernel
+from analysis.terms.base import (
+    FAMILIES,
+    Coefficient,
+    Columns,
+    Kernel,
+    Term,
+    Used,
+    equation,
+    kernel,
+)
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.model.units import plain
@@ -84,6 +93,12 @@ def between_samples(rig: Rig, seconds: float) -> str:
     )
 
 
+# The signal of each quantity (see `Effect.abscissa`), of a joint or of its chambers.
+OF_JOINT: Final = {
+    "velocity": "sd", "position": "s", "joint position": "q", "absolute angle": "theta",
+    "spool": "u",
+}  # fmt: skip
+OF_CHAMBER: Final = {"pressure": "p", "pressure rate": "pd"}
 UNNAMED: Final = ("piston", "spool", "position", "drive")  # sensors that a place does not name
 
 
@@ -234,7 +249,12 @@ class Effect(Term):
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the places on a rig that has what the effect acts on, by default every joint."""
+        """Return the places on a rig that has what the effect acts on.
+
+        By default the bench, or every joint where `where` is a joint's.
+        """
+        if cls.where == "bench":
+            return ("bench",)
         return tuple(f"joint {i}" for i in range(1, len(rig.joints) + 1))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
@@ -260,9 +280,10 @@ class Effect(Term):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Return why sign or size of the fitted parameters is not physical ('' if it is).
 
-        `values` holds the effect's own linear coefficients and the model's other parameters.
+        `values` holds the effect's own linear coefficients and the model's other parameters. By
+        default only the shapes are judged, by their bounds.
         """
-        return ""
+        return self.outside(rig, shape)
 
     def not_shown(
         self, rig: Rig, values: Mapping[str, float], shape: Sequence[float],
@@ -289,8 +310,21 @@ class Effect(Term):
         return self.quantity
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return, by equation, the variable (n,) to plot that equation's residual against."""
-        raise NotImplementedError
+        """Return, by equation, the variable (n,) to plot that equation's residual against.
+
+        By default `quantity` of its joint or chamber, or of all where it acts on the bench.
+        """
+        joints = range(signals.joints) if self.where == "bench" else (self.joint,)
+        if self.quantity in OF_CHAMBER:
+            sides, field = (self.side,) if self.side else ("cap", "rod"), OF_CHAMBER[self.quantity]
+            return {
+                equation(f"flow_{side}", i): getattr(signals, f"{field}_{side}")[:, i]
+                for i in joints
+                for side in sides
+            }
+        x = getattr(signals, OF_JOINT[self.quantity])
+        rows = "mechanical" if self.family in ("mechanics", "friction") else "fluid"
+        return {equation(kind, i): x[:, i] for i in joints for kind in FAMILIES[rows]}
 
     def shape_of(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
         """Return the shape, or the middle of each parameter's grid where none is given."""
@@ -352,6 +386,19 @@ class Effect(Term):
                     f"physical, {plain(s.low, 4)} to {plain(s.high, 4)}"
                 )
         return ""
+
+
+@dataclass(frozen=True)
+class SignalEffect(Effect):
+    """An effect that acts only on the signals that all terms see (`prepare`), with shapes only."""
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return nothing: it has shapes only."""
+        return ()
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return nothing: other terms' columns are of the prepared signals."""
+        return {}
 
 
 def exponent(shape: Sequence[float]) -> float:

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from analysis.effects.base import VOLUME, Array, Effect, Shape, beyond, exponent
+from analysis.effects.base import VOLUME, Array, Effect, Shape, SignalEffect, beyond, exponent
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     COMP_CAP,
@@ -71,11 +71,6 @@ class EntrainedAir(Effect):
     )
     kernel = _air
 
-    @classmethod
-    def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench."""
-        return ("bench",)
-
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return alpha [-]."""
         return (Coefficient("alpha_air", "", "fluid"),)
@@ -121,14 +116,6 @@ class EntrainedAir(Effect):
         """Return alpha and n."""
         return np.array([values["alpha_air"], exponent(shape)])
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return each chamber's pressure [Pa]."""
-        out: dict[str, Array] = {}
-        for i in range(signals.joints):
-            out[equation("flow_cap", i)] = signals.p_cap[:, i]
-            out[equation("flow_rod", i)] = signals.p_rod[:, i]
-        return out
-
 
 @kernel
 def _dead(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
@@ -139,7 +126,7 @@ def _dead(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True)
-class DeadVolume(Effect):
+class DeadVolume(SignalEffect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
 
     It is negative where the file states more than there is, at most the whole pipe. A hose gives
@@ -173,10 +160,6 @@ class DeadVolume(Effect):
         return tuple(
             f"{joint} {side}" for joint in super().all_places(rig) for side in ("cap", "rod")
         )
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: the volume is a shape."""
-        return ()
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the volume and its stiffening."""
@@ -237,24 +220,11 @@ class DeadVolume(Effect):
         V, stiffening = self.whole(rig, shape)
         return V * (1.0 + stiffening * 0.5 * rig.supply.pressure), stiffening
 
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return nothing: `compressibility` sees the larger volume."""
-        return {}
-
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, volume at no pressure of the cap side, of the rod side, stiffening."""
         V, stiffening = self.slack(rig, shape)
         sides = V * (self.side == "cap"), V * (self.side == "rod")
         return np.array([self.joint, *sides, stiffening])
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a volume at its bounds."""
-        return self.outside(rig, shape)
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the chamber's pressure rate [Pa/s]."""
-        rate = signals.pd_cap if self.side == "cap" else signals.pd_rod
-        return {equation(f"flow_{self.side}", self.joint): rate[:, self.joint]}
 
 
 TERMS = (EntrainedAir, DeadVolume)

@@ -183,11 +183,6 @@ class MeteringCurve(Effect):
             f"these records, {plain(largest, 3)} V; at smaller ones the curve says how it differs"
         )
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the spool [V]."""
-        u = signals.u[:, self.joint]
-        return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
-
 
 @kernel
 def _softness(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
@@ -216,11 +211,6 @@ class BulkModulusCurve(Effect):
     confounders = ("dead_volume", "spool_lag")
     separated_by = "fast pressure changes at low and at high chamber pressure"
     kernel = _softness
-
-    @classmethod
-    def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench."""
-        return ("bench",)
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots."""
@@ -282,14 +272,6 @@ class BulkModulusCurve(Effect):
         rise = float(np.max(soft - np.minimum.accumulate(soft)))
         falls = rise <= SOFTENS * float(np.ptp(soft))
         return "" if falls else "the oil would be softer at higher pressure"
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return each chamber's pressure [Pa]."""
-        out: dict[str, Array] = {}
-        for i in range(signals.joints):
-            out[equation("flow_cap", i)] = signals.p_cap[:, i]
-            out[equation("flow_rod", i)] = signals.p_rod[:, i]
-        return out
 
 
 TERMS = (MeteringCurve, BulkModulusCurve)

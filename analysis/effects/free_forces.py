@@ -325,9 +325,5 @@ class PositionForce(Effect):
         y = np.array([values[name] for name in self._names()])
         return _refuse_large_force(rig, self.joint, y, "the force")
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the piston's position [m]."""
-        return {equation("torque", self.joint): signals.s[:, self.joint]}
-
 
 TERMS = (FrictionCurve, PositionForce)

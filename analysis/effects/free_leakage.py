@@ -245,10 +245,5 @@ class LeakageAlongStroke(_FreeLeakage):
         size = spline(knots, shown(knots)) @ self._values(values)
         return self._refused(rig, 0.5 * size * rig.supply.pressure)
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the piston's position [m]."""
-        place = signals.s[:, self.joint]
-        return {equation(kind, self.joint): place for kind in ("flow_cap", "flow_rod")}
-
 
 TERMS = (LeakageCurve, LeakageAlongStroke)

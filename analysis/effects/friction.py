@@ -189,10 +189,6 @@ class Friction(Effect):
         linear = [values[c.parameter] for c in self.coefficients(rig)]
         return np.array([self.joint, *linear, *self.contact_of(shape)], dtype=np.float64)
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the piston's speed [m/s]."""
-        return {equation("torque", self.joint): signals.sd[:, self.joint]}
-
 
 def force_limit(rig: Rig, joint: int) -> float:
     """Return half of the force of cylinder or drive [N]; more dry friction would stop the joint."""

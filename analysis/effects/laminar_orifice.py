@@ -72,11 +72,6 @@ class LaminarOrifice(Effect):
     separated_by = "loads that leave a small drop across each edge in turn, at several openings"
     kernel = _laminar
 
-    @classmethod
-    def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench: one oil and, mostly, one series of valves."""
-        return ("bench",)
-
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the gains of all joints, which `orifice` owns."""
         return Orifice().coefficients(rig)
@@ -108,10 +103,6 @@ class LaminarOrifice(Effect):
         transition, sharpness = self.whole(rig, shape)
         gains = (values[c.parameter] for c in self.coefficients(rig))
         return np.array([transition, sharpness or SUM, *gains])
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a transition at its bounds."""
-        return self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the drop across the edge that is open [Pa]."""

@@ -197,13 +197,5 @@ class ExternalLeakage(_Leakage):
         leaks = (c * (side in self._chambers) for side in ("cap", "rod"))
         return np.array([self.joint, *leaks, exponent(shape)])
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return each leaking chamber's pressure [Pa]."""
-        pressures = {"cap": signals.p_cap, "rod": signals.p_rod}
-        return {
-            equation(f"flow_{side}", self.joint): pressures[side][:, self.joint]
-            for side in self._chambers
-        }
-
 
 TERMS = (InternalLeakage, ExternalLeakage)

@@ -18,9 +18,9 @@ from typing import Final
 
 import numpy as np
 
-from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect
+from analysis.effects.base import NO_KERNEL, SENSOR, Array, SignalEffect
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import Coefficient, Columns, Used, equation
+from analysis.terms.base import Used, equation
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -30,7 +30,7 @@ KINDS: Final = {**HYDRAULIC, **ELECTRIC}
 
 
 @dataclass(frozen=True)
-class Sensor(Effect):
+class Sensor(SignalEffect):
     """Common parts of sensor effects: the channel, and the signals that follow from it."""
 
     mechanism = "sensor"
@@ -73,14 +73,6 @@ class Sensor(Effect):
         measured = not rig.electric and rig.sensors.supply_pressure is not None
         supply = ("bench",) if measured else ()
         return (*(f"joint {i} {side}" for i in joints for side in sides), *supply)
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: a sensor's error is in every column."""
-        return ()
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return nothing."""
-        return {}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return nothing."""
@@ -161,10 +153,6 @@ class Sensor(Effect):
             value = self.shape_of(rig, shape)[0]
             out[self.channel] = self.undone(out[self.channel], 0, rate, value)
         return out
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds."""
-        return self.outside(rig, shape)
 
     def plotted(self) -> str:
         """Name the channel's quantity, of a position its velocity."""

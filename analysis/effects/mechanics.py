@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.effects.base import Array, Effect, Shape, SignalEffect, beyond
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -39,7 +39,7 @@ def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
 
 
 @dataclass(frozen=True)
-class BaseInclination(Effect):
+class BaseInclination(SignalEffect):
     """All absolute angles turned by one angle alpha: link k pulls W_k g sin(theta_k + alpha).
 
     Inertia depends on differences of absolute angles only, so that turning them changes gravity
@@ -67,10 +67,6 @@ class BaseInclination(Effect):
         free = getattr(rig, "inclination", 0.0) == UNKNOWN
         return () if getattr(rig, "prismatic", False) or free or rig.gravity == 0 else ("bench",)
 
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: the angle is a shape."""
-        return ()
-
     def shape_names(self) -> tuple[str, ...]:
         """Name the angle."""
         return ("inclination",)
@@ -82,18 +78,6 @@ class BaseInclination(Effect):
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Turn the absolute angles."""
         return replace(signals, theta=signals.theta + self.shape_of(rig, shape)[0])
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return nothing: `gravity` sees the turned angles."""
-        return {}
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject an angle at its bounds."""
-        return self.outside(rig, shape)
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return each link's absolute angle [rad]."""
-        return {equation("torque", i): signals.theta[:, i] for i in range(signals.joints)}
 
 
 LEAST_REACH: Final = 0.1  # of the joint's range: against a stiffer spring it cannot move so far
@@ -169,10 +153,6 @@ class JointSpring(Effect):
         stiffest = torque_limit(rig, self.joint) / (LEAST_REACH * (high - low))
         return beyond(name, values[name], "N*m/rad", stiffest) or self.outside(rig, shape)
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the joint's angle [rad]."""
-        return {equation("torque", self.joint): signals.q[:, self.joint]}
-
 
 def _reach(rig: Rig, joint: int) -> tuple[float, float]:
     """Return the joint's smallest and largest angle."""
@@ -234,10 +214,6 @@ class TorqueOffset(Effect):
         name = self._name(rig)[0]
         limit = torque_limit(rig, self.joint)
         return beyond(name, values[name], "N*m", limit, -limit)
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the joint's angle [rad], over which the offset is constant."""
-        return {equation("torque", self.joint): signals.q[:, self.joint]}
 
 
 TERMS = (BaseInclination, JointSpring, TorqueOffset)

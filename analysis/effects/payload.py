@@ -18,7 +18,6 @@ from analysis.terms.base import (
     TORQUE,
     Coefficient,
     Columns,
-    equation,
     kernel,
 )
 from analysis.terms.gravity import Gravity
@@ -116,10 +115,6 @@ class Payload(Effect):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a negative mass, and one that no joint can lift."""
         return beyond("m_payload", values["m_payload"], "kg", heaviest_payload(rig))
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return each link's absolute angle [rad]."""
-        return {equation("torque", i): signals.theta[:, i] for i in range(signals.joints)}
 
 
 def heaviest_payload(rig: Rig) -> float:

@@ -16,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import SUPPLY, Array, Effect, Evidence, Shape
+from analysis.effects.base import SUPPLY, Array, Evidence, Shape, SignalEffect
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     P_CAP,
@@ -24,8 +24,6 @@ from analysis.terms.base import (
     P_S,
     P_TANK,
     PREPARE,
-    Coefficient,
-    Columns,
     U,
     equation,
     kernel,
@@ -51,7 +49,7 @@ NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
 
 
 @dataclass(frozen=True)
-class PortEffect(Effect):
+class PortEffect(SignalEffect):
     """An effect on the pressure at all valves' ports, with shapes only."""
 
     hydraulic = True
@@ -59,23 +57,6 @@ class PortEffect(Effect):
     alters = ("fluid",)
     prepares = True
     stage = SUPPLY
-
-    @classmethod
-    def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench."""
-        return ("bench",)
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: pressures are inside the orifices' roots."""
-        return ()
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return nothing: `orifice` sees the prepared pressures."""
-        return {}
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds."""
-        return self.outside(rig, shape)
 
 
 def bulk_modulus(rig: Rig) -> float:
@@ -338,14 +319,6 @@ class TankPressure(PortEffect):
         kept = (v if v > 1e-3 * s.high else g for v, s, g in
                 zip((constant, back), self.shapes(rig), inner, strict=True))  # fmt: skip
         return self.outside(rig, tuple(kept))
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the pressure of the chamber that is open to the tank [Pa]."""
-        out: dict[str, Array] = {}
-        for i in range(signals.joints):
-            out[equation("flow_cap", i)] = signals.p_cap[:, i]
-            out[equation("flow_rod", i)] = signals.p_rod[:, i]
-        return out
 
 
 @kernel

@@ -20,8 +20,8 @@ from analysis.effects.base import (
     LAG,
     NULL,
     Array,
-    Effect,
     Shape,
+    SignalEffect,
     between_samples,
     longest_lag,
 )
@@ -29,8 +29,6 @@ from analysis.effects.edges import corner, edge, opened, rounding
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     PREPARE,
-    Coefficient,
-    Columns,
     U,
     equation,
     kernel,
@@ -39,7 +37,7 @@ from rig.model.rig import Rig
 
 
 @dataclass(frozen=True)
-class ValveEffect(Effect):
+class ValveEffect(SignalEffect):
     """Common parts of valve effects: a hydraulic joint, no linear unknown, spool as abscissa."""
 
     mechanism = "metering_curve"
@@ -51,14 +49,6 @@ class ValveEffect(Effect):
     prepares = True
     where: str = "joint 1"
 
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return nothing: the gains are those of the orifices."""
-        return ()
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return nothing: `orifice` sees the prepared opening."""
-        return {}
-
     def with_opening(self, signals: Signals, opening: Array) -> Signals:
         """Return the signals with the joint's opening (n,) [V] in the place of its spool."""
         u = signals.u.copy()
@@ -68,15 +58,6 @@ class ValveEffect(Effect):
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, shape."""
         return np.array([self.joint, *self.whole(rig, shape)], dtype=np.float64)
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds."""
-        return self.outside(rig, shape)
-
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the spool [V]."""
-        u = signals.u[:, self.joint]
-        return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
 
 
 # Rounding r over overlap w at which a round edge's gain at the null, 1 - w / sqrt(w^2 + r^2), is

@@ -108,9 +108,5 @@ class AsymmetricViscousFriction(Effect):
             return f"the slopes of the two directions differ by less than {100 * least:.0f} %"
         return ""
 
-    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the piston's velocity [m/s]."""
-        return {equation("torque", self.joint): signals.sd[:, self.joint]}
-
 
 TERMS = (AsymmetricViscousFriction,)
