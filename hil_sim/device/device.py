@@ -12,23 +12,20 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hil_sim.device.laws import DeviceLaw, LawTable, Refused
+from hil_sim.device.laws import LawTable, Refused
 from hil_sim.device.queue import BlockQueue
 from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
-from hil_sim.plant.prefetch import Prefetch, Rewindable
+from hil_sim.plant.interface import Law, PlantInterface, Prefetch, Rewindable
 from rig.model.parts import WATCHDOG_RANGE
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
+from rig.model.wire.codes import Codes
 from rig.model.wire.registers import BlockHeader, Refusal, Status, TripCause
 
 logger = logging.getLogger(__name__)
-
-Codes = NDArray[np.int64]
 
 QUEUE_SECONDS = 4.0
 SETTLE_SECONDS = 0.2  # virtual time with zero outputs after the host has disconnected
@@ -39,17 +36,6 @@ _U32 = 0xFFFF_FFFF
 # Integers, because every block needs them and an enumeration is slow.
 _STREAMING, _TRIPPED = int(Status.STREAMING), int(Status.TRIPPED)
 _ARMED, _CONTROLLED = int(Status.ARMED), int(Status.CONTROLLED)
-
-
-class PlantInterface(Protocol):
-    """The plant as the device uses it; deterministic, with all physical state."""
-
-    @property
-    def tick(self) -> int:
-        """Samples measured so far."""
-
-    def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[Codes, Codes]:
-        """Run `ticks` samples; return AD codes (ticks, channels), DA codes (ticks, joints)."""
 
 
 class Device:
@@ -77,7 +63,7 @@ class Device:
         self._faults = sorted(faults, key=lambda fault: fault.at)
         self._virtual_silence = virtual_silence
         # In real time the plant is never ahead of the clock; faults may change it between blocks.
-        ahead = not realtime and not faults and isinstance(plant, Rewindable)
+        ahead = not realtime and not faults
         self._prefetch = Prefetch(plant) if ahead and isinstance(plant, Rewindable) else None
         self._plant: PlantInterface = plant if self._prefetch is None else self._prefetch
         self._clock = clock
@@ -329,7 +315,7 @@ class Device:
                 self.queue.add(tick, measured, commands)
             ticks -= count
 
-    def _advance(self, count: int, laws: tuple[DeviceLaw, ...]) -> tuple[Codes, Codes]:
+    def _advance(self, count: int, laws: tuple[Law, ...]) -> tuple[Codes, Codes]:
         if self._broken:
             raise Refused(Refusal.FAULT)
         try:

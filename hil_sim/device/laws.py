@@ -11,15 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hil_sim.plant.interface import Law
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
-from rig.model.wire.codes import decode_output
+from rig.model.wire.codes import Array, decode_output
 from rig.model.wire.registers import Refusal
 
-Array = NDArray[np.float64]
 Words = NDArray[np.uint16]
 
-_SILENCE = np.zeros(1)
 _SINGLE = 1.0 + 1e-6  # registers hold single precision: 0.0375 arrives as 0.037500001
 GAIN_MAX = 100.0
 POSITION_GAIN_MAX = 1e5  # [V/m]
@@ -34,20 +33,7 @@ class Refused(Exception):
         self.joint = joint
 
 
-@dataclass(frozen=True)
-class DeviceLaw:
-    """One joint's output law, in volts and metres, as the plant evaluates it every tick."""
-
-    wave: Array
-    start: int = 0
-    gain: float = 0.0
-    bias: float = 0.0
-    position_gain: float = 0.0
-    setpoint: float = 0.0
-    limit: float = 0.0
-
-
-OFF = DeviceLaw(_SILENCE)
+OFF = Law(np.zeros(1))  # every plant may look into its wave
 
 
 @dataclass
@@ -66,9 +52,9 @@ class LawTable:
         reach = max(abs(edge) for edge in rig.sensors.piston.range)
         self._bounds = np.array([[GAIN_MAX, v, POSITION_GAIN_MAX, reach, v] for v in self._ranges])
         self._staged = np.zeros((len(rig.joints), len(reg.LAW_FIELDS)), dtype=">f4")
-        self._waves: list[Array] = [_SILENCE for _ in rig.joints]
+        self._waves: list[Array] = [OFF.wave for _ in rig.joints]
         self._upload: _Upload | None = None
-        self.active: tuple[DeviceLaw, ...] = tuple(OFF for _ in rig.joints)
+        self.active: tuple[Law, ...] = tuple(OFF for _ in rig.joints)
 
     @property
     def joints(self) -> int:
@@ -131,7 +117,7 @@ class LawTable:
         laws = []
         for wave, row, old in zip(self._waves, self._staged.tolist(), self.active, strict=True):
             values = dict(zip(reg.LAW_FIELDS, row, strict=True))
-            laws.append(DeviceLaw(wave, tick if restart else old.start, **values))
+            laws.append(Law(wave, tick if restart else old.start, **values))
         self.active = tuple(laws)
 
     def would_arm(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from typing import Protocol
 
 from pymodbus.constants import ExcCodes
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
@@ -21,12 +20,6 @@ _EXCEPTIONS = {
 _MAX_WRITE_BESIDE_READ = 121
 
 
-class DeviceSession(Protocol):
-    """The registers that a request's connection belongs to."""
-
-    registers: DeviceRegisters
-
-
 class ResponsePdu(ModbusPDU):
     """An answer made of bytes."""
 
@@ -41,9 +34,13 @@ class ResponsePdu(ModbusPDU):
 
 
 class Request(ModbusPDU):
-    """A request kept as bytes until its connection answers it."""
+    """A request kept as bytes until its connection answers it.
 
-    session: DeviceSession
+    `client` identifies the connection, `map` is the register map of the device.
+    """
+
+    map: DeviceRegisters
+    client: object
     data = b""
 
     def decode(self, data: bytes) -> None:
@@ -57,8 +54,9 @@ class Request(ModbusPDU):
         """Execute the request; return the bytes after the answer's function code."""
         raise NotImplementedError
 
-    def answered(self) -> ModbusPDU:
-        """Return the answer, or Modbus's exception response."""
+    def answered(self, registers: DeviceRegisters, client: object) -> ModbusPDU:
+        """Return the answer to a client, or Modbus's exception response."""
+        self.map, self.client = registers, client
         try:
             return ResponsePdu(self.function_code, self.answer())
         except Refused as refused:
@@ -66,6 +64,17 @@ class Request(ModbusPDU):
         except (struct.error, ValueError):
             code = ExcCodes.ILLEGAL_VALUE
         return ExceptionResponse(self.function_code, code)
+
+    def _read(self, address: int, count: int) -> bytes:
+        if not 1 <= count <= MAX_READ:
+            raise ValueError("register count")
+        data = self.map.read(self.client, address, count)
+        return bytes([len(data)]) + data
+
+    def _write(self, address: int, count: int, data: bytes, most: int) -> None:
+        if not 1 <= count <= most or len(data) != 2 * count:
+            raise ValueError("register count")
+        self.map.write(self.client, address, data)
 
 
 class ReadHolding(Request):
@@ -76,7 +85,7 @@ class ReadHolding(Request):
     def answer(self) -> bytes:
         """Read one span of registers."""
         address, count = struct.unpack(">HH", self.data)
-        return _read(self.session, address, count)
+        return self._read(address, count)
 
 
 class ReadInput(ReadHolding):
@@ -93,7 +102,7 @@ class WriteOne(Request):
     def answer(self) -> bytes:
         """Write one register, echo the request."""
         (address,) = struct.unpack_from(">H", self.data)
-        _write(self.session, address, 1, self.data[2:], MAX_WRITE)
+        self._write(address, 1, self.data[2:], MAX_WRITE)
         return self.data
 
 
@@ -107,7 +116,7 @@ class WriteMany(Request):
         address, count, size = struct.unpack_from(">HHB", self.data)
         if size != 2 * count:
             raise ValueError("byte count")
-        _write(self.session, address, count, self.data[5:], MAX_WRITE)
+        self._write(address, count, self.data[5:], MAX_WRITE)
         return self.data[:4]
 
 
@@ -121,21 +130,8 @@ class ReadWrite(Request):
         read_at, read_count, write_at, count, size = struct.unpack_from(">HHHHB", self.data)
         if size != 2 * count:
             raise ValueError("byte count")
-        _write(self.session, write_at, count, self.data[9:], _MAX_WRITE_BESIDE_READ)
-        return _read(self.session, read_at, read_count)
+        self._write(write_at, count, self.data[9:], _MAX_WRITE_BESIDE_READ)
+        return self._read(read_at, read_count)
 
 
 REQUESTS: list[type[ModbusPDU]] = [ReadHolding, ReadInput, WriteOne, WriteMany, ReadWrite]
-
-
-def _read(session: DeviceSession, address: int, count: int) -> bytes:
-    if not 1 <= count <= MAX_READ:
-        raise ValueError("register count")
-    data = session.registers.read(session, address, count)
-    return bytes([len(data)]) + data
-
-
-def _write(session: DeviceSession, address: int, count: int, data: bytes, most: int) -> None:
-    if not 1 <= count <= most or len(data) != 2 * count:
-        raise ValueError("register count")
-    session.registers.write(session, address, data)

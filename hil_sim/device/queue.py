@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.model.wire.codes import Codes
 from rig.model.wire.registers import BlockLayout, pack_samples
-
-Codes = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -33,19 +33,15 @@ _COUNTED: Final = {
 _BY_FUNCTION: Final = {request.function_code: request for request in REQUESTS}
 
 
-class _LineSession:
-    """The device's client on a serial line: one permanent host, whose end is not detectable."""
-
-    def __init__(self, device: Device) -> None:
-        self.registers = DeviceRegisters(device)
-
-
 class RtuLine:
-    """A serial line with one device's registers; `endpoint` is its other end."""
+    """A serial line with one device's registers; `endpoint` is its other end.
+
+    It is the device's client: one permanent host, whose end is not detectable.
+    """
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._session = _LineSession(device)
+        self._registers = DeviceRegisters(device)
         self._master, slave = pty.openpty()
         tty.setraw(slave)
         self._slave = slave  # held open, so that a host that closes its end does not end the line
@@ -97,9 +93,8 @@ class RtuLine:
         else:
             request = kind()
             assert isinstance(request, Request)
-            request.session = self._session
             request.decode(frame[2:-2])
-            answer = request.answered()
+            answer = request.answered(self._registers, self)
         if self._device.boots:  # since it has begun to answer
             return
         body = bytes([ADDRESS, answer.function_code]) + answer.encode()

@@ -5,36 +5,46 @@ When the last program closes the port, the device counts its host as lost, as if
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-from hil_sim.device.device import Device, PlantInterface
+from hil_sim.device.device import Device
 from hil_sim.device.lifetime import run_until, termination_signals
+from hil_sim.device.message_session import MessageSession
 from hil_sim.device.pty_line import PtyLine
-from hil_sim.device.serial_session import SerialSession
-from hil_sim.faults.device import DeviceFault
-from rig.model.rig import Rig
-
-logger = logging.getLogger(__name__)
+from rig.model.wire.frames import FrameDecoder, encode_frame
 
 
-def serve_serial(
-    rig: Rig,
-    plant: PlantInterface,
-    *,
-    realtime: bool = False,
-    on_ready: Callable[[str], None] = logger.info,
-    parent: int | None = None,
-    faults: Sequence[DeviceFault] = (),
-) -> None:
-    """Serve a plant on a new pty until SIGTERM, SIGINT or the end of process `parent`.
+class SerialSession:
+    """A `MessageSession` with frames of a serial line."""
 
-    `on_ready` is called once with the endpoint, ``serial:///dev/pts/3``. The sample clock starts
-    with this call. Raises EndpointError where there are no pseudo terminals.
+    def __init__(self, device: Device) -> None:
+        self._session = MessageSession(device)
+        self._decoder = FrameDecoder()
+
+    def receive(self, data: bytes) -> bytes:
+        """Execute the messages that `data` completes; return the answers."""
+        answers = map(self._session.receive, self._decoder.feed(data))
+        return b"".join(encode_frame(answer) for answer in answers if answer is not None)
+
+    def push(self) -> bytes:
+        """Return the frame of the next block if it may be sent, else nothing."""
+        block = self._session.push()
+        return b"" if block is None else encode_frame(block)
+
+    def ended(self) -> None:
+        """Note that no program has the other end of the line open."""
+        self._decoder.reset()
+        self._session.ended()
+
+
+def serve_serial(device: Device, on_ready: Callable[[str], None], parent: int | None) -> None:
+    """Serve a device on a new pty until SIGTERM, SIGINT or the end of process `parent`.
+
+    `on_ready` is called once with the endpoint, ``serial:///dev/pts/3``. Raises EndpointError where
+    there are no pseudo terminals.
     """
     line = PtyLine()
-    device = Device(rig, plant, realtime=realtime, faults=faults)
     try:
         with termination_signals() as ended:
             on_ready(f"serial://{line.name}")

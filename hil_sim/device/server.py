@@ -18,7 +18,7 @@ from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
 from pymodbus.transport import ModbusProtocol
 
-from hil_sim.device.device import Device, PlantInterface
+from hil_sim.device.device import Device
 from hil_sim.device.laws import LawTable
 from hil_sim.device.lifetime import PARENT_SECONDS, EndpointError, ParentProcess
 from hil_sim.device.pdu import REQUESTS, Request
@@ -26,6 +26,7 @@ from hil_sim.device.register_map import DeviceRegisters
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_serial
 from hil_sim.faults.device import DeviceFault
+from hil_sim.plant.interface import PlantInterface
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
 
@@ -69,7 +70,7 @@ class _Connection(ServerRequestHandler):
     def __init__(self, server: BenchServer, device: Device, registers: DeviceRegisters) -> None:
         super().__init__(server, None, None, self._connection)  # type: ignore[no-untyped-call]
         self._device = device
-        self.registers = registers
+        self._registers = registers
 
     def data_received(self, data: bytes) -> None:
         """Answer every complete request; keep an incomplete one."""
@@ -97,8 +98,7 @@ class _Connection(ServerRequestHandler):
         if request is None:
             return used
         if isinstance(request, Request):
-            request.session = self
-            answer = request.answered()
+            answer = request.answered(self._registers, self)
         else:
             answer = ExceptionResponse(request.function_code, ExcCodes.ILLEGAL_FUNCTION)
         answer.transaction_id, answer.dev_id = request.transaction_id, request.dev_id
@@ -205,14 +205,18 @@ def serve(
     ticks compile, `warm_up` a spare one before. `faults` are those of the device's electronics.
     Raises EndpointError when the address cannot be listened on.
     """
+
+    def device() -> Device:
+        return Device(rig, plant, realtime=realtime, faults=faults)
+
     if wire == SERIAL:
-        serve_serial(rig, plant, realtime=realtime, on_ready=on_ready, parent=parent, faults=faults)
+        serve_serial(device(), on_ready, parent)
         return
     if wire == VALVES:
         from hil_sim.device.can import adapters, valve_bench  # noqa: PLC0415 - as below
 
         bus = adapters.SocketcandServer(host, port)
-        valve_bench.serve_valves(rig, plant, bus, on_ready=on_ready, parent=parent)
+        valve_bench.serve_valves(rig, plant, bus, on_ready, parent)
         return
     if wire in (CAN, SLCAN):
         # Half a second of imports that no other wire needs.
@@ -221,10 +225,7 @@ def serve(
         adapter = (
             adapters.SlcanLine(bitrate) if wire == SLCAN else adapters.SocketcandServer(host, port)
         )
-        server.serve_can(
-            rig, plant, adapter, layout=layout, realtime=realtime, on_ready=on_ready, parent=parent,
-            faults=faults,
-        )  # fmt: skip
+        server.serve_can(device(), adapter, layout, on_ready, parent)
         return
     # The library logs frames only; errors of use are raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -235,8 +236,7 @@ def serve(
         else:
             await serve_until(stop, device, host=host, port=port, on_ready=on_ready)
 
-    device = Device(rig, plant, realtime=realtime, faults=faults)
-    asyncio.run(_serve(on_wire, device, parent))
+    asyncio.run(_serve(on_wire, device(), parent))
 
 
 def warm_up(rig: Rig, spare: PlantInterface) -> None:

@@ -9,18 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from hil_sim.effects import fluid, friction, measurement, mechanics, valve
-from hil_sim.effects.base import PlantEffect
+from hil_sim.effects.base import PlantEffect, named_in
 
 MODULES = (friction, mechanics, valve, fluid, measurement)
-CLASSES: tuple[type[PlantEffect], ...] = tuple(
-    kind
-    for module in MODULES
-    for kind in vars(module).values()
-    if isinstance(kind, type)
-    and issubclass(kind, PlantEffect)
-    and "name" in kind.__annotations__
-    and kind is not PlantEffect
-)
+CLASSES = named_in(PlantEffect, MODULES)
 
 if TYPE_CHECKING:
     AnyEffect = PlantEffect

@@ -8,16 +8,19 @@ measurement name a channel. Quantities are SI.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, get_args
+from types import ModuleType
+from typing import Any, ClassVar, TypeVar, get_args
 
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, field_validator
+from pydantic import BeforeValidator, ValidationInfo, field_validator
 
+from rig.model.parts import Part
 from rig.model.quantity import UnitError, parse_quantity
 from rig.model.rig import Rig
 
+Kind = TypeVar("Kind")
 Table = NDArray[Any]  # structured, one row per joint or channel (`hil_sim.plant.kernel_data`)
 Size = tuple[float, float]  # smallest and largest, SI
 
@@ -62,11 +65,24 @@ class Tables:
     channels: Table
 
 
+def named_in(base: type[Kind], modules: Iterable[ModuleType]) -> tuple[type[Kind], ...]:
+    """Return the classes of modules that derive from `base` and have a name in scenario files."""
+    return tuple(
+        kind
+        for module in modules
+        for kind in vars(module).values()
+        if isinstance(kind, type)
+        and issubclass(kind, base)
+        and "name" in kind.__annotations__
+        and kind is not base
+    )
+
+
 _WHERE = re.compile(r"^(?:bench|joint (?P<joint>[1-9])(?: (?P<chamber>cap|rod))?)$")
 _FORMS = {"bench": "bench", "joint": "joint I", "chamber": "joint I cap|rod"}
 
 
-class PlantEffect(BaseModel):
+class PlantEffect(Part):
     """One effect: possible places, random ranges, changes of the tables.
 
     `places` are the forms of place where it can be. `drawn_at` is where a random scenario puts it:
@@ -75,8 +91,6 @@ class PlantEffect(BaseModel):
     values of its key `form`: different physics of the same cause, the first by default. Random
     scenarios have only those `drawn`: with a further one every seed would draw another scenario.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     places: ClassVar[tuple[str, ...]] = ("joint",)
     drawn: ClassVar[bool] = True

@@ -27,7 +27,6 @@ class InternalLeakage(PlantEffect):
     worn: Length | None = Field(default=None, gt=0, description="half length of the wear [m]")
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["leak_internal"][self.joint] += self.conductance
         t.joints["leak_length"][self.joint] = self.worn or math.inf
 
@@ -44,7 +43,6 @@ class ExternalLeakage(PlantEffect):
     conductance: Conductance = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         for chamber in (self.chamber,) if self.chamber else ("cap", "rod"):
             t.joints[f"leak_{chamber}"][self.joint] += self.conductance
 
@@ -74,7 +72,6 @@ class SupplySag(PlantEffect):
         return self
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         rated = t.rig.supply.flow
         if self.flow is not None:
             t.bench["pump"] = self.flow
@@ -105,7 +102,6 @@ class TankPressure(PlantEffect):
     lag: Time = Field(default=5e-3, ge=5e-4)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.bench["tank_pressure"] = self.pressure
         t.bench["tank_resistance"] = self.back_pressure / t.rig.supply.flow**2
         t.bench["tank_lag"] = self.lag
@@ -126,7 +122,6 @@ class EntrainedAir(PlantEffect):
     form: Literal["isothermal", "polytropic", "undissolved"] = "isothermal"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.bench["air"] = self.fraction
         t.bench["air_dissolution"] = 1e12 if self.form == "undissolved" else self.dissolution
         t.bench["air_exponent"] = 1.4 if self.form == "polytropic" else 1.0
@@ -144,7 +139,6 @@ class DeadVolume(PlantEffect):
     volume: Volume = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints[f"{self.chamber}_volume"][self.joint] += self.volume
 
 
@@ -166,7 +160,6 @@ class ReturnLine(PlantEffect):
     form: Literal["turbulent", "laminar", "filter"] = "turbulent"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         square = {"turbulent": 1.0, "laminar": 0.0, "filter": 0.5}[self.form]
         rated = t.rig.supply.flow
         t.bench["tank_resistance"] += square * self.drop / rated**2

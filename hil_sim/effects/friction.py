@@ -57,7 +57,6 @@ class CoulombFriction(_Friction):
     taper: PerLength = Field(default=0.0, description="growth from mid-stroke [1/m]")
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["friction_plus"][self.joint] += self.force
         t.joints["friction_minus"][self.joint] += self.force
         t.joints["friction_taper"][self.joint] += self.taper
@@ -75,7 +74,6 @@ class StribeckFriction(_Friction):
     speed: Speed = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["stribeck"][self.joint] += self.force
         t.joints["stribeck_speed"][self.joint] = self.speed
         self.seal(t, self.force)
@@ -98,7 +96,6 @@ class AsymmetricFriction(_Friction):
         return self
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["friction_plus"][self.joint] += self.extending
         t.joints["friction_minus"][self.joint] += self.retracting
         self.seal(t, max(self.extending, self.retracting))
@@ -114,7 +111,6 @@ class PressureDependentFriction(_Friction):
     coefficient: ForcePerPressure = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["friction_pressure"][self.joint] += self.coefficient
         self.seal(t, self.coefficient * t.rig.supply.pressure)
 
@@ -142,7 +138,6 @@ class AsymmetricViscousFriction(PlantEffect):
         return self
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["drag_plus"][self.joint] += self.extending
         t.joints["drag_minus"][self.joint] += self.retracting
         t.joints["drag_thinning"][self.joint] = 2.0 if self.form == "thinning" else 0.0

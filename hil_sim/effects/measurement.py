@@ -32,7 +32,6 @@ class ChannelDelay(_Sensor):
     time: Time = Field(gt=0, le=0.2)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.channels["lag"][t.rig.channels.index(self.channel)] += self.time
 
 
@@ -46,7 +45,6 @@ class SensorGain(_Sensor):
     gain: Ratio = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.channels["gain"][t.rig.channels.index(self.channel)] *= self.gain
 
 
@@ -70,7 +68,6 @@ class SensorOffset(_Sensor):
         return {**data, "offset": read_with_unit(data["offset"], unit)}
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.channels["offset"][t.rig.channels.index(self.channel)] += self.offset
 
 
@@ -88,7 +85,6 @@ class SensorLag(_Sensor):
     form: Literal["pole", "poles"] = "pole"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         k = t.rig.channels.index(self.channel)
         t.channels["filter_time"][k] = self.time
         t.channels["filter_stages"][k] = 1 + (self.form == "poles")
@@ -125,7 +121,6 @@ class SensorCrosstalk(_Sensor):
         return self.other or channel(other, joint or 1)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         k = t.rig.channels.index(self.channel)
         t.channels["seen"][k] = 1 + t.rig.channels.index(self.seen)
         t.channels["seen_share"][k] = self.share

@@ -29,7 +29,6 @@ class BaseInclination(PlantEffect):
     angle: Angle
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.bench["sin_slope"], t.bench["cos_slope"] = math.sin(self.angle), math.cos(self.angle)
 
 
@@ -45,7 +44,6 @@ class Payload(PlantEffect):
     mass: Mass = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         # A point mass at the tip: R_ij += m l_i l_j, W_i += m l_i.
         lengths = np.array([j.link_length for j in t.rig.joints])
         t.inertia[:] += self.mass * np.outer(lengths, lengths)
@@ -65,7 +63,6 @@ class JointSpring(PlantEffect):
     hardening: Annotated[float, in_unit("rad^-2")] = Field(default=0.25, ge=0)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         rest = self.rest
         if rest is None:
             rest = float(t.rig.joints[self.joint or 0].linkage.angle(0.0))
@@ -86,7 +83,6 @@ class TorqueOffset(PlantEffect):
     torque: Torque
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["torque_offset"][self.joint] += self.torque
 
 
@@ -106,7 +102,6 @@ class PeriodicDisturbance(PlantEffect):
     form: Literal["sine", "triangle", "pulses"] = "sine"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["wave_torque"][self.joint] = self.torque
         t.joints["wave_rate"][self.joint] = self.frequency
         t.joints["wave_form"][self.joint] = float(self.forms.index(self.form))

@@ -25,7 +25,6 @@ class ValveDeadband(PlantEffect):
     form: Literal["round", "sharp", "notch"] = "round"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["lap_ahead"][self.joint] += self.width
         t.joints["lap_astern"][self.joint] += self.astern or self.width
         if self.form == "round":
@@ -48,7 +47,6 @@ class UnderlapLeakage(PlantEffect):
     form: Literal["round", "sharp", "notch"] = "round"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["lap_ahead"][self.joint] -= self.width
         t.joints["lap_astern"][self.joint] -= self.width
         if self.form == "round":
@@ -76,7 +74,6 @@ class LaminarOrifice(PlantEffect):
     form: Literal["smooth", "cubic", "tanh"] = "smooth"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.bench["laminar"] = self.transition
         t.bench["laminar_form"] = self.forms.index(self.form)
 
@@ -93,7 +90,6 @@ class SpoolOffset(PlantEffect):
     voltage: Voltage
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["null"][self.joint] += self.voltage
 
 
@@ -108,7 +104,6 @@ class SpoolLag(PlantEffect):
     time: Time = Field(ge=2e-4)
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["opening_rate"][self.joint] = 1.0 / self.time
 
 
@@ -128,6 +123,5 @@ class SpoolHysteresis(PlantEffect):
     form: Literal["backlash", "friction"] = "backlash"
 
     def apply(self, t: Tables) -> None:
-        """Put the effect into the plant's tables."""
         t.joints["play"][self.joint] += self.width
         t.joints["play_travel"][self.joint] = self.width / 3.0 if self.form == "friction" else 0.0

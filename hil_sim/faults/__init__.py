@@ -8,18 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
+from hil_sim.effects.base import named_in
 from hil_sim.faults import device, machine, sensors, wire
 from hil_sim.faults.base import Fault
 
-CLASSES: tuple[type[Fault], ...] = tuple(
-    kind
-    for module in (sensors, machine, device, wire)
-    for kind in vars(module).values()
-    if isinstance(kind, type)
-    and issubclass(kind, Fault)
-    and "name" in kind.__annotations__
-    and kind is not Fault
-)
+CLASSES = named_in(Fault, (sensors, machine, device, wire))
 
 if TYPE_CHECKING:
     AnyFault = Fault

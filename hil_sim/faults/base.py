@@ -13,20 +13,19 @@ from typing import Any, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from hil_sim.effects.base import Tables
+from rig.model.parts import Part
 from rig.model.quantity import Time
 from rig.model.rig import Rig
+from rig.model.wire.codes import Codes
 
-Codes = NDArray[np.int64]
 Mend = Callable[[], None]
 
 
-class Fault(BaseModel):
+class Fault(Part):
     """One fault: its name, and its times [s of the device's time]."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     at: Time = Field(default=0.0, ge=0)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from hil_sim.effects.base import Tables, in_unit
+from hil_sim.effects.base import Tables
+from hil_sim.effects.fluid import Conductance
 from hil_sim.faults.base import Fault, Mend, changed
 from rig.model.quantity import Flow
-
-Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
 
 
 class JointFault(Fault):

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from hil_sim.faults.base import Codes, Fault
+from hil_sim.faults.base import Fault
 from rig.model.channels import kind_of
 from rig.model.quantity import Ratio
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
+from rig.model.wire.codes import Array, Codes
 
 
 class ChannelFault(Fault):

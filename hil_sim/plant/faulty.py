@@ -9,10 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from hil_sim.faults.base import Codes, Fault, Mend
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.faults.base import Fault, Mend
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from rig.model.rig import Rig
+from rig.model.wire.codes import Codes
 
 STREAM: Final = 3  # of a bench's seed; 0 and 1 are the plant's, 2 is that of drawn scenarios
 

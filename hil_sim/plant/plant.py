@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -16,9 +15,9 @@ from numpy.typing import NDArray
 
 from hil_sim.effects.base import Tables
 from hil_sim.plant import kernel, kernel_loop
+from hil_sim.plant.interface import Law
 from hil_sim.plant.kernel_data import ATMOSPHERE, LAW, record
-from hil_sim.plant.sensors import ring_length
-from hil_sim.plant.tables import build
+from hil_sim.plant.tables import build, ring_length
 from hil_sim.scenario.file import Scenario
 from hil_sim.scenario.truth import load_machine
 from rig.model.rig import Rig
@@ -28,23 +27,6 @@ from rig.model.wire.codes import Array, Codes
 # (1e-7 at 1/6 ms, 8e-7 at 1/4 ms); the stiffest edge, wide open at an end stop, allows 1/4 ms.
 STEP = 2e-4
 DRAWN: Final = 256  # ticks of noise drawn at once, and kept for `rewind`
-
-
-@dataclass(frozen=True)
-class Law:
-    """The output law of one joint; all zeros closes the valve.
-
-    v = clip(gain wave[(tick - start) mod period] + bias + position_gain (setpoint - s), +-limit)
-    [V], s the piston as measured at that tick [m]; an empty wave adds nothing.
-    """
-
-    wave: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    start: int = 0
-    gain: float = 0.0
-    bias: float = 0.0
-    position_gain: float = 0.0
-    setpoint: float = 0.0
-    limit: float = 0.0
 
 
 class Plant:

@@ -1,4 +1,4 @@
-"""The compiled plant's tables from rig, machine and scenario."""
+"""The compiled plant's tables from rig, machine and scenario: joints, bench, converters."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from hil_sim.effects.base import Tables, set_relief
-from hil_sim.plant.kernel_data import ATMOSPHERE, BENCH, JOINT, Table
-from hil_sim.plant.sensors import channel_table
+from hil_sim.plant.kernel_data import ATMOSPHERE, BENCH, CHANNEL, JOINT, KIND, Table
 from hil_sim.scenario.file import Scenario, check_fits
 from hil_sim.scenario.truth import Constants, TrueMachine
+from rig.model.channels import kind_of
 from rig.model.parse import InputError
 from rig.model.parts import Joint
 from rig.model.rig import Rig
@@ -133,3 +133,39 @@ def _fill_bench(
     for name, value in row.items():
         tables.bench[name] = value
     set_relief(tables, constants.relief_override)
+
+
+def channel_table(rig: Rig, noise: float) -> Table:
+    """Return the sensors of `rig` in the order of its channels, noise scaled; shape (channels,).
+
+    Channel k of `rig.channels` is converted k skews after the tick (the multiplexer runs ahead of
+    the tick: along the tangent of the true signal), and shows the signal `delay` before that (cubic
+    Hermite through earlier ticks). Then gain, offset, noise, and the converter code
+    (`rig.model.wire.codes`).
+    """
+    table = np.zeros(len(rig.channels), CHANNEL)
+    for k, name in enumerate(rig.channels):
+        kind, joint = kind_of(name)
+        sensor = rig.sensors.of(kind)
+        low, high = sensor.range
+        top = (1 << sensor.bits) - 1
+        row = {
+            "kind": KIND[kind],
+            "joint": (joint or 1) - 1,
+            "noise": sensor.noise * noise,
+            "gain": 1.0,
+            "lag": sensor.delay - k * rig.sensors.skew,
+            "low": low,
+            "step": (high - low) / top,
+            "scale": top / (high - low),
+            "top": top,
+        }
+        for field, value in row.items():
+            table[field][k] = value
+    return table
+
+
+def ring_length(table: Table, period: float) -> int:
+    """Return how many ticks of history the longest lag needs."""
+    longest = float(np.max(table["lag"], initial=0.0))
+    return max(math.ceil(longest / period), 0) + 3

@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from hil_sim.effects import AnyEffect
 from hil_sim.effects.base import with_units
@@ -28,14 +28,13 @@ from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
 from rig.model.parameters import parameter_unit
 from rig.model.parse import InputError, parse_model
+from rig.model.parts import Part
 from rig.model.quantity import Ratio
 from rig.model.rig import Rig
 
 
-class Scenario(BaseModel):
+class Scenario(Part):
     """Effects, parameter overrides [SI] and a noise scale; the default changes nothing."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     description: str = ""
     effects: tuple[AnyEffect, ...] = ()

@@ -10,19 +10,18 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from hil_sim.effects.base import in_unit, with_units
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError, parse_model
+from rig.model.parts import Part
 from rig.model.quantity import Pressure, Ratio, Volume
 from rig.model.rig import Rig
 
 
-class Constants(BaseModel):
+class Constants(Part):
     """Plant-only constants [SI]; the defaults suit a small bench on mineral oil."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     laminar_transition: Pressure = Field(
         default=50e3, gt=0, description="pressure drop below which an orifice is laminar"
@@ -43,10 +42,8 @@ class Constants(BaseModel):
     relief_rounding: Pressure = Field(default=20e3, gt=0)
 
 
-class TrueMachine(BaseModel):
+class TrueMachine(Part):
     """The true parameters by name [SI] and the plant's constants."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     parameters: dict[str, float]
     constants: Constants = Constants()

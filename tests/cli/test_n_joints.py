@@ -12,7 +12,8 @@ import pytest
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
 from analysis.simulation.validate import validate
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from protocols.design.generate import generate, validation
 from protocols.files import library

@@ -14,8 +14,7 @@ from drivers.base import OFF, DeviceError, OutputLaw
 from drivers.can_stream import CanStreamDriver
 from drivers.message_stream import MessageStreamDriver
 from drivers.settings import DRIVER
-from hil_sim.device.can.server import layout_of
-from hil_sim.device.can.session import CanSession
+from hil_sim.device.can.server import CanSession, layout_of
 from hil_sim.device.device import Device
 from rig.model.parts import Wire
 from rig.model.rig import Rig

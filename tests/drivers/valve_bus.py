@@ -12,7 +12,7 @@ from drivers.conformance import Capabilities, DeviceUnderTest, Subject
 from drivers.registry import wire_at
 from hil_sim.device.can.adapters import SocketcandServer
 from hil_sim.device.can.valve_bench import POLL_SECONDS, ValveBench
-from hil_sim.device.device import PlantInterface
+from hil_sim.plant.interface import PlantInterface
 from rig.model import channels as ch
 from rig.model.parts import Wire
 from rig.model.rig import Rig

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rig as rig_package
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, parse_scenario
 from rig.model.parse import parse_model
 from rig.model.rig import Rig

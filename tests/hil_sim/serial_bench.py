@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 
+from hil_sim.device.device import Device
 from hil_sim.device.serial_server import serve_serial
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
@@ -15,9 +16,7 @@ def main() -> None:
     """Serve the plant, print the endpoint first."""
     rig = seed_rig()
     serve_serial(
-        rig,
-        IntegratorPlant(rig),
-        realtime=sys.argv[1] == "realtime",
+        Device(rig, IntegratorPlant(rig), realtime=sys.argv[1] == "realtime"),
         on_ready=lambda endpoint: print(endpoint, flush=True),  # noqa: T201
         parent=int(sys.argv[2]) if len(sys.argv) > 2 else None,
     )

@@ -9,7 +9,8 @@ import pytest
 
 from hil_sim.faults import CLASSES
 from hil_sim.plant.faulty import FaultyPlant
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, check_fits, parse_scenario
 from rig.model.parse import InputError
 from tests.hil_sim.plant_trace import CLOSED, bench, sine

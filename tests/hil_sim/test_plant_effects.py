@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from hil_sim.effects import CLASSES
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from tests.hil_sim.plant_trace import CLOSED, Array, Trace, bench, scenario, sine, story
 

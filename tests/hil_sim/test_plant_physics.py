@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hil_sim.plant import kernel
+from hil_sim.plant.interface import Law
 from hil_sim.plant.kernel_data import ATMOSPHERE, record
-from hil_sim.plant.plant import Law, Plant, compression
+from hil_sim.plant.plant import Plant, compression
 from hil_sim.plant.tables import build
 from hil_sim.scenario.file import Scenario
 from hil_sim.scenario.truth import TrueMachine, load_machine, machine_text

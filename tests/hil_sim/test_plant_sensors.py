@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hil_sim.plant import kernel_loop
+from hil_sim.plant.interface import Law
 from hil_sim.plant.kernel_data import record as record_of
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from rig.model.channels import kind_of
 from rig.model.rig import Rig

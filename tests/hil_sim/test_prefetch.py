@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from hil_sim.faults.sensors import SensorStuck
 from hil_sim.plant.faulty import FaultyPlant
-from hil_sim.plant.plant import Law, Plant
-from hil_sim.plant.prefetch import Prefetch
+from hil_sim.plant.interface import Law, Prefetch
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from rig.model.wire import registers as reg
 from tests.hil_sim.device_bench import Bench

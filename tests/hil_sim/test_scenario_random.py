@@ -7,7 +7,8 @@ from collections import Counter
 import pytest
 
 from hil_sim.effects import CLASSES
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from hil_sim.scenario.random_draw import NO_FORMULA_EFFECTS, draw
 from rig.model.rig import Rig

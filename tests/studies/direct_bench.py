@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import DeviceInfo, OutputLaw, SampleBlock
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.interface import Law
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from protocols.engine import engine
 from protocols.files import library

@@ -5,20 +5,23 @@ A node of a bus cannot detect the end of a program; its watchdog zeroes the outp
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from hil_sim.device.can.adapters import Adapter
-from hil_sim.device.can.session import CanSession
-from hil_sim.device.device import Device, PlantInterface
+from hil_sim.device.device import Device
 from hil_sim.device.lifetime import run_until, termination_signals
-from hil_sim.faults.device import DeviceFault
+from hil_sim.device.message_session import MessageSession
 from rig.model.rig import Rig
 from rig.model.wire.can_database import database_text
-from rig.model.wire.can_layout import CanLayout, read_layout
-
-logger = logging.getLogger(__name__)
+from rig.model.wire.can_frames import (
+    CanFrame,
+    PartCollector,
+    block_frames,
+    part_frames,
+    read_alive,
+)
+from rig.model.wire.can_layout import EXTENDED, CanLayout, read_layout
 
 
 def layout_of(rig: Rig, *, fd: bool = False) -> CanLayout:
@@ -26,26 +29,52 @@ def layout_of(rig: Rig, *, fd: bool = False) -> CanLayout:
     return read_layout(database_text(rig, fd=fd), f"the DBC made for {rig.name}", rig)
 
 
-def serve_can(
-    rig: Rig,
-    plant: PlantInterface,
-    adapter: Adapter,
-    *,
-    layout: CanLayout | None = None,
-    realtime: bool = False,
-    on_ready: Callable[[str], None] = logger.info,
-    parent: int | None = None,
-    faults: Sequence[DeviceFault] = (),
-) -> None:
-    """Serve a plant on a bus until SIGTERM, SIGINT or the end of process `parent`.
+class CanSession:
+    """A `MessageSession` with frames of a bus; frames with other identifiers are ignored."""
 
-    `on_ready` is called once with the adapter's endpoint; the sample clock starts with this call.
+    def __init__(self, device: Device, layout: CanLayout) -> None:
+        self._device, self._layout = device, layout
+        self._session = MessageSession(device)
+        self._requests = PartCollector()
+
+    def receive(self, frame: CanFrame) -> list[CanFrame]:
+        """Execute the message that a frame completes; return the frames of the answer."""
+        key = frame.identifier | (EXTENDED if frame.extended else 0)
+        if key == self._layout.zero.key:
+            self._device.zero()
+        elif key == self._layout.alive.key:
+            session = self._session.session
+            note = None if session is None else read_alive(self._layout, frame.data, session)
+            if note is not None:
+                self._session.receive(note)
+        elif key == self._layout.request.key:
+            request = self._requests.feed(frame.data)
+            answer = None if request is None else self._session.receive(request)
+            if answer is not None:
+                return part_frames(self._layout.answer, answer)
+        return []
+
+    def push(self) -> list[CanFrame]:
+        """Return the frames of the next block if it may be sent, else none."""
+        block = self._session.push()
+        return [] if block is None else block_frames(self._layout, self._device.layout, block)
+
+
+def serve_can(
+    device: Device,
+    adapter: Adapter,
+    layout: CanLayout | None,
+    on_ready: Callable[[str], None],
+    parent: int | None,
+) -> None:
+    """Serve a device on a bus until SIGTERM, SIGINT or the end of process `parent`.
+
+    `on_ready` is called once with the adapter's endpoint.
     """
-    device = Device(rig, plant, realtime=realtime, faults=faults)
     try:
         with termination_signals() as ended:
             on_ready(adapter.endpoint)
-            run_device(adapter, device, layout or layout_of(rig), ended, parent)
+            run_device(adapter, device, layout or layout_of(device.rig), ended, parent)
     finally:
         device.zero()
         adapter.close()

@@ -16,9 +16,9 @@ import canopen
 import numpy as np
 
 from hil_sim.device.can.adapters import Adapter
-from hil_sim.device.device import PlantInterface
-from hil_sim.device.laws import OFF, DeviceLaw
+from hil_sim.device.laws import OFF
 from hil_sim.device.lifetime import run_until, termination_signals
+from hil_sim.plant.interface import Law, PlantInterface
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.wire import cia408
@@ -164,7 +164,7 @@ class ValveBench:
             self._origin += (due - most) / rate
             due = most
         if due > 0:
-            laws = [DeviceLaw(OFF.wave, bias=volts, limit=abs(volts)) for volts in self.volts]
+            laws = [Law(OFF.wave, bias=volts, limit=abs(volts)) for volts in self.volts]
             measured, _ = self._plant.advance(due, laws)
             self._codes = measured[-1]
 
@@ -184,9 +184,8 @@ def serve_valves(
     rig: Rig,
     plant: PlantInterface,
     adapter: Adapter,
-    *,
-    on_ready: Callable[[str], None] = logger.info,
-    parent: int | None = None,
+    on_ready: Callable[[str], None],
+    parent: int | None,
 ) -> None:
     """Serve a plant behind valve nodes 1 to N until SIGTERM, SIGINT or the end of `parent`."""
     bench = ValveBench(rig, plant, adapter)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from hil_sim.plant import kernel, kernel_loop
+from hil_sim.plant.interface import Law
 from hil_sim.plant.kernel_data import record
-from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
 from rig.model.rig import Rig
 from rig.model.wire.codes import Array, decode_output

@@ -1,4 +1,4 @@
-"""A plant that is computed ahead between requests, and rewound if the laws change.
+"""The plant as the device uses it: output laws, and samples that are computed ahead.
 
 In virtual time the next block almost always has the same laws, so that it is computed while the
 host works on the previous one. If the laws change, the plant is rewound before it runs, so that
@@ -9,17 +9,33 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Codes = NDArray[np.int64]
+from rig.model.wire.codes import Array, Codes
 
 
-@runtime_checkable
-class Rewindable(Protocol):
-    """A plant with a state that can be restored."""
+@dataclass(frozen=True)
+class Law:
+    """The output law of one joint; all zeros closes the valve.
+
+    v = clip(gain wave[(tick - start) mod period] + bias + position_gain (setpoint - s), +-limit)
+    [V], s the piston as measured at that tick [m]; an empty wave adds nothing.
+    """
+
+    wave: Array = field(default_factory=lambda: np.zeros(0))
+    start: int = 0
+    gain: float = 0.0
+    bias: float = 0.0
+    position_gain: float = 0.0
+    setpoint: float = 0.0
+    limit: float = 0.0
+
+
+class PlantInterface(Protocol):
+    """A plant, deterministic, with all physical state."""
 
     @property
     def tick(self) -> int:
@@ -27,6 +43,11 @@ class Rewindable(Protocol):
 
     def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[Codes, Codes]:
         """Run `ticks` samples; return AD codes (ticks, channels), DA codes (ticks, joints)."""
+
+
+@runtime_checkable
+class Rewindable(PlantInterface, Protocol):
+    """A plant with a state that can be restored."""
 
     def mark(self) -> object | None:
         """Return the state for `rewind`; None if it cannot be restored."""
