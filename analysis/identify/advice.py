@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
 from analysis.identify.settings import IDENTIFY
-from analysis.regression.base_parameters import Determinacy, determined
-from analysis.regression.identifiability import predicted_rows
+from analysis.regression.identifiability import Determinacy, determined, predicted_rows
 from analysis.regression.solve import Solution
 from rig.model.parameters import gain_names, parameter_names
 from rig.model.rig import Rig

@@ -25,9 +25,8 @@ from analysis.identify.checks import Check
 from analysis.identify.reduction import Part, RecordReduction
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
-from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Rows, parameters_of, record_rows
-from analysis.regression.solve import RowCluster, solve
+from analysis.regression.solve import Accumulator, RowCluster, solve
 from analysis.signals.conditioning import of_other_geometry
 from analysis.simulation.model import Estimate
 from analysis.terms.base import FAMILIES, Used, family_of

@@ -22,10 +22,9 @@ from analysis.regression.chunks import InMemory, Source, divisible, source_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import record_moments
 from analysis.regression.nonlinear import reduced
-from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
 from analysis.regression.settings import REGRESSION
-from analysis.regression.solve import RowCluster, Solution, solve
+from analysis.regression.solve import Accumulator, RowCluster, Solution, solve
 from analysis.signals.conditioning import condition, lost_samples
 from analysis.signals.locks import motion_bands
 from analysis.signals.settings import SIGNALS

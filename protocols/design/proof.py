@@ -18,7 +18,7 @@ class ProofPart(Protocol):
 
 
 class Verdict(Protocol):
-    """What rows determine, as `analysis.regression.base_parameters.Determinacy`."""
+    """What rows determine, as `analysis.regression.identifiability.Determinacy`."""
 
     @property
     def names(self) -> tuple[str, ...]:

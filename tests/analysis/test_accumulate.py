@@ -19,9 +19,8 @@ from analysis.identify.result import PLAIN, Identification
 from analysis.identify.stacked_rows import build_rows
 from analysis.identify.streams.out_of_core import identify_folders
 from analysis.regression.chunks import InMemory, source_rows
-from analysis.regression.qr import Accumulator
 from analysis.regression.rows import default_filtering, paper_filtering
-from analysis.regression.solve import triangle
+from analysis.regression.solve import Accumulator, triangle
 from analysis.signals.locks import held_positions, motion_bands
 from analysis.terms import baseline
 from analysis.terms.base import Used

@@ -10,7 +10,7 @@ import pytest
 from analysis.identify.advice import base_statements
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
-from analysis.regression.base_parameters import determined
+from analysis.regression.identifiability import determined
 from analysis.regression.solve import RowCluster, solve, triangle
 from rig.model.parse import InputError
 from rig.model.records import Run

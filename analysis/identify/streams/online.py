@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 from analysis.identify.result import estimates_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.chunks import Locks, divisible, overlap, stretch_rows
-from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
-from analysis.regression.solve import RowCluster, Solution, merge, solve
+from analysis.regression.solve import Accumulator, RowCluster, Solution, merge, solve
 from analysis.simulation.model import Estimate
 from analysis.terms import baseline_of
 from analysis.terms.base import Term, Used, family_of

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from analysis.identify.streams.out_of_core import identify_folders
-from analysis.regression.qr import Accumulator
+from analysis.regression.solve import Accumulator
 from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import ONE_THREAD, Processes, environment
 
