@@ -154,6 +154,8 @@ class Effect(Term):
     `beside` those that it may accompany as another part of their law, `excludes` those that cannot
     act at the same place.
 
+    `shape_stems` are the names of its shape parameters without `mark`, their place.
+
     `stage` orders the terms' `prepare` (see `ordered`): sensor errors are undone first, then come
     effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
     others need not be rebuilt for another shape. `adds_to_gains` marks effects whose columns add to
@@ -188,6 +190,7 @@ class Effect(Term):
     includes: ClassVar[tuple[str, ...]] = ()
     beside: ClassVar[bool] = False
     excludes: ClassVar[tuple[str, ...]] = ()
+    shape_stems: ClassVar[tuple[str, ...]] = ()
     stage: ClassVar[int] = PLANT
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False
@@ -261,9 +264,15 @@ class Effect(Term):
         """Return the shape parameters, none by default."""
         return ()
 
+    @property
+    def mark(self) -> str:
+        """How its parameters' names end: `1`, `1_cap`, '' for the bench."""
+        return "_".join(self.where.split()[1:])
+
     def shape_names(self) -> tuple[str, ...]:
         """Name the shape parameters; their number does not depend on the rig."""
-        return ()
+        end = f"_{self.mark}" if self.mark else ""
+        return tuple(f"{stem}{end}" for stem in self.shape_stems)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return the starting points of shapes that follow from the data."""

@@ -69,15 +69,12 @@ class EntrainedAir(Effect):
     separated_by = (
         "fast pressure changes at low and at high chamber pressure: dead volume acts alike at both"
     )
+    shape_stems = ("air_exponent",)
     kernel = _air
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return alpha [-]."""
         return (Coefficient("alpha_air", "", "fluid"),)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the exponent."""
-        return ("air_exponent",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return n [-], from isothermal to adiabatic."""
@@ -151,6 +148,7 @@ class DeadVolume(SignalEffect):
     quantity = "pressure rate"
     confounders = ("entrained_air", "spool_lag", "channel_delay")
     separated_by = "fast pressure changes near both ends of the stroke, of several chambers"
+    shape_stems = ("V_dead", "stiffening")
     kernel = _dead
     where: str = "joint 1 cap"
 
@@ -160,11 +158,6 @@ class DeadVolume(SignalEffect):
         return tuple(
             f"{joint} {side}" for joint in super().all_places(rig) for side in ("cap", "rod")
         )
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the volume and its stiffening."""
-        place = f"{self.joint + 1}_{self.side}"
-        return f"V_dead_{place}", f"stiffening_{place}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber.

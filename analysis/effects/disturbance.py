@@ -56,6 +56,7 @@ class PeriodicDisturbance(Effect):
         "another excitation, which changes effects of the joint's motion but not this one"
     )
     by_data = True
+    shape_stems = ("frequency",)
     kernel = _wave
     where: str = "joint 1"
 
@@ -66,10 +67,6 @@ class PeriodicDisturbance(Effect):
         """Return T_sin, T_cos [N m] (electric: N or N m)."""
         unit = str(getattr(rig.joints[self.joint], "force_unit", "N*m"))
         return tuple(Coefficient(name, unit, "mechanical") for name in self._names())
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the frequency."""
-        return (f"frequency_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the frequency [Hz]."""

@@ -99,10 +99,6 @@ class LeakageCurve(_FreeLeakage):
         """Return each joint, between its chambers, then each of its chambers."""
         return with_chambers(super().all_places(rig))
 
-    @property
-    def _mark(self) -> str:
-        return f"{self.joint + 1}" + (f"_{self.side}" if self.side else "")
-
     def across(self, signals: Signals) -> Array:
         """Return the pressure across the leak (n,) [Pa]."""
         cap, rod = signals.p_cap[:, self.joint], signals.p_rod[:, self.joint]
@@ -112,7 +108,7 @@ class LeakageCurve(_FreeLeakage):
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots."""
-        return tuple(f"leak_{self._mark}_knot_{k}" for k in range(1, DROPS + 1))
+        return tuple(f"leak_{self.mark}_knot_{k}" for k in range(1, DROPS + 1))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the knots [Pa]."""
@@ -124,7 +120,7 @@ class LeakageCurve(_FreeLeakage):
         return knot_points(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
 
     def _names(self) -> tuple[str, ...]:
-        return tuple(f"Q_leak_{self._mark}_{k}" for k in range(2, DROPS + 1))
+        return tuple(f"Q_leak_{self.mark}_{k}" for k in range(2, DROPS + 1))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the flows at the knots [m^3/s]."""

@@ -62,12 +62,8 @@ class SpoolHysteresis(ValveEffect):
     separated_by = (
         "two frequencies of one amplitude: hysteresis stays the same, a lag grows with the rate"
     )
+    shape_stems = ("w_hysteresis", "spread", "steepness")
     kernel = _play
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the width, its spread and the steepness of a reversal."""
-        joint = self.joint + 1
-        return f"w_hysteresis_{joint}", f"spread_{joint}", f"steepness_{joint}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the width [V], up to a quarter of the spool's stroke, and how it reverses."""

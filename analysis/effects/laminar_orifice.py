@@ -70,15 +70,12 @@ class LaminarOrifice(Effect):
     quantity = "pressure"
     confounders = ("tank_pressure", "supply_sag", "sensor_offset")
     separated_by = "loads that leave a small drop across each edge in turn, at several openings"
+    shape_stems = (TRANSITION, SHARPNESS)
     kernel = _laminar
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the gains of all joints, which `orifice` owns."""
         return Orifice().coefficients(rig)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the drop of the transition and the sharpness of its form."""
-        return TRANSITION, SHARPNESS
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the drop of the transition [Pa], and the sharpness."""

@@ -47,24 +47,16 @@ class _Leakage(Effect):
     element = "piston"
     family = "fluid"
     hydraulic = True
+    shape_stems = ("exponent",)
     where: str = "joint 1"
 
     @property
-    def _mark(self) -> str:
-        """The end of its parameters' names, such as `internal_1`."""
-        raise NotImplementedError
-
-    @property
     def _parameter(self) -> str:
-        return f"c_{self._mark}"
+        return f"c_{self.mark}"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return c [m^3/(s Pa)]."""
         return (Coefficient(self._parameter, UNIT, "fluid"),)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the exponent."""
-        return (f"exponent_{self._mark}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the exponent n [-]."""
@@ -126,8 +118,9 @@ class InternalLeakage(_Leakage):
     kernel = _internal
 
     @property
-    def _mark(self) -> str:
-        return f"internal_{self.joint + 1}"
+    def mark(self) -> str:
+        """How its parameters' names end: `internal_1`."""
+        return f"internal_{super().mark}"
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the flow per unit c, out of the cap side and into the rod side."""
@@ -178,8 +171,9 @@ class ExternalLeakage(_Leakage):
         return (self.side,) if self.side else ("cap", "rod")
 
     @property
-    def _mark(self) -> str:
-        return f"external_{self.joint + 1}" + (f"_{self.side}" if self.side else "")
+    def mark(self) -> str:
+        """How its parameters' names end: `external_1`, `external_1_cap`."""
+        return f"external_{super().mark}"
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the flow per unit c out of each leaking chamber."""

@@ -66,6 +66,11 @@ class Sensor(SignalEffect):
             return ch.SUPPLY
         return ch.channel(KINDS[self.side], self.joint + 1)
 
+    @property
+    def mark(self) -> str:
+        """How its parameters' names end: the channel's name."""
+        return self.channel
+
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every channel that the model uses."""

@@ -71,10 +71,7 @@ class ChannelDelay(Late):
     separated_by = (
         "a wide band: a delay turns the phase in proportion to frequency and leaves the amplitude"
     )
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the delay."""
-        return (f"delay_{self.channel}",)
+    shape_stems = ("delay",)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x(t + delay)."""
@@ -98,10 +95,7 @@ class SensorLag(Late):
     variable = "the channel's rate"
     confounders = ("channel_delay", "spool_lag", "dead_volume")
     separated_by = "a wide band: a lag loses amplitude at high frequencies, a delay only phase"
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the time constant."""
-        return (f"lag_{self.channel}",)
+    shape_stems = ("lag",)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x + tau dx/dt."""

@@ -33,6 +33,7 @@ class SensorCrosstalk(Sensor):
     variable = "the other chamber's pressure"
     confounders = ("sensor_gain", "sensor_offset", "pressure_dependent_friction")
     separated_by = "loads at which one chamber's pressure changes and the other does not"
+    shape_stems = ("crosstalk",)
     where: str = "joint 1 cap"
 
     @classmethod
@@ -51,10 +52,6 @@ class SensorCrosstalk(Sensor):
     def _other(self) -> str:
         """The other chamber of the cylinder."""
         return "rod" if self.side == "cap" else "cap"
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the share."""
-        return (f"crosstalk_{self.channel}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the share of the other pressure that is seen [-], up to three tenths."""
@@ -178,6 +175,7 @@ class SensorOffset(Sensor):
         "tank_pressure",
     )
     separated_by = "working points far apart: low and high pressure, both ends of the stroke"
+    shape_stems = ("offset",)
 
     def least_shapes(self) -> tuple[float, ...]:
         """Return the offset of interest of a pressure or a piston, none of other channels."""
@@ -193,10 +191,6 @@ class SensorOffset(Sensor):
         """Return every channel that the model uses but the spools, and a supply that is stated."""
         places = tuple(place for place in super().all_places(rig) if not place.endswith("spool"))
         return places if rig.electric or "bench" in places else (*places, "bench")
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the offset."""
-        return (f"offset_{self.channel}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the offset, within a quarter of the sensor's span, or of a stated supply."""

@@ -59,6 +59,7 @@ class BaseInclination(SignalEffect):
     quantity = "absolute angle"
     confounders = ("torque_offset", "joint_spring", "sensor_offset")
     separated_by = "slow motion of every joint over its whole stroke at several poses of the others"
+    shape_stems = ("inclination",)
     kernel = _inclination
 
     @classmethod
@@ -66,10 +67,6 @@ class BaseInclination(SignalEffect):
         """Return the bench, where gravity pulls at links whose base is not free already."""
         free = getattr(rig, "inclination", 0.0) == UNKNOWN
         return () if getattr(rig, "prismatic", False) or free or rig.gravity == 0 else ("bench",)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the angle."""
-        return ("inclination",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return alpha [rad], up to 20 degrees either way."""
@@ -111,16 +108,13 @@ class JointSpring(Effect):
         "slow motion over the whole stroke at two poses of the other joints: gravity "
         "depends on the absolute angle, the spring on the joint's angle"
     )
+    shape_stems = ("rest",)
     kernel = _spring
     where: str = "joint 1"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return k [N m/rad]."""
         return (Coefficient(f"k_spring_{self.joint + 1}", "N*m/rad", "mechanical"),)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the rest angle."""
-        return (f"rest_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the rest angle [rad], up to `PRELOAD` times the joint's range beyond its ends.

@@ -226,11 +226,8 @@ class SupplySag(LineDrop):
     separated_by = (
         "two amplitudes, one and both joints at once: the drop depends on the whole bench's flow"
     )
+    shape_stems = ("dp_supply", "laminar_share", "V_supply")
     kernel = _sag
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the drop, its laminar share and the oil volume."""
-        return ("dp_supply", "laminar_share", "V_supply")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the drop at the pump's whole flow [Pa], r_t and the volume [m^3]."""
@@ -284,11 +281,8 @@ class TankPressure(PortEffect):
     separated_by = (
         "motion at low chamber pressure, where the drop across the edge to the tank is small"
     )
+    shape_stems = ("p_tank", "p_back")
     kernel = _tank
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the constant pressure and the line's part."""
-        return ("p_tank", "p_back")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return both [Pa]; `p_back` is that at the pump's whole flow."""
@@ -347,11 +341,8 @@ class ReturnLine(LineDrop):
     quantity = "flow returned"
     confounders = ("tank_pressure", "supply_sag")
     separated_by = "two amplitudes: a tank's own pressure stays the same, the line's grows"
+    shape_stems = ("dp_return", "return_laminar")
     kernel = _return_line
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the drop and its laminar share."""
-        return ("dp_return", "return_laminar")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the drop at the pump's whole flow [Pa], and r_t."""

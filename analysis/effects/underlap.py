@@ -67,17 +67,13 @@ class UnderlapLeakage(ValveEffect):
         "small spool amplitudes about the null beside large ones: leakage of seals does not depend "
         "on the spool"
     )
+    shape_stems = ("w_underlap", "rounding", "corner")
     kernel = _underlap
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the joint's four gains, which `orifice` owns."""
         names = gain_names(self.joint + 1)
         return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the underlap, the edges' rounding and their corner."""
-        joint = self.joint + 1
-        return f"w_underlap_{joint}", f"rounding_{joint}", f"corner_{joint}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the underlap [V], up to half of the stroke, and the edges' form."""

@@ -93,12 +93,8 @@ class ValveDeadband(ValveEffect):
     confounders = ("spool_offset", "underlap_leakage", "spool_lag")
     excludes = ("underlap_leakage",)
     separated_by = "small spool amplitudes about the null beside large ones, both edges reached"
+    shape_stems = ("w_ahead", "w_astern", "rounding", "corner")
     kernel = _deadband
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the two edges, their rounding and their corner."""
-        joint = self.joint + 1
-        return f"w_ahead_{joint}", f"w_astern_{joint}", f"rounding_{joint}", f"corner_{joint}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the edges [V], each up to four tenths of the spool's stroke, and their form."""
@@ -163,11 +159,8 @@ class SpoolOffset(ValveEffect):
     separated_by = (
         "two spool amplitudes: the flow error stays the same, that of a gain grows with them"
     )
+    shape_stems = ("u_null",)
     kernel = _offset
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the null."""
-        return (f"u_null_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the null [V], within a tenth of the spool's stroke."""
@@ -227,11 +220,8 @@ class SpoolLag(ValveEffect):
     quantity = "spool rate"
     confounders = ("channel_delay", "valve_deadband", "entrained_air")
     separated_by = "high frequencies: a lag loses amplitude there, a delay only phase"
+    shape_stems = ("tau_spool", "zeta_spool", "held_spool")
     kernel = _lag
-
-    def shape_names(self) -> tuple[str, ...]:
-        """Name the time constant, the damping ratio and whether the input is held (1)."""
-        return tuple(f"{name}_spool_{self.joint + 1}" for name in ("tau", "zeta", "held"))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the time constant [s], the damping ratio [-] and whether the input is held (1)."""
