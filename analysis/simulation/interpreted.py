@@ -18,23 +18,7 @@ from numba import carray, cfunc, njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from analysis.simulation.equations import (
-    AREA_CAP,
-    AREA_ROD,
-    BAD_INERTIA,
-    COLUMNS,
-    DEAD_CAP,
-    DEAD_ROD,
-    GAIN,
-    LEFT_STROKE,
-    MID,
-    OFFSET,
-    OK,
-    PIN_A,
-    PIN_C,
-    RATES_SIGNATURE,
-    STROKE,
-)
+from analysis.simulation import equations as eq
 from analysis.terms.base import (
     COMP_CAP,
     COMP_ROD,
@@ -95,24 +79,24 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
             x[Q, i] = y[i]
             x[QD, i] = y[N + i]
         angle += x[Q, i]
-        if geometry[i, GAIN] != 0.0:
-            angle += geometry[i, OFFSET]
+        if geometry[i, eq.GAIN] != 0.0:
+            angle += geometry[i, eq.OFFSET]
             x[THETA, i], x[G, i], x[S, i], x[SD, i] = angle, 1.0, x[Q, i], x[QD, i]
             x[P_CAP, i] = x[P_ROD, i] = x[V_CAP, i] = x[V_ROD, i] = 0.0
             continue
         x[THETA, i] = angle
-        a, c = geometry[i, PIN_A], geometry[i, PIN_C]
-        beta = x[Q, i] + geometry[i, OFFSET]
+        a, c = geometry[i, eq.PIN_A], geometry[i, eq.PIN_C]
+        beta = x[Q, i] + geometry[i, eq.OFFSET]
         sine, cosine = sine_cosine(beta)
         length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
         x[G, i] = a * c * sine / length
-        x[S, i] = length - geometry[i, MID]
+        x[S, i] = length - geometry[i, eq.MID]
         x[SD, i] = x[G, i] * x[QD, i]
         x[P_CAP, i] = y[2 * N + i]
         x[P_ROD, i] = y[3 * N + i]
-        half = 0.5 * geometry[i, STROKE]
-        x[V_CAP, i] = geometry[i, DEAD_CAP] + (half + x[S, i]) * geometry[i, AREA_CAP]
-        x[V_ROD, i] = geometry[i, DEAD_ROD] + (half - x[S, i]) * geometry[i, AREA_ROD]
+        half = 0.5 * geometry[i, eq.STROKE]
+        x[V_CAP, i] = geometry[i, eq.DEAD_CAP] + (half + x[S, i]) * geometry[i, eq.AREA_CAP]
+        x[V_ROD, i] = geometry[i, eq.DEAD_ROD] + (half - x[S, i]) * geometry[i, eq.AREA_ROD]
         # No real cylinder goes half a stroke past its end; chamber volumes are still positive
         # there.
         if not (abs(x[S, i]) < 2.0 * half) or x[V_CAP, i] <= 0.0 or x[V_ROD, i] <= 0.0:
@@ -185,7 +169,7 @@ def _rates(t, y_at, dy_at, inputs_at, n, rate, locked_at, geometry_at, par_at, c
     size = 4 * N + hidden_ends[terms]
     y, dy, par = carray(y_at, (size,)), carray(dy_at, (size,)), carray(par_at, (ends[terms],))
     inputs = carray(inputs_at, (n, 3 + 4 * N))
-    locked, geometry = carray(locked_at, (N,)), carray(geometry_at, (N, COLUMNS))
+    locked, geometry = carray(locked_at, (N,)), carray(geometry_at, (N, eq.COLUMNS))
     scratch = carray(work, (4 + 17 * N + N * N,))
     bench = scratch[:4]
     x = scratch[4 : 4 + X_ROWS * N].reshape((X_ROWS, N))
@@ -195,7 +179,7 @@ def _rates(t, y_at, dy_at, inputs_at, n, rate, locked_at, geometry_at, par_at, c
         scratch[4 + 16 * N + N * N :],
     )
     if not _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):
-        return LEFT_STROKE
+        return eq.LEFT_STROKE
     out[:] = 0.0
     M[:] = 0.0
     for phase in (PREPARE, CONTRIBUTE):
@@ -205,33 +189,33 @@ def _rates(t, y_at, dy_at, inputs_at, n, rate, locked_at, geometry_at, par_at, c
                 p = slice(ends[m], ends[m + 1])
                 _call(addresses[m], phase, bench, x, y[z], par[p], out, M, dy[z])
     for i in range(N):
-        if geometry[i, GAIN] != 0.0:
-            out[TORQUE, i] += geometry[i, GAIN] * x[U, i]
+        if geometry[i, eq.GAIN] != 0.0:
+            out[TORQUE, i] += geometry[i, eq.GAIN] * x[U, i]
             continue
-        force = geometry[i, AREA_CAP] * x[P_CAP, i] - geometry[i, AREA_ROD] * x[P_ROD, i]
+        force = geometry[i, eq.AREA_CAP] * x[P_CAP, i] - geometry[i, eq.AREA_ROD] * x[P_ROD, i]
         out[TORQUE, i] += x[G, i] * force
     _impose(M, out[TORQUE], locked, q_dd)
     if not _accelerate(M, out[TORQUE], q_dd):
-        return BAD_INERTIA
+        return eq.BAD_INERTIA
     for i in range(N):
         if locked[i]:
             dy[i] = dy[N + i] = dy[2 * N + i] = dy[3 * N + i] = 0.0
             continue
         dy[i] = x[QD, i]
         dy[N + i] = q_dd[i]
-        if geometry[i, GAIN] != 0.0:
+        if geometry[i, eq.GAIN] != 0.0:
             dy[2 * N + i] = dy[3 * N + i] = 0.0
             continue
-        cap, rod = geometry[i, AREA_CAP] * x[SD, i], geometry[i, AREA_ROD] * x[SD, i]
+        cap, rod = geometry[i, eq.AREA_CAP] * x[SD, i], geometry[i, eq.AREA_ROD] * x[SD, i]
         dy[2 * N + i] = (out[FLOW_CAP, i] - cap) / out[COMP_CAP, i]
         dy[3 * N + i] = (out[FLOW_ROD, i] + rod) / out[COMP_ROD, i]
-    return OK
+    return eq.OK
 
 
 @functools.cache
 def compiled_rates() -> Any:
     """Return the right-hand side, compiled (or read from numba's cache); `address` is its place."""
-    return cfunc(RATES_SIGNATURE, cache=True, error_model="numpy")(_rates)
+    return cfunc(eq.RATES_SIGNATURE, cache=True, error_model="numpy")(_rates)
 
 
 def context(

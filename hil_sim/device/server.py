@@ -33,21 +33,6 @@ from rig.model.wire import registers as reg
 if TYPE_CHECKING:
     from rig.model.wire.can_layout import CanLayout
 
-__all__ = [
-    "CAN",
-    "RTU",
-    "SERIAL",
-    "SLCAN",
-    "TCP",
-    "VALVES",
-    "WIRES",
-    "BenchServer",
-    "EndpointError",
-    "serve",
-    "serve_until",
-    "warm_up",
-]
-
 logger = logging.getLogger(__name__)
 
 TCP: Final = "modbus-tcp"

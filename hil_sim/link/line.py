@@ -41,17 +41,12 @@ class LineLink(FaultyLink):
         kind, self._target = _prefix_and_device(target)
         self._folder = TemporaryDirectory(prefix="bramah-line-")
         self._name = Path(self._folder.name) / "line"
-        self._endpoint = f"{kind}{self._name}"
+        self.endpoint = f"{kind}{self._name}"
         self._device: int | None = None
         self._unsent = b""
         self._to_device, self._to_host = self._ways()
         self._plug_in()
-        self._start()
-
-    @property
-    def endpoint(self) -> str:
-        """The host's endpoint of this link."""
-        return self._endpoint
+        self._thread.start()
 
     def use(self, faults: Sequence[WireFault]) -> None:
         """Replace the faults from now on; an ended direction is restored."""

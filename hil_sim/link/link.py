@@ -32,6 +32,7 @@ class FaultyLink(ABC):
     link was made. Frames are struck as `seed` draws it, each way by its own draw.
     """
 
+    endpoint: str  # the host's of this link
     beneath: ClassVar[Carrier] = Carrier.LINE  # what carries it, but for a wire with its own
 
     def __init__(
@@ -51,11 +52,6 @@ class FaultyLink(ABC):
         self._closing = False
         self._cut = False
         self._thread = threading.Thread(target=self._run, name="faulty link", daemon=True)
-
-    @property
-    @abstractmethod
-    def endpoint(self) -> str:
-        """The host's endpoint of this link."""
 
     @abstractmethod
     def _step(self) -> None:
@@ -97,9 +93,6 @@ class FaultyLink(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _start(self) -> None:
-        self._thread.start()
 
     def _ways(self) -> tuple[Way, Way]:
         """Return the directions of a new connection: to the device, to the host."""

@@ -63,14 +63,9 @@ class TcpLink(FaultyLink):
                 "or choose another one (0: any free one)"
             ) from error
         here = f"127.0.0.1:{self._listener.getsockname()[1]}"
-        self._endpoint = _ADDRESS.sub(here, target, count=1)
+        self.endpoint = _ADDRESS.sub(here, target, count=1)
         self._sides: dict[socket.socket, _Side] = {}
-        self._start()
-
-    @property
-    def endpoint(self) -> str:
-        """The host's endpoint of this link."""
-        return self._endpoint
+        self._thread.start()
 
     def _step(self) -> None:
         ways = [side.sends for side in self._sides.values()]

@@ -42,15 +42,16 @@ class Plant:
         self._truth = dict(machine.parameters)
         # Streams of one seed: 0 sensor noise, 1 oil temperature; 2 is reserved for drawn scenarios.
         self._noise = np.random.default_rng([seed, 0])
-        self._tables = build(rig, machine, scenario, _periods(np.random.default_rng([seed, 1])))
+        # The compiled loop reads them: a change acts from the next tick on.
+        self.tables = build(rig, machine, scenario, _periods(np.random.default_rng([seed, 1])))
         self._period = 1.0 / rig.sample_rate
         self._substeps = math.ceil(self._period / STEP * (1.0 - 1e-9))
-        self._state, self._spool = rest(self._tables)
+        self._state, self._spool = rest(self.tables)
         self._joints, self._width = len(rig.joints), len(rig.channels)
         self._draws, self._used = np.empty((0, self._width)), 0
         self._work = np.zeros(kernel_loop.work_size(self._joints))
         self._laws: tuple[Law, ...] = ()
-        ring = ring_length(self._tables.channels, self._period)
+        ring = ring_length(self.tables.channels, self._period)
         self._values, self._slopes = np.zeros((ring, self._width)), np.zeros((ring, self._width))
         self._fill_history()
         # Compile (or load) the tick loop now, so that the first block need not wait for it.
@@ -72,7 +73,7 @@ class Plant:
         table, waves = self._law_table
         measured = np.empty((ticks, self._width), dtype=np.int64)
         outputs = np.empty((ticks, joints), dtype=np.int64)
-        t = self._tables
+        t = self.tables
         kernel_loop.run(
             self.tick,
             self._period,
@@ -110,7 +111,7 @@ class Plant:
     @property
     def _changing(self) -> tuple[NDArray[Any], ...]:
         """The arrays that a tick changes in place; of the channels the states of their filters."""
-        return self._state, self._spool, self._values, self._slopes, self._tables.channels
+        return self._state, self._spool, self._values, self._slopes, self.tables.channels
 
     def _noise_of(self, ticks: int) -> Array:
         """Return the noise of the next `ticks` ticks, (ticks, channels).
@@ -126,11 +127,6 @@ class Plant:
         self._used = last
         return self._draws[first:last]
 
-    @property
-    def tables(self) -> Tables:
-        """The tables that the compiled loop reads; a change acts from the next tick on."""
-        return self._tables
-
     def truth(self) -> dict[str, float]:
         """Return the true parameters [SI] by the names of rig.model.parameters.
 
@@ -144,7 +140,7 @@ class Plant:
         Per joint, (N,): angle, rate, piston, speed, cap_pressure, rod_pressure, spool, opening,
         bristle; of the bench, (): supply_pressure, port_pressure, tank_pressure, oil_temperature.
         """
-        n, y, bench = len(self._rig.joints), self._state, record(self._tables.bench)
+        n, y, bench = len(self._rig.joints), self._state, record(self.tables.bench)
         joints = self._rig.joints
         q, rate = y[:n].copy(), y[n : 2 * n].copy()
         lever = np.array([j.linkage.jacobian(q[i]) for i, j in enumerate(joints)])
@@ -169,7 +165,7 @@ class Plant:
 
     def _fill_history(self) -> None:
         # Before tick 0 the bench had been at rest, so every earlier sample is the first.
-        t, bench, dy = self._tables, record(self._tables.bench), np.zeros_like(self._state)
+        t, bench, dy = self.tables, record(self.tables.bench), np.zeros_like(self._state)
         heat = kernel_loop.temperature(0.0, bench)
         kernel_loop.sense(
             self._state, dy, self._spool, heat, t.joints, bench, t.channels,

@@ -14,7 +14,8 @@ from collections.abc import Iterator
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from hil_sim.device.server import EndpointError, serve, warm_up
+from hil_sim.device.lifetime import EndpointError
+from hil_sim.device.server import serve, warm_up
 from rig.model.wire import registers as reg
 from rig.model.wire.registers import TripCause
 from tests.drivers.wires import ROOT, device_process

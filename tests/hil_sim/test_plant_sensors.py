@@ -156,7 +156,7 @@ def test_the_oil_stays_in_its_band_and_moves_slowly() -> None:
     shapes = []
     for seed in (1, 2, 3):
         plant = Plant(rig, QUIET, seed)
-        table = record_of(plant._tables.bench)
+        table = record_of(plant.tables.bench)
         heat = np.array([kernel_loop.temperature(t, table) for t in np.arange(0.0, 1800.0)])
         assert 38.0 <= np.min(heat) < 39.0
         assert 41.0 < np.max(heat) <= 42.0

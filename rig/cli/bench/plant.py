@@ -57,7 +57,7 @@ class Reference:
 
     def __init__(self, plant: Plant) -> None:
         self.n = len(plant._rig.joints)
-        self.tables, self.period = plant._tables, plant._period
+        self.tables, self.period = plant.tables, plant._period
         self.bench = record(self.tables.bench)
         self.y = np.concatenate([plant._state, plant._spool.ravel()])
         self.tick = plant.tick

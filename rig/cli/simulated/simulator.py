@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.modbus_tcp import TcpSettings
-from hil_sim.device.server import CAN, SLCAN, TCP, VALVES, WIRES, EndpointError, serve, warm_up
+from hil_sim.device.lifetime import EndpointError
+from hil_sim.device.server import CAN, SLCAN, TCP, VALVES, WIRES, serve, warm_up
 from hil_sim.faults import CLASSES
 from hil_sim.faults.wire import WireFault
 from hil_sim.link.link import FaultyLink
