@@ -13,7 +13,7 @@ from analysis.identify.result import Identification
 from analysis.report import format as fm
 from analysis.report.identification.machine import steps
 from analysis.report.identification.tables import joints_of
-from analysis.report.plots import arm_plot, interval_plots, record_plots, validation_plots
+from analysis.report.plots import arm_plot, interval_plots, record_plots
 from analysis.report.residuals import Residual
 from analysis.report.settings import REPORT
 from analysis.simulation.validate import RecordValidation
@@ -126,7 +126,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
     ]  # fmt: skip
     figures = []
     for n, (result, record, joint) in enumerate(wanted[: REPORT.most_figures]):
-        part = validation_plots.shown_part(result)
+        part = record_plots.shown_part(result)
         seconds = (part.stop - part.start) / result.simulation.rate
         whole = len(result.time) / result.simulation.rate
         text = f"last {seconds:.3g} s of {whole:.3g} s, free run from the first sample"
@@ -134,7 +134,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
             text = f"all {whole:.3g} s, free run from the first sample"
         if result.failure:
             text += f"; {result.failure}"
-        svg = validation_plots.comparison(rig, result, record, joint, f"val{n}")
+        svg = record_plots.comparison(rig, result, record, joint, f"val{n}")
         figures.append(ReportFigure(svg, f"{result.record}, joint {joint}", text))
     return Gallery(tuple(figures), len(wanted) - len(figures))
 

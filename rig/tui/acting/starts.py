@@ -17,7 +17,7 @@ from rig.tui.acting.commands import CHOOSE_KEYS, Commands
 from rig.tui.browse import TABS, BrowserState, read_disk
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog
-from rig.tui.pages.manual import MANUAL
+from rig.tui.pages.levels import MANUAL
 from rig.tui.recorded_run import STORED, RunLog, RunTrace, read_log, read_trace
 
 REPORT: Final = "trace.html"

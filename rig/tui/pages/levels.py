@@ -1,15 +1,17 @@
-"""The levels below the overview: one joint, one channel, diagnostics."""
+"""The levels below the overview: one joint, moved by hand or not, one channel, diagnostics."""
 
 from __future__ import annotations
 
 from rig.model import channels as ch
-from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row
-from rig.tui.drawing.styles import ALARM_TEXT, DIM, STRONG, WARN_TEXT
+from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row, wrapped
+from rig.tui.drawing.styles import ALARM_TEXT, ASK, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
+    bench_bars,
     curve,
     curves,
     freshness_label,
+    joint_box,
     joint_channels,
     joint_title,
     joints_in,
@@ -19,6 +21,7 @@ from rig.tui.words import NEARNESS, band_of, run_time, value
 
 TWO = 110  # from this width on, curves are in two columns
 LIST = 26  # width of the list of channels
+MANUAL = "manual"  # the kind of session that accepts jogs
 
 
 def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
@@ -46,6 +49,38 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     return box(
         f"{title} · {remark}" if remark else title, [*above, *bars], width, height, DIM, note
     )
+
+
+def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
+    """Return the manual actions possible now, and the joints."""
+    snapshot = view.newest.snapshot
+    if snapshot is None or view.newest.over:
+        lines = [
+            row((" Nothing is held by hand.", STRONG)),
+            row((" Enter starts a manual session: it takes the device; no protocol may run.", "")),
+            row((" d lets the pressure out, where the rig can.", "")),
+        ]
+        return block(lines, width, height)
+    if snapshot.kind != MANUAL:
+        text = (
+            f" Refused while a protocol runs ({snapshot.run or snapshot.step}): wait for its end."
+        )
+        return block(wrapped(text, width, WARN_TEXT), width, height)
+    joints = list(joints_in(snapshot.channels))
+    joint = joints[min(max(view.look.joint, 1), len(joints)) - 1] if joints else 1
+    keys = f"hold ↑ to extend joint {joint}, ↓ to retract: it stops when you let go"
+    head = [
+        *wrapped(snapshot.message, width, STRONG),
+        *([] if view.in_command else wrapped("t takes the controls first", width, WARN_TEXT)),
+        *wrapped(keys, width, ASK),
+        *wrapped("← → joint   l lock   u unlock   x end the session", width, DIM),
+    ]
+    bars = bench_bars(view, width)
+    room = max(height - len(head) - len(bars), 0)
+    others = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
+    each = (width - len(others) + 1) // len(others)
+    boxes = [(joint_box(view, number, each, room), each) for number in sorted(others)]
+    return [*head, *hstack(boxes, room), *bars]
 
 
 def channel_page(view: PlotView, width: int, height: int) -> list[Row]:

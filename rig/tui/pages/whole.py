@@ -9,7 +9,7 @@ from rig.tui.drawing.rows import Row, block, box, ends, fit, hstack, row, wrappe
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.link import LinkStage
 from rig.tui.look import OF_A_RECORDED_RUN, PAGES, PlotView
-from rig.tui.pages import estimates, levels, manual, operation, overview, runs, trace
+from rig.tui.pages import estimates, levels, operation, overview, runs, trace
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time, time_left
 
@@ -31,7 +31,7 @@ OF_THE_DISK: Final[Mapping[str, Page]] = {  # and pages that need no run
     "runs": runs.runs_page,
     "run log": operation.run_log_page,
     "run trace": trace.run_trace_page,
-    "manual": manual.manual_page,
+    "manual": levels.manual_page,
 }
 KEYS: Final = {
     "overview": "t command  p pause/resume  a answer  k acknowledge  h hold",

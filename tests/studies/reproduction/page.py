@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from analysis.report import paper
-from analysis.report.plots.validation_plots import comparison
+from analysis.report.plots.record_plots import comparison
 from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from rig.model.parameters import parameter_unit
