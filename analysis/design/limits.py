@@ -154,14 +154,10 @@ class LimitForecast:
             level = DESIGN.peak_clip * shares[worst]
             clipped = np.clip(motion[worst], -level * self.low[worst], level * self.high[worst])
             remaining_lines = np.fft.rfft(clipped)[self.lines]
-            spectrum = size * np.exp(
-                1j * np.angle(remaining_lines / _nonzero(self.responses[worst]))
-            )
+            response = self.responses[worst]
+            response = np.where(np.abs(response) > 0, response, 1.0)
+            spectrum = size * np.exp(1j * np.angle(remaining_lines / response))
         return best, lowest
-
-
-def _nonzero(values: Spectrum) -> Spectrum:
-    return np.where(np.abs(values) > 0, values, 1.0)
 
 
 def forecast_of(rig: Rig, played: Played, joint: int, lines: NDArray[np.int64]) -> LimitForecast:

@@ -104,13 +104,9 @@ class SensorGain(Sensor):
             return ""
         return _same_force(self.side, 1.0 / self.shape_of(rig, shape)[0])
 
-    @property
-    def _bends(self) -> bool:
-        return ch.unit_of(self.channel) == "Pa"
-
     def shape_names(self) -> tuple[str, ...]:
         """Name the gain, and the bend of a pressure."""
-        bend = (f"bend_{self.channel}",) if self._bends else ()
+        bend = (f"bend_{self.channel}",) if ch.unit_of(self.channel) == "Pa" else ()
         return (f"gain_{self.channel}", *bend)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:

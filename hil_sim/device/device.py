@@ -273,12 +273,6 @@ class Device:
         """The actual sample rate of the device [1/s]."""
         return self.rig.sample_rate * (1.0 + self._drift)
 
-    def _drift_by(self, share: float) -> None:
-        # From now on; earlier samples are unchanged.
-        self._origin = self._clock()
-        self._first_tick = self._plant.tick
-        self._drift = share
-
     def _begin_faults(self) -> None:
         now = self._plant.tick / self.rig.sample_rate
         while self._faults and self._faults[0].at <= now:
@@ -290,7 +284,9 @@ class Device:
             elif isinstance(fault, QueueOverrun):
                 self.queue.lose_next(fault.blocks)
             elif isinstance(fault, ClockDrift):
-                self._drift_by(fault.rate)
+                # From now on; earlier samples are unchanged.
+                self._origin, self._first_tick = self._clock(), self._plant.tick
+                self._drift = fault.rate
                 if fault.until is not None:
                     end = fault.model_copy(update={"at": fault.until, "until": None, "rate": 0.0})
                     self._faults = sorted([*self._faults, end], key=lambda entry: entry.at)

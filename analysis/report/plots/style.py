@@ -134,17 +134,8 @@ def svg(canvas: Figure, key: str, label: str) -> Markup:
     text = _FONT.sub(
         lambda m: f"font-size: {m[2]}px" + (f"; font-weight: {m[1]}" if m[1] else ""), text
     )
-    opening = Markup(
-        '<svg viewBox="{}" role="img" aria-label="{}" preserveAspectRatio="xMidYMid">'
-    ).format(_view_box(text), label)
-    return Markup(_OPENING.sub(lambda _: str(opening), text, count=1).strip())
-
-
-def _view_box(text: str) -> str:
-    match = _OPENING.search(text)
-    if match is None:
-        raise ValueError("matplotlib wrote an SVG without a viewBox")
-    return match[1]
+    opening = Markup('<svg viewBox="{}" role="img" aria-label="{}" preserveAspectRatio="xMidYMid">')
+    return Markup(_OPENING.sub(lambda m: str(opening.format(m[1], label)), text, count=1).strip())
 
 
 def _short(number: re.Match[str]) -> str:

@@ -108,7 +108,10 @@ def _content(
         raise InputError(f"the model cannot be exported as C: {error}") from error
     digest = hashlib.sha256(f"{version} {identifier} {bare}".encode()).digest()
     token = f"{{{uuid.UUID(bytes=digest[:16])}}}"
-    sources = _sources(version) | {"model.h": model_header(model, variables, token)}
+    folder = resources.files("analysis.simulation.fmu") / "c"
+    names = (f"fmi{version}.c", "bench_model.c", "variables.h")
+    sources = {name: (folder / name).read_text(encoding="utf-8") for name in names}
+    sources["model.h"] = model_header(model, variables, token)
     describe = description_2 if version == 2 else description_3
     step = 1.0 / model.rig.sample_rate
     text = describe(identifier, about, token, step, variables)  # may name a file not in UTF-8
@@ -118,16 +121,10 @@ def _content(
         content["sources/buildDescription.xml"] = build_description(identifier).encode()
     for target in targets:
         announce(version, target)
-        folder = target.folders[VERSIONS.index(version)]
+        place = target.folders[VERSIONS.index(version)]
         library = _compiled(sources, f"fmi{version}.c", target.name)
-        content[f"binaries/{folder}/{identifier}.{target.ending}"] = library
+        content[f"binaries/{place}/{identifier}.{target.ending}"] = library
     return content
-
-
-def _sources(version: int) -> dict[str, str]:
-    folder = resources.files("analysis.simulation.fmu") / "c"
-    names = (f"fmi{version}.c", "bench_model.c", "variables.h")
-    return {name: (folder / name).read_text(encoding="utf-8") for name in names}
 
 
 def _compiled(sources: dict[str, str], main: str, target: str) -> bytes:

@@ -83,7 +83,9 @@ class Starts(Commands):
         if browsed.name == "protocols":
             name = browsed.protocols[at]
             self._offer(name, {
-                "check on the twin": lambda: self._check(name),
+                "check on the twin": lambda: self._with_rig(
+                    lambda rig: self._job(("check", name, "--rig", rig))
+                ),
                 "start on the bench": lambda: self._start_run(name),
             })  # fmt: skip
         elif browsed.name == "runs":
@@ -193,9 +195,6 @@ class Starts(Commands):
 
         body = ("The rig's shipped name, or the path of its file.",)
         self.ask(Dialog("rig", body, text="", keys="Enter takes it, Esc closes"), named)
-
-    def _check(self, protocol: str) -> None:
-        self._with_rig(lambda rig: self._job(("check", protocol, "--rig", rig)))
 
     def _start_run(self, protocol: str) -> None:
         frame = self.link.frame

@@ -40,7 +40,7 @@ def large_width(text: str, scale: int = 1) -> int:
     return scale * len(_bitmap(text)[0]) if text else 0
 
 
-def large(text: str, style: str = "", scale: int = 1) -> list[Row]:
+def large(text: str, style: str, scale: int) -> list[Row]:
     """Return a text in letters of 3 `scale` rows; an unknown character becomes a question mark."""
     if not text:
         return [()] * (ROWS * scale)

@@ -85,12 +85,12 @@ def fit(line: Row, width: int, style: str = PLAIN) -> Row:
     return fit(tuple(fitting), width, style)
 
 
-def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
+def ends(left: Row, right: Row, width: int) -> Row:
     """Return a row with a part at either end; the left one is cut if they do not fit."""
     room = width - width_of(right)
     if room <= 0:
-        return fit(right, width, style)
-    return (*fit(left, room, style), *right)
+        return fit(right, width)
+    return (*fit(left, room), *right)
 
 
 def window(rows: list[Row], at: int, height: int) -> list[Row]:

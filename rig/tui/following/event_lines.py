@@ -142,9 +142,6 @@ def event_text(event: Mapping[str, Any]) -> EventText:
         "controls released": (f"controls released by {get('by')}", PLAIN, "people"),
         "stop": (f"stop: {get('reason')}", STRONG, "people"),
     }
-    return texts.get(get("event")) or (_by_its_fields(event), DIM, "protocol")
-
-
-def _by_its_fields(event: Mapping[str, Any]) -> str:
-    fields = (f"{key} {value}" for key, value in event.items() if key not in _OWN)
-    return f"{event.get('event')}  {', '.join(fields)}".strip()
+    fields = ", ".join(f"{key} {value}" for key, value in event.items() if key not in _OWN)
+    other = (f"{event.get('event')}  {fields}".strip(), DIM, "protocol")
+    return texts.get(get("event"), other)

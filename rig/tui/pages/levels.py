@@ -7,6 +7,7 @@ from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, ro
 from rig.tui.drawing.styles import ALARM_TEXT, ASK, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
+    WIDE,
     bench_bars,
     curve,
     curves,
@@ -19,7 +20,6 @@ from rig.tui.pages.parts import (
 from rig.tui.units import age_text, clock_text, limit, shown
 from rig.tui.words import NEARNESS, band_of, run_time, value
 
-TWO = 110  # from this width on, curves are in two columns
 LIST = 26  # width of the list of channels
 MANUAL = "manual"  # the kind of session that accepts jogs
 
@@ -35,7 +35,7 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     inner = width - 4
     bars, names = joint_channels(view, joint, inner)
     room = height - 2 - len(bars)
-    if width >= TWO:
+    if width >= WIDE:
         pressures = {n: k for n, k in names.items() if ch.kind_of(n)[0] in (ch.CAP, ch.ROD)}
         motion = {n: k for n, k in names.items() if n not in pressures}
         half = (inner - 2) // 2
@@ -153,7 +153,7 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
         for name, channel in snapshot.channels.items()
     ]
     listed = columns(names)
-    if width >= TWO:
+    if width >= WIDE:
         left = max(width // 2, 60)
         return hstack([(table, left), (listed, width - left - 1)], height)
     return block([*table, row(), *listed], width, height)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw
-from rig.tui.drawing.rows import Row, block, box, columns, fit, hstack, row, window, wrapped
+from rig.tui.drawing.rows import Row, block, box, columns, fit, row, window, wrapped
 from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.following.event_lines import EventLine
 from rig.tui.look import PlotView
 from rig.tui.pages.overview import alarm_mark
+from rig.tui.pages.parts import list_with_detail
 from rig.tui.units import clock_text, limit, shown
 from rig.tui.words import run_time, time_left
 
 BEFORE = 2.0  # of an alarm's channel shown before its first offending sample [s]
 AFTER = 0.5  # and after it [s]
-WIDE = 110  # from this width on, details are to the right of the list
 
 
 def in_order(view: PlotView) -> list[tuple[Alarm, bool]]:
@@ -44,16 +45,9 @@ def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
         indent = "   └ " if follows else " "
         moment = f"{run_time(view.frame, alarm.time):9.2f} s  "
         rows.append(row(mark, (moment, DIM), indent, *alarm_mark(view, alarm), f" {alarm.key}"))
-    if width >= WIDE:
-        left = width * 2 // 5
-        right = width - left - 1
-        detail = _detail(view, listed[at][0], right, height)
-        return hstack([(window(rows, at, height), left), (detail, right)], height)
     above = min(len(rows), max(height // 3, 1))
-    return block(
-        [*window(rows, at, above), *_detail(view, listed[at][0], width, height - above)],
-        width, height,
-    )  # fmt: skip
+    detail = partial(_detail, view, listed[at][0])
+    return list_with_detail(rows, at, detail, width, height, above)
 
 
 def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import groupby
 from typing import Final
 
@@ -12,7 +12,7 @@ from rig.bench.screens.sockets import ChannelView, Snapshot
 from rig.model import channels as ch
 from rig.tui.drawing.braille import scale_around
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
-from rig.tui.drawing.rows import Row, box, fit, row, width_of
+from rig.tui.drawing.rows import Row, block, box, fit, hstack, row, width_of, window
 from rig.tui.drawing.styles import DIM, STRONG, TRIP_LINE, WARN_LINE, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.units import limit, shown
@@ -25,12 +25,29 @@ CURVES: Final = (ch.CAP, ch.ROD, ch.PISTON, ch.COMMAND, ch.SPOOL, ch.POSITION, c
 GAUGES: Final = (ch.CAP, ch.ROD, ch.PISTON, ch.SPOOL, ch.COMMAND, ch.POSITION, ch.DRIVE)
 CURVE_HEIGHT: Final = 4  # least rows of a curve with its words
 WIDTH: Final = 38  # least columns of a joint
+WIDE: Final = 110  # from this width on, details and curves are beside each other
 ROLES: Final = {"locked": "▣ locked", "excited": "≈ excited", "free": "○ free"}
 
 LABEL: Final = 8  # characters of a gauge's name
 NUMBER: Final = 9  # of its value and unit
 LIMIT: Final = 3  # of a limit
 MARKS: Final = {"├": TRIP_LINE, "┤": TRIP_LINE, "╎": WARN_LINE, "─": DIM, "━": DIM}
+
+
+def list_with_detail(
+    rows: list[Row], at: int, detail: Callable[[int, int], list[Row]], width: int, height: int,
+    above: int,
+) -> list[Row]:  # fmt: skip
+    """Return a list with row `at` marked and `detail(width, height)` beside or below it.
+
+    It is below the list's `above` rows on a screen that is not `WIDE`.
+    """
+    if width >= WIDE:
+        left = width * 2 // 5
+        right = width - left - 1
+        return hstack([(window(rows, at, height), left), (detail(right, height), right)], height)
+    shown = block(window(rows, at, above), width, above)
+    return block([*shown, *detail(width, height - above)], width, height)
 
 
 def joints_in(channels: Iterable[str]) -> dict[int, list[str]]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from rig.queue.items import Item
 from rig.runs.listing.summary import RunSummary
 from rig.tui.browse import TABS
-from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row, window, wrapped
+from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, row, window, wrapped
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.following.link import ENDED_STATES
 from rig.tui.look import PlotView
+from rig.tui.pages.parts import list_with_detail
 
-WIDE = 110  # from this width on, the verb's output is to the right of the list
 STATES = {"tripped": "■", "unreadable": "✕", "interrupted": "▲", "aborted": "▲", "running": "●"}
 
 
@@ -37,15 +38,8 @@ def runs_page(view: PlotView, width: int, height: int) -> list[Row]:
     room = height - len(head)
     if browsed.job is None:
         return block([*head, *window(listed, at, room)], width, height)
-    if width >= WIDE:
-        left = width * 2 // 5
-        right = width - left - 1
-        pair = [(window(listed, at, room), left), (_job(view, right, room), right)]
-        return [*head, *hstack(pair, room)]
     above = max(room // 3, 3)
-    return block(
-        [*head, *block(window(listed, at, above), width, above),
-         *_job(view, width, room - above)], width, height)  # fmt: skip
+    return [*head, *list_with_detail(listed, at, partial(_job, view), width, room, above)]
 
 
 def _lines(view: PlotView) -> list[Row]:

@@ -14,12 +14,12 @@ from rig.tui.drawing.plot import GUTTER, PlotTrace, draw
 from rig.tui.drawing.rows import Part, Row, block, columns, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
+from rig.tui.pages.parts import WIDE
 from rig.tui.recorded_run import StoredCurves, StoredEffect, StoredEstimate, StoredTrace
 from rig.tui.units import shown
 
 Array = NDArray[np.float64]
 
-WIDE: Final = 110  # from this width on, the free run is to the right of the text
 PLOT: Final = 6  # rows of a plot below it
 UNITS: Final = {"torque": "N·m", "force": "N", "flow": "m³/s"}  # by the first word of an equation
 SYMBOLS: Final = {"clean": "●", "explained": "●", "confounded": "▲", "unexplained": "▲"}
