@@ -20,6 +20,15 @@ class EndpointError(Exception):
     """The bench cannot be offered at an endpoint; the message names the place and a remedy."""
 
 
+def cannot_listen(host: str, port: int, error: OSError) -> EndpointError:
+    """Return the error of a port that cannot be listened on."""
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    return EndpointError(
+        f"cannot listen on {host}:{port}: {reason}; end what uses the port, "
+        "or choose another one (0: any free one)"
+    )
+
+
 class ParentProcess:
     """The process that a server belongs to and ends with."""
 

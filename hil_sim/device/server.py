@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import signal
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
@@ -20,7 +19,7 @@ from pymodbus.transport import ModbusProtocol
 
 from hil_sim.device.device import Device
 from hil_sim.device.laws import LawTable
-from hil_sim.device.lifetime import PARENT_SECONDS, EndpointError, ParentProcess
+from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, cannot_listen
 from hil_sim.device.pdu import REQUESTS, Request
 from hil_sim.device.register_map import DeviceRegisters
 from hil_sim.device.rtu_server import serve_line
@@ -119,11 +118,7 @@ class BenchServer(ModbusTcpServer):
         try:
             self.transport = await self.call_create()
         except OSError as error:
-            reason = os.strerror(error.errno) if error.errno else str(error)
-            raise EndpointError(
-                f"cannot listen on {host}:{port}: {reason}; end what uses the port, "
-                "or choose another one (0: any free one)"
-            ) from error
+            raise cannot_listen(host, port, error) from error
         return True
 
     def callback_new_connection(self) -> ServerRequestHandler:

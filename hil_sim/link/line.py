@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import select
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +14,6 @@ from typing import Final
 from hil_sim.device.lifetime import EndpointError
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.faults.wire import End, WireFault
-from hil_sim.link.frames import Framing
 from hil_sim.link.link import FaultyLink
 
 _CHUNK: Final = 65_536
@@ -28,16 +27,7 @@ class LineLink(FaultyLink):
     by closing. One direction that ends is silent; if both end, the host's side is unplugged.
     """
 
-    def __init__(
-        self,
-        target: str,
-        framing: Framing,
-        faults: Sequence[WireFault] = (),
-        seed: int = 0,
-        seconds: Callable[[], float] | None = None,
-        port: int = 0,
-    ) -> None:
-        super().__init__(framing, faults, seed, seconds)
+    def _open(self, target: str, port: int) -> None:
         kind, self._target = _prefix_and_device(target)
         self._folder = TemporaryDirectory(prefix="bramah-line-")
         self._name = Path(self._folder.name) / "line"
@@ -46,7 +36,6 @@ class LineLink(FaultyLink):
         self._unsent = b""
         self._to_device, self._to_host = self._ways()
         self._plug_in()
-        self._thread.start()
 
     def use(self, faults: Sequence[WireFault]) -> None:
         """Replace the faults from now on; an ended direction is restored."""

@@ -37,10 +37,12 @@ class FaultyLink(ABC):
 
     def __init__(
         self,
+        target: str,
         framing: Framing,
-        faults: Sequence[WireFault] = (),
-        seed: int = 0,
-        seconds: Callable[[], float] | None = None,
+        faults: Sequence[WireFault],
+        seed: int,
+        seconds: Callable[[], float] | None,
+        port: int,
     ) -> None:
         self._framing = framing
         self._injectors = (
@@ -51,7 +53,13 @@ class FaultyLink(ABC):
         self.seconds = seconds or (lambda: time.monotonic() - made)
         self._closing = False
         self._cut = False
+        self._open(target, port)
         self._thread = threading.Thread(target=self._run, name="faulty link", daemon=True)
+        self._thread.start()
+
+    @abstractmethod
+    def _open(self, target: str, port: int) -> None:
+        """Make the host's end of a link to the device at `target`, and `endpoint`."""
 
     @abstractmethod
     def _step(self) -> None:

@@ -7,15 +7,13 @@ import re
 import select
 import socket
 import time
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
 from hil_sim.device.lifetime import EndpointError
-from hil_sim.faults.wire import Carrier, End, WireFault
-from hil_sim.link.frames import Framing
+from hil_sim.faults.wire import Carrier, End
 from hil_sim.link.link import FaultyLink
 from hil_sim.link.way import Way
 
@@ -42,16 +40,7 @@ class TcpLink(FaultyLink):
 
     beneath: ClassVar[Carrier] = Carrier.TCP
 
-    def __init__(
-        self,
-        target: str,
-        framing: Framing,
-        faults: Sequence[WireFault] = (),
-        seed: int = 0,
-        seconds: Callable[[], float] | None = None,
-        port: int = 0,
-    ) -> None:
-        super().__init__(framing, faults, seed, seconds)
+    def _open(self, target: str, port: int) -> None:
         match = _ADDRESS.search(target)
         url = urlsplit(f"//{match.group()}" if match else "")
         self._target = (str(url.hostname), int(url.port or 0))
@@ -65,7 +54,6 @@ class TcpLink(FaultyLink):
         here = f"127.0.0.1:{self._listener.getsockname()[1]}"
         self.endpoint = _ADDRESS.sub(here, target, count=1)
         self._sides: dict[socket.socket, _Side] = {}
-        self._thread.start()
 
     def _step(self) -> None:
         ways = [side.sends for side in self._sides.values()]

@@ -8,14 +8,13 @@ protocol on a pseudo terminal, CAN FD by the letters of the CANable 2.0.
 from __future__ import annotations
 
 import logging
-import os
 import select
 import socket
 import time
 from contextlib import suppress
 from typing import Final, Protocol
 
-from hil_sim.device.lifetime import EndpointError
+from hil_sim.device.lifetime import cannot_listen
 from hil_sim.device.pty_line import PtyLine
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.can_layout import CLASSIC_BYTES, FD_SIZES
@@ -104,11 +103,7 @@ class SocketcandServer:
         try:
             self._listener = socket.create_server((host, port))
         except OSError as error:
-            reason = os.strerror(error.errno) if error.errno else str(error)
-            raise EndpointError(
-                f"cannot listen on {host}:{port}: {reason}; end what uses the port, "
-                "or choose another one (0: any free one)"
-            ) from error
+            raise cannot_listen(host, port, error) from error
         self._listener.setblocking(False)
         host, port = self._listener.getsockname()[:2]
         self.endpoint = f"can://socketcand/{host}:{port}/{CHANNEL}"
