@@ -19,10 +19,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import Played, ideal
+from analysis.design.twin_records import Array, Played, ideal
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import parameters_of
 from analysis.regression.solve import merge, triangle
@@ -31,7 +30,6 @@ from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from rig.model.wire.resample import Resampler
 
-Array = NDArray[np.float64]
 BULK = "b"
 
 

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import Played, TwinStep
+from analysis.design.twin_records import Array, Played, TwinStep
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
 
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from analysis.design.limits import Spectrum
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import TwinStep
+from analysis.design.twin_records import Array, TwinStep
 
-Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
 
 KINDS = ("shape", "bump", "lines", "phases")

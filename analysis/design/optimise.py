@@ -19,20 +19,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.design.limits import forecast_of, used
 from analysis.design.moves import Tone, mutated, tilted, tone_of, with_tones
 from analysis.design.predict import StepInformation, coefficients, covariance, information
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import Played, TwinStep, play
+from analysis.design.twin_records import Array, Played, TwinStep, play
 from analysis.regression.rows import parameters_of
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 Passes = Callable[[TwinStep, Mapping[int, Tone]], bool]

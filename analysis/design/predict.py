@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from analysis.design.lateness import BULK, LatenessCost, lateness_cost
 from analysis.design.sensor_noise import score_covariance
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import Played, TwinStep, ideal, play
+from analysis.design.twin_records import Array, Played, TwinStep, ideal, play
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.least_squares import scaled_inverse
@@ -35,8 +35,6 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, family_of, inverted
 from rig.model.records import Run
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
 from analysis.regression.noise import sensor_variance
-from analysis.regression.rows import Filtering, Rows, prepared, right_sides
+from analysis.regression.rows import Array, Filtering, Rows, prepared, right_sides
 from analysis.signals.conditioning import Signals
 from analysis.signals.convolution import same_convolved
 from analysis.signals.filters import FirSmoother
@@ -31,8 +30,6 @@ from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from analysis.regression.rows import Filtering, Rows, record_rows
+from analysis.regression.rows import Array, Filtering, Rows, record_rows
 from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import align_reach, condition
 from analysis.signals.filters import FirSmoother
@@ -23,8 +20,6 @@ from analysis.signals.locks import band_reach, held_positions
 from analysis.terms.base import FAMILIES, Term, Used
 from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 class Source(Protocol):

@@ -13,14 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
-from analysis.regression.least_squares import least_squares
+from analysis.regression.least_squares import Array, least_squares
 from analysis.regression.settings import REGRESSION
 from rig.model.parse import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from analysis.regression.least_squares import factored
-from analysis.regression.rows import Filtering, parameters_of, record_rows
+from analysis.regression.rows import Array, Filtering, parameters_of, record_rows
 from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import square
 from analysis.signals.conditioning import condition
@@ -37,7 +37,6 @@ from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 Triangles = Mapping[str, Array]  # family -> triangle (k, k) of its rows
 
 

@@ -16,18 +16,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import Rows, in_common, record_rows
+from analysis.regression.rows import Array, Rows, in_common, record_rows
 from analysis.signals.filters import Smoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.parts import AnySensor
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 _HARMONICS = 50  # of a rounding error as a function of the signal: 99 % of its variance
 

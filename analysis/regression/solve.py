@@ -24,10 +24,8 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.special import stdtrit
 
-from analysis.regression.least_squares import factored
+from analysis.regression.least_squares import Array, factored
 from analysis.regression.settings import REGRESSION
-
-Array = NDArray[np.float64]
 
 MOSTLY_NOISE: Final = "its column in these records is mostly sensor noise"
 Indices = NDArray[np.int64]

@@ -11,18 +11,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import welch
 
 from analysis.identify.result import Identification
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import least_squares
-from analysis.regression.rows import Rows
+from analysis.regression.rows import Array, Rows
 from analysis.regression.solve import RowCluster, solve, triangle
 from analysis.report.settings import REPORT
 from analysis.terms.base import family_of, inverted
-
-Array = NDArray[np.float64]
 
 KINDS = ("torque", "flow_cap", "flow_rod")
 

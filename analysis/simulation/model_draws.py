@@ -15,16 +15,14 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
-from analysis.simulation.model import Estimate, Model, rig_difference
+from analysis.simulation.model import Array, Estimate, Model, rig_difference
 from analysis.simulation.settings import SIMULATION
 from analysis.terms import BASELINE
 from rig.model.parameters import is_positive
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 SIGMAS: Final = 2.0  # equivalent standard errors to the edge of a 95 % interval
 
 

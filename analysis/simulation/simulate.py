@@ -18,7 +18,7 @@ from analysis.signals.conditioning import Signals
 from analysis.simulation import compiled_sources, fused, interpreted
 from analysis.simulation import equations as eq
 from analysis.simulation.integrator import integrate
-from analysis.simulation.model import Model
+from analysis.simulation.model import Array, Model
 from analysis.simulation.settings import SIMULATION
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
@@ -28,7 +28,6 @@ from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 _REASONS = {

@@ -7,18 +7,14 @@ simulated bench does, with separately written physics.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.model import Array, Model, nominal_model
 from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import DrivingInput, Simulation, constant_supply, simulate
 from analysis.simulation.twin import holding_state
 from rig.model import channels as ch
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
-
 
 Wave = tuple[Array, tuple[int, ...]]  # one period of unit RMS, its lines
 

@@ -11,16 +11,14 @@ from collections.abc import Mapping
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.model import Array, Model, nominal_model
 from analysis.simulation.simulate import State, constant_supply, simulate
 from rig.model.parse import InputError
 from rig.model.parts import Valve
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 

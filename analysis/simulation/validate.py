@@ -12,10 +12,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.effects.measurement import corrected_channels
-from analysis.regression.rows import default_filtering
+from analysis.regression.rows import Array, default_filtering
 from analysis.signals.conditioning import Mask, Signals, aligned_channels, condition, lost_samples
 from analysis.signals.filters import Smoother
 from analysis.signals.locks import bands_by_step
@@ -35,8 +34,6 @@ from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Record, Run, refuse_malformed
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

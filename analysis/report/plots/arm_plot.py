@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 from matplotlib.patches import Arc, Polygon
-from numpy.typing import NDArray
 
 from analysis.report.plots.style import (
     CARD,
@@ -22,6 +21,7 @@ from analysis.report.plots.style import (
     INK,
     JOINT_COLOURS,
     PALE,
+    Array,
     figure,
     note,
     style,
@@ -29,8 +29,6 @@ from analysis.report.plots.style import (
 )
 from analysis.report.settings import REPORT
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from analysis.report.plots.style import (
     MODEL,
     ORANGE,
     SKY,
+    Array,
     figure,
     gapped,
     note,
@@ -33,8 +34,6 @@ from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.regression.conditioned import ConditionedRecord
@@ -26,6 +25,7 @@ from analysis.report.plots.style import (
     MODEL,
     ORANGE,
     PALE,
+    Array,
     figure,
     gapped,
     note,
@@ -53,8 +53,6 @@ from rig.model import channels as ch
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.units import AXES, display_unit, typeset
-
-Array = NDArray[np.float64]
 
 WORDS = 125  # letters of a line across a page
 
