@@ -88,7 +88,7 @@ def improve(
     before = search.errors([c.information for c in candidates])
     shares = {c.information.step: (c.share, c.limit) for c in candidates}
     plays, accepted, children = 0, 0, 0
-    for s, _ in dict.fromkeys((s, 0) for s, _ in free):
+    for s in dict.fromkeys(s for s, _ in free):
         candidates[s], cost = search.fitted(candidates[s])
         plays += cost
     best = search.value([c.information for c in candidates])

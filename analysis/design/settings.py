@@ -41,9 +41,7 @@ class DesignSettings:
     # than the first error of the criterion's parameter.
     kept_error: float = 1.5
     phase_rounds: int = 40  # of the search for phases, for each candidate
-    gain_band: float = (
-        0.2  # of the logarithm of a piston's gain, which the bench needs to centre it
-    )
+    gain_band: float = 0.2  # of the logarithm of a piston's gain, needed to centre it
 
     # Relative fall of a mineral oil's bulk modulus per kelvin, about 0.4 to 0.6 % (Merritt,
     # Hydraulic Control Systems, ch. 2); the swing of `oil.temperature_band` is taken as a sine's.

@@ -31,14 +31,10 @@ class PaperParameter:
     nominal: tuple[float, ...] = ()
 
 
-def _gain(
-    low: float, mean: float, high: float, rsd: float, pso: float | None = None,
-    ga: float | None = None,
-) -> PaperParameter:  # fmt: skip
-    def si(value: float | None) -> float | None:
-        return None if value is None else value * 1e-7
-
-    return PaperParameter(low * 1e-7, mean * 1e-7, high * 1e-7, rsd, si(pso), si(ga))
+def _gain(low: float, mean: float, high: float, rsd: float, *searched: float) -> PaperParameter:
+    """Return a flow gain that the paper prints in 1e-7; `searched` are PSO and GA."""
+    pso, ga = (*(value * 1e-7 for value in searched), None, None)[:2]
+    return PaperParameter(low * 1e-7, mean * 1e-7, high * 1e-7, rsd, pso, ga)
 
 
 TABLE_III: Final[Mapping[str, PaperParameter]] = {

@@ -16,9 +16,7 @@ class ReportSettings:
     # -- stretches of time that a figure shows ---------------------------------------------------
     record_seconds: float = 10.0  # [s] of a record
     electric_seconds: float = 15.0  # [s] of an electric joint's record: it moves slowly
-    free_run_seconds: float = (
-        4.0  # [s] at the end of a free run (the paper's window), with its drift
-    )
+    free_run_seconds: float = 4.0  # [s] at the end of a free run (the paper's window)
     effect_seconds: float = 4.0  # [s] of a record, before and after an effect is added
 
     # -- residual spectra ------------------------------------------------------------------------

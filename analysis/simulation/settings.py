@@ -27,9 +27,7 @@ class SimulationSettings:
 
     # -- synthetic records ---------------------------------------------------------------------
     trim_rounds: int = 4  # secant steps that centre an open-loop stroke
-    lead: float = (
-        2.0  # [s] simulated before the record starts, so that the initial transient has decayed
-    )
+    lead: float = 2.0  # [s] simulated before the record, for the initial transient to decay
     end_share: float = 0.99  # of half the stroke: where a joint stands that is locked at its end
     # The integrator joins the spool's samples by straight lines, which takes (pi f / rate)^2 / 3
     # of a line's amplitude: 0.01 % of the gains at 1 kHz. The model runs so many times finer.

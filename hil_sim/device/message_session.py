@@ -45,15 +45,17 @@ class MessageSession:
         self._host: _Host | None = None
         self._stream = 0  # number of the request that started it
         self._next = 0  # number of the block to be sent next
-        self._requests: dict[int, Callable[[_Host, bytes], bytes]] = {
-            Message.CLOSE: self._close,
-            Message.START: self._start,
-            Message.STOP: self._stop,
-            Message.APPLY: self._apply,
-            Message.RESET: self._reset,
-            Message.UPLOAD_BEGIN: self._writing(reg.UPLOAD_JOINT, 6, 6),
-            Message.UPLOAD_PAGE: self._writing(reg.UPLOAD_OFFSET, 6, 4 + 2 * msg.PAGE_SAMPLES),
-            Message.UPLOAD_END: self._writing(reg.UPLOAD_COMMIT, 4, 4),
+        laws = 2 + 2 * reg.LAW_WORDS * device.laws.joints
+        # What a request does, and the least and the largest size of its payload [bytes].
+        self._requests: dict[int, tuple[Callable[[_Host, bytes], bytes], int, int]] = {
+            Message.CLOSE: (self._close, 0, 0),
+            Message.START: (self._start, 0, 0),
+            Message.STOP: (self._stop, 0, 0),
+            Message.APPLY: (self._apply, laws, laws),
+            Message.RESET: (self._writing(reg.CONTROL_RESET), 2, 2),
+            Message.UPLOAD_BEGIN: (self._writing(reg.UPLOAD_JOINT), 6, 6),
+            Message.UPLOAD_PAGE: (self._writing(reg.UPLOAD_OFFSET), 6, 4 + 2 * msg.PAGE_SAMPLES),
+            Message.UPLOAD_END: (self._writing(reg.UPLOAD_COMMIT), 4, 4),
         }
 
     @property
@@ -130,11 +132,12 @@ class MessageSession:
             return self._for_anybody(frame.type)
         if frame.type == Message.OPEN:
             return self._open(frame, known)
-        request = self._requests.get(frame.type)
-        if request is None:
+        if frame.type not in self._requests:
             raise Refused(Refusal.NO_SUCH_REGISTER)
         if self._host is None or not known:
             raise Refused(Refusal.NOT_IN_CONTROL)
+        request, least, most = self._requests[frame.type]
+        _sized(frame.payload, least, most)
         return request(self._host, frame.payload)
 
     def _for_anybody(self, kind: int) -> bytes:
@@ -155,7 +158,6 @@ class MessageSession:
         return b""
 
     def _close(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 0, 0)
         self._device.take_control(host)
         self._device.zero()
         self._device.stop()
@@ -163,33 +165,21 @@ class MessageSession:
         return b""
 
     def _start(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 0, 0)
         self._command(host, reg.CONTROL_STREAM, reg.STREAM_START)
         self._stream, self._next = host.number, 0
         return b""
 
     def _stop(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 0, 0)
         self._command(host, reg.CONTROL_STREAM, reg.STREAM_STOP)
         return b""
 
-    def _reset(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 2, 2)
-        self._registers.write(host, reg.CONTROL_RESET.address, payload)
-        return b""
-
     def _apply(self, host: _Host, payload: bytes) -> bytes:
-        size = 2 + 2 * reg.LAW_WORDS * self._device.laws.joints
-        _sized(payload, size, size)
         self._registers.write(host, reg.LAWS.address, payload[2:])
         self._registers.write(host, reg.CONTROL_APPLY.address, payload[:2])
         return self._registers.read(host, reg.STATUS_APPLY_TICK.address, 2)
 
-    def _writing(
-        self, register: Register, least: int, most: int
-    ) -> Callable[[_Host, bytes], bytes]:
+    def _writing(self, register: Register) -> Callable[[_Host, bytes], bytes]:
         def write(host: _Host, payload: bytes) -> bytes:
-            _sized(payload, least, most)
             self._registers.write(host, register.address, payload)
             return b""
 

@@ -26,10 +26,8 @@ logger = logging.getLogger(__name__)
 ADDRESS: Final = 1  # of this device on its line
 GAP: Final = 0.02  # [s] of silence after which an unfinished frame is dropped
 _FIXED: Final = {3: 8, 4: 8, 6: 8}  # whole length of requests without a byte count
-_COUNTED: Final = {
-    16: (6, 9),
-    23: (10, 13),
-}  # position of the byte count, length without its bytes
+# Position of the byte count, length without its bytes.
+_COUNTED: Final = {16: (6, 9), 23: (10, 13)}
 _BY_FUNCTION: Final = {request.function_code: request for request in REQUESTS}
 
 

@@ -43,15 +43,11 @@ def read_with_unit(value: Any, si: str) -> float:
     return parse_quantity(value, si)
 
 
-def with_units(read: Callable[[str], str]) -> Callable[[Any, ValidationInfo], Any]:
-    """Return a reader of a mapping of quantities whose SI unit follows from the key."""
-
-    def convert(value: Any, info: ValidationInfo) -> Any:
-        if not isinstance(value, dict) or not info.context:
-            return value
-        return {str(k): read_with_unit(v, read(str(k))) for k, v in value.items()}
-
-    return convert
+def with_units(value: Any, info: ValidationInfo, unit_of: Callable[[str], str]) -> Any:
+    """Read a file's mapping of quantities whose SI unit follows from the key."""
+    if not isinstance(value, dict) or not info.context:
+        return value
+    return {str(k): read_with_unit(v, unit_of(str(k))) for k, v in value.items()}
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from rig.model.quantity import Time
 from rig.model.rig import Rig
 from rig.model.wire.codes import Codes
 
-Mend = Callable[[], None]
+Restore = Callable[[], None]
 
 
 class Fault(Part):
@@ -47,7 +47,7 @@ class Fault(Part):
         """Its place, as text."""
         return str(getattr(self, "where", None) or getattr(self, "channel", None) or "bench")
 
-    def begin(self, tables: Tables) -> Mend | None:
+    def begin(self, tables: Tables) -> Restore | None:
         """Change the plant's tables; return a function that restores them, None if unchanged."""
         return None
 
@@ -61,12 +61,12 @@ class Fault(Part):
         """
 
 
-def changed(row: Any, field: str, value: float) -> Mend:
+def changed(row: Any, field: str, value: float) -> Restore:
     """Set a field of a table's row; return a function that restores it."""
     before = row[field].copy()
 
-    def mend() -> None:
+    def restore() -> None:
         row[field] = before
 
     row[field] = value
-    return mend
+    return restore

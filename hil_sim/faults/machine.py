@@ -8,7 +8,7 @@ from pydantic import Field
 
 from hil_sim.effects.base import Tables
 from hil_sim.effects.fluid import Conductance
-from hil_sim.faults.base import Fault, Mend, changed
+from hil_sim.faults.base import Fault, Restore, changed
 from rig.model.quantity import Flow
 
 
@@ -28,7 +28,7 @@ class ValveStuck(JointFault):
 
     name: Literal["valve_stuck"]
 
-    def begin(self, tables: Tables) -> Mend:
+    def begin(self, tables: Tables) -> Restore:
         """Set the spool's speed limit to zero."""
         return changed(tables.joints[self.joint : self.joint + 1], "spool_rate", 0.0)
 
@@ -40,7 +40,7 @@ class HoseBurst(JointFault):
     chamber: Literal["cap", "rod"] = "cap"
     conductance: Conductance = Field(default=2e-10, gt=0)
 
-    def begin(self, tables: Tables) -> Mend:
+    def begin(self, tables: Tables) -> Restore:
         """Open the chamber to the outside."""
         row = tables.joints[self.joint : self.joint + 1]
         return changed(row, f"leak_{self.chamber}", self.conductance)
@@ -52,7 +52,7 @@ class JointUnlocks(JointFault):
     name: Literal["joint_unlocks"]
     conductance: Conductance = Field(default=1e-10, gt=0)
 
-    def begin(self, tables: Tables) -> Mend:
+    def begin(self, tables: Tables) -> Restore:
         """Connect the chambers."""
         row = tables.joints[self.joint : self.joint + 1]
         return changed(row, "leak_internal", self.conductance)
@@ -64,6 +64,6 @@ class PumpOff(Fault):
     name: Literal["pump_off"]
     flow: Flow = Field(default=0.0, ge=0)
 
-    def begin(self, tables: Tables) -> Mend:
+    def begin(self, tables: Tables) -> Restore:
         """Reduce the pump's flow."""
         return changed(tables.bench, "pump", self.flow)

@@ -72,7 +72,7 @@ class WireFault(Fault):
         """The direction of the frames that it affects."""
         return self.way
 
-    def strikes(self, way: str) -> bool:
+    def affects(self, way: str) -> bool:
         """Return whether it acts on the frames of a direction."""
         return self.way in (way, BOTH)
 

@@ -40,8 +40,8 @@ class LineLink(FaultyLink):
     def use(self, faults: Sequence[WireFault]) -> None:
         """Replace the faults from now on; an ended direction is restored."""
         super().use(faults)
-        self._to_device.mend()
-        self._to_host.mend()
+        self._to_device.restore()
+        self._to_host.restore()
 
     def _plug_in(self) -> None:
         self._line = PtyLine()

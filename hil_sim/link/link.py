@@ -29,7 +29,7 @@ class FaultyLink(ABC):
     """A link in a thread of its own; a context manager that ends it.
 
     `seconds` is the device's time, by which faults begin and end; without it, the time since the
-    link was made. Frames are struck as `seed` draws it, each way by its own draw.
+    link was made. `seed` draws which frames a fault changes, for each way by itself.
     """
 
     endpoint: str  # the host's of this link

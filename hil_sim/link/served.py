@@ -20,13 +20,7 @@ if TYPE_CHECKING:
     from hil_sim.device.can.adapters import Adapter
 
 Answer = TypeVar("Answer")
-SERVED: Final = (
-    TCP,
-    RTU,
-    SERIAL,
-    CAN,
-    SLCAN,
-)  # wires with both a device and a faulty link here
+SERVED: Final = (TCP, RTU, SERIAL, CAN, SLCAN)  # wires with a device and a faulty link here
 _SECONDS: Final = 60.0  # [s] longer than any call here; a hang ends in an error
 
 

@@ -18,10 +18,9 @@ from hil_sim.link.link import FaultyLink
 from hil_sim.link.way import Way
 
 _CHUNK: Final = 65_536
-_ADDRESS: Final = re.compile(
-    r"[^/]+:\d+"
-)  # in modbus-tcp://HOST:PORT, can://socketcand/HOST:PORT/can0
-_SEND_SECONDS: Final = 1.0  # [bytes] buffered for an end that does not read, before its link ends
+# In modbus-tcp://HOST:PORT, can://socketcand/HOST:PORT/can0.
+_ADDRESS: Final = re.compile(r"[^/]+:\d+")
+_SEND_SECONDS: Final = 1.0  # longest wait for an end that does not read, before its link ends
 
 
 @dataclass(eq=False)

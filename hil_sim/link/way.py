@@ -46,7 +46,7 @@ class FaultInjector:
     def use(self, faults: Sequence[WireFault]) -> None:
         """Inject other faults from the next frame on; their counts restart."""
         self._injected = Counter()
-        self._faults = tuple(fault for fault in faults if fault.strikes(self.way))
+        self._faults = tuple(fault for fault in faults if fault.affects(self.way))
 
     def inject(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
         """Return the pieces of a frame at `seconds` of the device's time; one fault per frame.
@@ -116,7 +116,7 @@ class Way:
         late, self._for_other_way = self._for_other_way, []
         self._queue(late, now)
 
-    def mend(self) -> None:
+    def restore(self) -> None:
         """Restore a way that a fault has ended."""
         self.ended = False
 

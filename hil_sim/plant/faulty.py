@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from hil_sim.faults.base import Fault, Mend
+from hil_sim.faults.base import Fault, Restore
 from hil_sim.plant.interface import Law
 from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario
@@ -26,7 +26,7 @@ class _Timed:
     fault: Fault
     first: int
     end: float
-    mend: Mend | None = None
+    restore: Restore | None = None
     last: Codes = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
@@ -83,9 +83,9 @@ class FaultyPlant:
         for fault in self._faults:
             if fault.first == self.tick:
                 fault.last = self._last.copy()
-                fault.mend = fault.fault.begin(self.plant.tables)
-            elif fault.end == self.tick and fault.mend is not None:
-                fault.mend()
+                fault.restore = fault.fault.begin(self.plant.tables)
+            elif fault.end == self.tick and fault.restore is not None:
+                fault.restore()
 
     def _distorted(self, codes: Codes, outputs: Codes) -> tuple[Codes, Codes]:
         first = self.tick - len(codes)

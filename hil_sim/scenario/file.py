@@ -55,7 +55,7 @@ class Scenario(Part):
     @field_validator("parameters", mode="before")
     @classmethod
     def _units(cls, value: Any, info: ValidationInfo) -> Any:
-        return with_units(_unit_of)(value, info)
+        return with_units(value, info, _unit_of)
 
     @field_validator("effects")
     @classmethod

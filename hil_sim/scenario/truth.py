@@ -51,7 +51,7 @@ class TrueMachine(Part):
     @field_validator("parameters", mode="before")
     @classmethod
     def _units(cls, value: Any, info: ValidationInfo) -> Any:
-        return with_units(parameter_unit)(value, info)
+        return with_units(value, info, parameter_unit)
 
 
 def machine_text(name: str) -> str | None:
