@@ -53,14 +53,13 @@ def inputs_of(rig: Rig) -> tuple[Input, ...]:
     """
     inputs = []
     for i in range(len(rig.joints)):
-
-        def name(kind: str, joint: int = i + 1) -> str:
-            return ch.channel(kind, joint)
-
-        inputs += [Input(name(ch.PISTON), k, f, i) for k, f in enumerate(("s", "sd", "sdd"))]
-        inputs.append(Input(name(ch.SPOOL), 0, "u", i))
-        for kind, fields in ((ch.CAP, ("p_cap", "pd_cap")), (ch.ROD, ("p_rod", "pd_rod"))):
-            inputs += [Input(name(kind), k, f, i) for k, f in enumerate(fields)]
+        for kind, fields in (
+            (ch.PISTON, ("s", "sd", "sdd")),
+            (ch.SPOOL, ("u",)),
+            (ch.CAP, ("p_cap", "pd_cap")),
+            (ch.ROD, ("p_rod", "pd_rod")),
+        ):
+            inputs += [Input(ch.channel(kind, i + 1), k, f, i) for k, f in enumerate(fields)]
     inputs.append(Input(ch.SUPPLY, 0, "p_s", None))
     inputs.append(Input(ch.TEMPERATURE, 0, "temperature", None))
     return tuple(i for i in inputs if i.channel in rig.channels)

@@ -19,9 +19,9 @@ from analysis.effects.curve import (
     spline,
     spread_knots,
 )
-from analysis.effects.supply import PortEffect, edge_gains, port_flow
+from analysis.effects.supply import PortEffect, edge_gains, in_every_flow, port_flow
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, U, equation, kernel
+from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, U, kernel
 from rig.model.rig import Rig
 
 FLOWS: Final = 3  # knots of the flow, the first at zero, without a drop
@@ -126,8 +126,7 @@ class SupplyCurve(PortEffect):
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow drawn [m^3/s]."""
-        flow, kinds = port_flow(rig, signals, drawn=True), ("flow_cap", "flow_rod")
-        return {equation(kind, i): flow for i in range(signals.joints) for kind in kinds}
+        return in_every_flow(signals, port_flow(rig, signals, drawn=True))
 
 
 TERMS = (SupplyCurve,)

@@ -190,7 +190,7 @@ class LineDrop(PortEffect):
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow drawn or returned [m^3/s]."""
-        return _everywhere(signals, port_flow(rig, signals, self.drawn))
+        return in_every_flow(signals, port_flow(rig, signals, self.drawn))
 
 
 @kernel
@@ -370,7 +370,8 @@ def edge_gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -
     return [values[joint[k]] for joint in names for k in chosen]
 
 
-def _everywhere(signals: Signals, variable: Array) -> dict[str, Array]:
+def in_every_flow(signals: Signals, variable: Array) -> dict[str, Array]:
+    """Return a variable (n,) as that of every flow equation."""
     kinds = ("flow_cap", "flow_rod")
     return {equation(kind, i): variable for i in range(signals.joints) for kind in kinds}
 

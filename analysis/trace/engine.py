@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, ordered
-from analysis.effects.payload import Payload
+from analysis.effects.mechanics import Payload
 from analysis.identify import checks as ck
 from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.identify.port_flows import with_identified_bulk_modulus

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
-from analysis.effects.payload import Payload, growth, heaviest_payload
+from analysis.effects.mechanics import Payload, growth, heaviest_payload
 from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records

@@ -12,7 +12,7 @@ from scipy.signal import lsim
 from analysis.effects.base import SUPPLY, Effect, Evidence, ordered
 from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
-from analysis.effects.payload import growth
+from analysis.effects.mechanics import growth
 from analysis.effects.valve import second_order
 from analysis.identify.identify import identify
 from analysis.regression.rows import right_sides

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from analysis.effects.friction import CoulombFriction
-from analysis.effects.payload import Payload
+from analysis.effects.mechanics import Payload
 from analysis.identify.identify import identify
 from analysis.simulation.validate import validate
 from analysis.terms import baseline_of
