@@ -31,7 +31,7 @@ from rig.tui.look import OF_A_RECORDED_RUN, PAGES, Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.pages.parts import joints_in
 from rig.tui.pages.whole import compose
-from rig.tui.words import LINGER, KeyAnswer, Stop
+from rig.tui.words import LINGER, Stop
 
 SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
 LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
@@ -421,15 +421,6 @@ class Monitor(Starts, App[int]):
     def action_leave(self, code: int) -> None:
         """Close the screen and state what happens to the run."""
         self.exit(code, message=farewell(self.link.frame))
-
-    def stop_answered(self, stop: Stop, where: Endpoint | None, answered: bool) -> None:
-        """Note the result of a stop; called by the sending thread."""
-        # Replacing one attribute needs no lock.
-        if self.stop_asked is stop:
-            missed = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
-            answer = KeyAnswer.TAKEN if answered else missed
-            self.stop_asked = replace(stop, endpoint=where, answer=answer)
-            self.redraw()
 
     def redraw(self) -> None:
         """Draw at once; any thread may call this."""

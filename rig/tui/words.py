@@ -133,7 +133,7 @@ def nearest_margin(frame: Frame) -> Margin | None:
     for name, view in snapshot.channels.items() if snapshot is not None else ():
         low, high = limit(view.low), limit(view.high)
         kind, joint = place_of(name)
-        free = snapshot is not None and joint is not None and _role(snapshot, joint) == "free"
+        free = snapshot is not None and joint is not None and role_of(snapshot, joint) == "free"
         if low is None or high is None or not high > low or (kind == ch.PISTON and free):
             continue
         seen = frame.window.span(name, frame.device_time - RECENT) or (view.last, view.last)
@@ -156,7 +156,8 @@ def place_of(name: str) -> tuple[str, int | None]:
         return name, None
 
 
-def _role(snapshot: Snapshot, joint: int) -> str:
+def role_of(snapshot: Snapshot, joint: int) -> str:
+    """Return what the run does with a joint; '' if it does not say."""
     return snapshot.roles[joint - 1] if joint <= len(snapshot.roles) else ""
 
 

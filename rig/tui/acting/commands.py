@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Final
 
 from rig.bench.screens.sockets import Endpoint, Snapshot
-from rig.model.alarms.states import Alarm, AlarmState, AlarmTable
+from rig.model.alarms.states import Alarm, AlarmState
 from rig.model.trips import RecordingFailed
 from rig.runs.runstate import EventLog
-from rig.tui.following.link import Frame, Link, LinkStage
+from rig.tui.following.link import Link, LinkStage
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
-from rig.tui.words import Stop
+from rig.tui.words import KeyAnswer, Stop
 
 CHOOSE_KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
 MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort needs no confirmation
@@ -43,8 +44,6 @@ class Commands:
     ask: Callable[..., None]
     view: Callable[[], PlotView]
     redraw: Callable[[], None]
-    stop_answered: Callable[[Stop, Endpoint | None, bool], None]
-    alarms_of: Callable[[Frame], AlarmTable]
 
     def act_stop(self) -> None:
         """Zero the outputs of the run shown, of the one marked in the list, or of the only one."""
@@ -52,7 +51,16 @@ class Commands:
         choosing = frame.stage is LinkStage.CHOOSING
         endpoint = self.marked_session if choosing else frame.endpoint
         self.stop_asked = stop = Stop(self.clock(), endpoint)
-        self.link.stop(endpoint, lambda where, answered: self.stop_answered(stop, where, answered))
+
+        def answered(where: Endpoint | None, taken: bool) -> None:
+            # Called by the sending thread: replacing one attribute needs no lock.
+            if self.stop_asked is stop:
+                missed = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
+                answer = KeyAnswer.TAKEN if taken else missed
+                self.stop_asked = replace(stop, endpoint=where, answer=answer)
+                self.redraw()
+
+        self.link.stop(endpoint, answered)
         if choosing:
             self.link.choose(endpoint)
 

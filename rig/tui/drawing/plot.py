@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.tui.drawing import braille
+from rig.tui.drawing.braille import Array
 from rig.tui.drawing.rows import Part, Row, fitted, row
 from rig.tui.drawing.styles import ALARM, DIM, PLAIN, TRIP_LINE, WARN_LINE
 from rig.tui.units import Format
 
-Array = NDArray[np.float64]
 Band = tuple[float | None, float | None]
 
 GUTTER: Final = 7  # characters left of the curve: a limit's number and the axis

@@ -70,8 +70,8 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
         ("acts", acts),
     ]  # fmt: skip
     inner = width - 4
-    body = columns([[(name, DIM), text] for name, text in facts])
-    body = [line for text in wrapped(alarm.sentence, inner, STRONG) for line in (text,)] + body
+    body = wrapped(alarm.sentence, inner, STRONG)
+    body += columns([[(name, DIM), text] for name, text in facts])
     body += [row(("do    ", ASK_TEXT), *line) for line in wrapped(alarm.remedy, inner - 6)]
     plot = _curve_before(view, alarm, inner, height - 2 - len(body))
     return box(alarm.key, [*body, *plot], width, height)

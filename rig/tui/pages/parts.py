@@ -16,7 +16,7 @@ from rig.tui.drawing.rows import Row, block, box, fit, hstack, row, width_of, wi
 from rig.tui.drawing.styles import DIM, STRONG, TRIP_LINE, WARN_LINE, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.units import limit, shown
-from rig.tui.words import Freshness, value
+from rig.tui.words import Freshness, role_of, value
 
 _JOINT_CHANNEL = re.compile(r"^(?P<kind>.+)_(?P<joint>[1-9]\d*)$")
 NAMES: Final = {ch.CAP: "cap", ch.ROD: "rod", ch.SUPPLY: "supply", ch.TEMPERATURE: "oil"}
@@ -210,8 +210,7 @@ def curves(view: PlotView, names: dict[str, str], width: int, height: int) -> li
 def joint_title(view: PlotView, joint: int) -> str:
     """Return a joint's name with its present activity."""
     snapshot = view.frame.snapshot
-    roles = snapshot.roles if snapshot is not None else []
-    role = ROLES.get(roles[joint - 1], "") if joint <= len(roles) else ""
+    role = ROLES.get(role_of(snapshot, joint), "") if snapshot is not None else ""
     return f"joint {joint} {role}".rstrip()
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.model.units import plain, typeset, with_interval
+from rig.tui.drawing.braille import Array
 from rig.tui.drawing.plot import GUTTER, PlotTrace, draw
 from rig.tui.drawing.rows import Part, Row, block, columns, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
@@ -17,8 +17,6 @@ from rig.tui.look import PlotView
 from rig.tui.pages.parts import WIDE
 from rig.tui.recorded_run import StoredCurves, StoredEffect, StoredEstimate, StoredTrace
 from rig.tui.units import shown
-
-Array = NDArray[np.float64]
 
 PLOT: Final = 6  # rows of a plot below it
 UNITS: Final = {"torque": "N·m", "force": "N", "flow": "m³/s"}  # by the first word of an equation
