@@ -270,18 +270,10 @@ def simulate(
     failure = ""
     if status != eq.OK:
         failure = f"{_REASONS[status]} {filled / drive.rate:.3f} s after the start"
-    return _result(ready.geometry, drive, inputs, ys, failure, filled, evaluations)
-
-
-def _result(
-    geometry: Array, drive: DrivingInput, inputs: Array, ys: Array, failure: str, filled: int,
-    evaluations: int,
-) -> Simulation:  # fmt: skip
-    N = drive.u.shape[1]
-    q, qd, cap, rod, piston, speed = np.empty((6, len(ys), N))
-    electric = bool((geometry[:, eq.GAIN] != 0.0).all())
+    q, qd, cap, rod, piston, speed = np.empty((6, samples, N))
+    electric = bool((ready.geometry[:, eq.GAIN] != 0.0).all())
     outside = _output(
-        geometry, inputs, drive.locked, ys, filled, electric, q, qd, cap, rod, piston, speed
+        ready.geometry, inputs, drive.locked, ys, filled, electric, q, qd, cap, rod, piston, speed
     )
     if electric:
         piston, speed = q, qd
