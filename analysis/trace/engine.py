@@ -49,6 +49,7 @@ from analysis.trace.next_experiment.detection_limits import (
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.notes import (
     evidence_notes,
+    geometry_note,
     not_judged_notes,
     record_condition_notes,
     refitted_notes,
@@ -66,6 +67,7 @@ from analysis.trace.result import (
     Gate,
     Trace,
 )
+from analysis.trace.search.geometry import geometry_for_smaller_set
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
@@ -156,13 +158,17 @@ def _of_rig(rig: Rig, result: Trace) -> Trace:
 
 @dataclass(frozen=True)
 class _Options:
-    """Candidates, the terms `known` to act, and further options of `trace`."""
+    """Candidates, the terms `known` to act, and further options of `trace`.
+
+    `geometry_exact`: the rig's areas, volumes and pin distances are taken as they are.
+    """
 
     effects: Sequence[Effect]
     known: tuple[Used, ...]
     seed: int
     look_ahead: bool
     free_forms: bool
+    geometry_exact: bool = False
 
     @property
     def may_be_load(self) -> bool:
@@ -249,6 +255,8 @@ def _traced(
     if known := unstated_noise(rig, terms, prepared.records, finding):
         prepared = replace(prepared, records=known[0], rows=known[1])
         finding = searched(prepared)
+    if by_geometry := _traced_within_tolerances(records, options, finding, done):
+        return by_geometry
     done(JUDGED)
     records = replace(prepared.records, lines=finding.rows.lines)
     finding, fitted, free_runs = _with_free_runs(prepared, records, finding)
@@ -324,6 +332,29 @@ def _traced(
     )  # fmt: skip
     notes += tolerated_error_notes(result)
     return replace(result, notes=tuple(notes), sentence=sentence(result))
+
+
+def _traced_within_tolerances(
+    records: TraceRuns, options: _Options, finding: Finding, done: Callable[[float], None]
+) -> Trace | None:
+    """Return a simpler answer beside a geometry within the rig file's tolerances, None without."""
+    if options.geometry_exact:
+        return None
+    explained = finding.verdict != UNEXPLAINED
+    geometry = geometry_for_smaller_set(finding.hypotheses, finding.winner, explained)
+    if geometry is None:
+        return None
+    again = _traced(
+        geometry.rig, records.of_rig(geometry.rig), replace(options, geometry_exact=True), done
+    )
+    sizes = [
+        (len(effects), sum(len(e.parameters) for e in effects))
+        for effects in (again.effects, finding.named)
+    ]
+    if again.verdict == UNEXPLAINED or (explained and sizes[0] >= sizes[1]):
+        return None
+    note = geometry_note(geometry.words, finding.named, explained)
+    return replace(again, notes=(note, *again.notes))
 
 
 def _without_unlocked_lines(

@@ -25,6 +25,7 @@ from analysis.trace.result import JudgedEffect
 from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import TRACE
+from rig.model.channels import place_in_words
 from rig.model.records import Run
 from rig.model.units import plain
 
@@ -160,6 +161,16 @@ def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
         f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
         "do: the errors are given with their values; record training motions like the held-out ones"
     ]
+
+
+def geometry_note(moved: str, named: Sequence[JudgedEffect], explained: bool) -> str:
+    """State the numbers `moved` within their tolerances, and the answer without that."""
+    effects = ", ".join(f"{e.name} at {place_in_words(e.at)}" for e in named) or "no effect"
+    answer = f"{effects} would be named" if explained else "the records would be unexplained"
+    return (
+        "areas, volumes and pin distances are taken within the tolerances of the rig file, the "
+        f"furthest {moved}; as stated, {answer}"
+    )
 
 
 def not_judged_notes(

@@ -368,6 +368,12 @@ class SearchSettings:
     altered_share: float = 0.1
     """Share of an equation's energy above noise that a set removes, from which a free form must
     explain that equation (tuned)."""
+    most_deviations: float = 3.0
+    """Standard uncertainties by which a number of the rig file with a tolerance may be wrong
+    (convention: three standard deviations)."""
+    independent_rows: float = 0.03
+    """Share of the rows whose noise is independent, since the row filter correlates it (tuned: with
+    it a geometry drawn within its tolerances comes out nearest to the true one)."""
     free_form_near: float = 2.0
     """Remaining energy over the least of all sets with a free form: of the sets with less, the
     simplest is judged first (tuned)."""

@@ -39,6 +39,14 @@ class TraceRuns:
     lines: tuple[Line, ...] = ()
     noise_ratio: Mapping[str, float] = field(default_factory=dict)
 
+    def of_rig(self, rig: Rig) -> TraceRuns:
+        """Return the runs as records of another rig."""
+        train, holdout, judge = (
+            tuple(replace(run, rig=rig) for run in runs)
+            for runs in (self.train, self.holdout, self.judge)
+        )
+        return replace(self, train=train, holdout=holdout, judge=judge)
+
 
 @dataclass(frozen=True)
 class TraceRows:

@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 from rig.model.channels import CAP, PISTON, ROD, SPOOL, SUPPLY, TEMPERATURE, channel
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.tolerances import Tolerances
 from rig.model.wire.codes import decode_input, encode_input
 from rig.runs.rigs import load_rig
 from tests.studies.foreign import plant
@@ -28,6 +29,10 @@ SETTLE: Final = 4.0  # [s] before a record begins
 CENTRING: Final = 0.3  # [V/m]
 LIMIT: Final = 0.0355  # [m] that no piston passes
 TEMPERED: Final = 40.0  # [degC]
+
+
+# Of cylinders and pins that were measured with a calliper, pipes with a tape.
+STATED = Tolerances(area=0.003, volume=0.05, pin=2e-4, mid_length=5e-4)
 
 
 @dataclass(frozen=True)
@@ -263,6 +268,16 @@ def _sensed(bench: Bench, clean: Mapping[str, Array], rng: np.random.Generator) 
             encode_input(noisy, low, high, sensor.bits), low, high, sensor.bits
         )
     return out
+
+
+def stated_rig(rig: Rig, seed: int) -> Rig:
+    """Return a rig file's machine: with tolerances, and numbers that are wrong by draws of them."""
+    rng = np.random.default_rng([seed, 23])
+    rig = rig.model_copy(update={"tolerances": STATED})
+    for number in rig.uncertain_numbers:
+        sigma = number.sigma * float(rng.standard_normal())
+        rig = rig.with_moved(replace(number, sigma=sigma))
+    return rig
 
 
 def records_of(bench: Bench, steps: tuple[str, ...], seed: int, scale: float, repeats: int) -> Run:

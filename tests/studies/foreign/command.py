@@ -27,6 +27,9 @@ def foreign(
     better: Annotated[
         bool, typer.Option("--better", help="Measure each better as well, three ways.")
     ] = False,
+    tolerances: Annotated[
+        bool, typer.Option("--tolerances", help="Rig files are wrong within stated tolerances.")
+    ] = False,
     workers: WorkersOption = 1,
     cluster: ClusterOption = None,
     json: JsonOption = None,
@@ -56,7 +59,7 @@ def foreign(
 
     kept = Kept(keep, _name, asdict, loaded) if keep else None
     work = [
-        Job(seed + stride * k, only, kind, spool, how)
+        Job(seed + stride * k, only, kind, spool, how, tolerances)
         for k in range(count)
         for how in ("", *(BETTER if better else ()))
     ]

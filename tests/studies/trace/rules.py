@@ -160,6 +160,8 @@ RULES: Final = (
          ((finding, "_with_best_tied_set", lambda found, *_: found),)),
     Rule("exact forms", "the form of a gain, an offset or a mass may miss as much as any other",
          ((gates, "form_share", lambda *_: TRACE.held_out_share),)),
+    Rule("tolerances", "areas, volumes and pin distances are taken as the rig file states them",
+         ((engine, "geometry_for_smaller_set", lambda *_: None),)),
     Rule("unstated noise", "where nothing repeats, the noise is the stated one",
          ((engine, "unstated_noise", lambda *_: None),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",

@@ -1,0 +1,121 @@
+"""A smaller set of effects beside a geometry within the tolerances of the rig file.
+
+A wrong area resembles a gain of a pressure, a wrong pipe volume oil that was not stated: on a rig
+whose numbers have tolerances, such effects may be no more than these. Beside each set that was
+fitted, the likeliest numbers g [sigma] minimise, to first order,
+
+    w |r + X db + D g|^2 + |g|^2,   |g_j| <= `SEARCH.most_deviations`,
+
+with the whitened residual r (M,) of the set, its columns X (M, k), the changes D (M, J) of the
+residual when each number is one sigma larger, and the share w of the rows that are independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from analysis.signals.conditioning import of_other_geometry
+from analysis.trace.data.cache import RowCache
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.search.exact_fit import ExactFit, design_matrix
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.linear_fit import orthonormal
+from analysis.trace.settings import SEARCH
+from rig.model.rig import Rig
+from rig.model.tolerances import UncertainNumber
+
+Array = NDArray[np.float64]
+
+SHOWN = 3  # numbers in a note
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A rig whose uncertain numbers are moved by `deviations` (J,) [sigma]."""
+
+    rig: Rig
+    numbers: tuple[UncertainNumber, ...]
+    deviations: Array
+
+    @property
+    def words(self) -> str:
+        """The numbers that are moved furthest, in words."""
+        order = np.argsort(-np.abs(self.deviations))[:SHOWN]
+        return ", ".join(
+            f"{self.numbers[j].name} {abs(self.deviations[j]):.1f} times {self.numbers[j].stated} "
+            f"{'larger' if self.deviations[j] > 0.0 else 'smaller'}"
+            for j in order
+        )
+
+
+def geometry_for_smaller_set(
+    hypotheses: HypothesisSet, winner: Hypothesis, explained: bool
+) -> Geometry | None:
+    """Return the geometry beside which a set simpler than `winner` leaves as little, None without.
+
+    `explained`: the `winner` explains the records; where it does not, the other set may be of any
+    size, and it must leave no more than noise or form error.
+    """
+    data = hypotheses.train_data
+    numbers = data.rig.uncertain_numbers
+    if not numbers or not (winner.effects or not explained):
+        return None
+    changes = residual_changes(data, winner.fit, numbers)
+    sets = [h for h in hypotheses.fitted.values() if not explained or h.size < winner.size]
+    for hypothesis in sorted((hypotheses.empty, *sets), key=lambda h: (h.size, h.total)):
+        deviations, left = _likeliest(data, hypothesis, changes)
+        most = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
+        if float(deviations @ deviations) <= most and all(  # chi square with J degrees of freedom
+            hypotheses.negligible(e, v) or (explained and v <= winner.excess_energy[e])
+            for e, v in left.items()
+        ):
+            return Geometry(_moved(data.rig, deviations), numbers, deviations)
+    return None
+
+
+def _moved(rig: Rig, deviations: Array) -> Rig:
+    """Return the rig with its uncertain numbers moved by `deviations` (J,) [sigma]."""
+    for number, deviation in zip(rig.uncertain_numbers, deviations, strict=True):
+        rig = rig.with_moved(replace(number, sigma=float(deviation) * number.sigma))
+    return rig
+
+
+def residual_changes(
+    data: RegressionData, fit: ExactFit, numbers: Sequence[UncertainNumber]
+) -> Array:
+    """Return the changes (M, J) of a fit's whitened residual by one sigma of each number."""
+    beta = np.array(list(fit.beta.values()))
+
+    def residual(of: RegressionData) -> Array:
+        rows = design_matrix(of, fit.terms)
+        return np.asarray(rows.rhs - rows.matrix @ beta)
+
+    own, columns = residual(data), []
+    for number in numbers:
+        other = data.rig.with_moved(number)
+        records = tuple(
+            replace(c, signals=of_other_geometry(data.rig, c.signals, other)) for c in data.records
+        )
+        columns.append(residual(replace(data, rig=other, records=records, cache=RowCache())) - own)
+    return np.column_stack(columns)
+
+
+def _likeliest(
+    data: RegressionData, hypothesis: Hypothesis, changes: Array
+) -> tuple[Array, dict[str, float]]:
+    """Return the deviations (J,) [sigma] beside a set, and the energy above noise they leave."""
+    basis = orthonormal(design_matrix(data, hypothesis.fit.terms).matrix)
+    free = changes - basis @ (basis.T @ changes)
+    Q, R = np.linalg.qr(free)
+    weight, most = math.sqrt(SEARCH.independent_rows), SEARCH.most_deviations
+    stacked = np.vstack((weight * R, np.eye(R.shape[1])))
+    wanted = np.concatenate((-weight * (Q.T @ hypothesis.fit.residual), np.zeros(R.shape[1])))
+    found = np.asarray(lsq_linear(stacked, wanted, bounds=(-most, most)).x)
+    return found, energy_above_noise(data, hypothesis.fit.residual + free @ found)

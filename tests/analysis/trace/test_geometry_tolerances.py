@@ -1,0 +1,96 @@
+"""A rig file whose areas, volumes and pin distances are wrong, within the tolerances it states.
+
+The bench keeps its geometry; the rig file that the records are read with states other numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
+from analysis.trace.engine import trace
+from analysis.trace.result import Trace
+from analysis.trace.search.exact_fit import fit_coefficients
+from analysis.trace.search.geometry import residual_changes
+from rig.model.records import Run
+from rig.model.rig import Rig
+from rig.model.tolerances import Tolerances
+from tests.analysis.small_bench import TRUTH
+from tests.analysis.trace.hidden import pair_of_runs
+
+STATED = Tolerances(area=0.005, volume=0.1, pin=4e-4, mid_length=5e-4)
+SEED = 3
+
+
+def misread(run: Run, seed: int = SEED, tolerances: Tolerances | None = STATED) -> Run:
+    """Return the run as records of a rig file whose numbers are off by `STATED`, one sigma each."""
+    rng = np.random.default_rng(seed)
+    rig = run.rig.model_copy(update={"tolerances": STATED})
+    for number in rig.uncertain_numbers:
+        rig = rig.with_moved(replace(number, sigma=number.sigma * rng.choice((-1.0, 1.0))))
+    return replace(run, rig=rig.model_copy(update={"tolerances": tolerances}))
+
+
+def traced(runs: tuple[Run, Run], tolerances: Tolerances | None = STATED) -> Trace:
+    train, held_out = (misread(run, tolerances=tolerances) for run in runs)
+    return trace([train], [held_out], look_ahead=False)
+
+
+def test_wrong_numbers_within_their_tolerances_are_no_effect(rig: Rig) -> None:
+    runs = pair_of_runs(rig)
+    assert traced(runs, tolerances=None).verdict != "clean"
+    result = traced(runs)
+    assert (result.verdict, result.effects) == ("clean", ())
+    (note,) = [n for n in result.notes if "are taken within the tolerances" in n]
+    assert "as stated" in note
+    for name in ("b", "M2", "W2", "Fv2", "C_pp_2"):
+        low, high = result.model_after.parameters[name].ci95
+        assert low < TRUTH[name] < high
+
+
+def test_an_effect_beside_wrong_numbers_is_named_alone(rig: Rig) -> None:
+    result = traced(pair_of_runs(rig, c_internal=2e-12))
+    assert [(e.name, e.where) for e in result.effects] == [("internal_leakage", "joint 2")]
+    low, high = result.effects[0].parameters["c_internal_2"].ci95
+    assert low < 2e-12 < high
+
+
+def test_a_gain_far_beyond_the_tolerance_of_an_area_is_still_named(rig: Rig) -> None:
+    train, held_out = pair_of_runs(rig)
+
+    def misgauged(run: Run) -> Run:
+        records = []
+        for r in run.records:
+            pressure = 1.06 * r.channels["cap_pressure_2"]
+            records.append(replace(r, channels={**r.channels, "cap_pressure_2": pressure}))
+        rig = run.rig.model_copy(update={"tolerances": STATED})
+        return replace(run, rig=rig, records=tuple(records))
+
+    result = trace([misgauged(train)], [misgauged(held_out)], look_ahead=False)
+    assert "sensor_gain" in {e.name for e in result.effects}
+    assert not any("are taken within the tolerances" in note for note in result.notes)
+
+
+def test_changes_by_one_sigma_are_those_of_records_read_with_the_other_rig(rig: Rig) -> None:
+    train, _ = pair_of_runs(rig)
+    stated = rig.model_copy(update={"tolerances": STATED})
+    terms = tuple(map(Used, baseline_of(rig)))
+    data = regression_data(stated, terms, conditioned_records(stated, [train]))
+    fit = fit_coefficients(data, terms)
+    numbers = [n for n in stated.uncertain_numbers if n.joint == 1]
+    changes = residual_changes(data, fit, numbers)
+    for number, change in zip(numbers, changes.T, strict=True):
+        other = stated.with_moved(number)
+        again = regression_data(other, terms, conditioned_records(other, [train]), fit.beta)
+        expected = np.concatenate(
+            [
+                again.mean_residual[t.where] * t.noise / s.noise - data.mean_residual[s.where]
+                for s, t in zip(data.segments, again.segments, strict=True)
+            ]
+        )
+        assert np.linalg.norm(change - expected) < 0.02 * np.linalg.norm(expected), number.name
