@@ -30,6 +30,7 @@ from analysis.trace.next_experiment.small_effects import sets_with_small_effect,
 from analysis.trace.notes import shared_parameters
 from analysis.trace.result import UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_fit import contribution, design_matrix, fit_coefficients
+from analysis.trace.search.geometry import shape_errors
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from rig.model.records import Record, Run
 
@@ -74,6 +75,7 @@ def model_with_effects(
     if shooting.winner is not winner:
         winner = shooting.winner
         after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+    from_tolerances |= shape_errors(rows.train, winner.fit)
     others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
     absorbed = None
     if finding.verdict != UNEXPLAINED:

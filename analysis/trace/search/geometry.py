@@ -23,11 +23,11 @@ from scipy.optimize import lsq_linear
 from analysis.signals.conditioning import of_other_geometry
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.search.exact_fit import ExactFit, design_matrix
+from analysis.trace.search.exact_fit import ExactFit, design_matrix, tangent
 from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import orthonormal
-from analysis.trace.settings import SEARCH
+from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 from rig.model.tolerances import UncertainNumber
 
@@ -105,6 +105,20 @@ def residual_changes(
         )
         columns.append(residual(replace(data, rig=other, records=records, cache=RowCache())) - own)
     return np.column_stack(columns)
+
+
+def shape_errors(data: RegressionData, fit: ExactFit) -> dict[str, float]:
+    """Return the standard error of each shape of a fit by the rig's tolerances, by parameter."""
+    numbers = data.rig.uncertain_numbers
+    if not numbers:
+        return {}
+    names, columns = tangent(data, fit)
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    changes = residual_changes(data, fit, numbers)
+    shifts = np.linalg.lstsq(columns / scale, changes, rcond=TRACE.rank_limit)[0].T / scale
+    errors = dict(zip(names, map(float, np.linalg.norm(shifts, axis=0)), strict=True))
+    return {name: error for name, error in errors.items() if name not in fit.beta}
 
 
 def _likeliest(
