@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
@@ -94,3 +95,14 @@ def test_changes_by_one_sigma_are_those_of_records_read_with_the_other_rig(rig: 
             ]
         )
         assert np.linalg.norm(change - expected) < 0.02 * np.linalg.norm(expected), number.name
+
+
+@pytest.mark.slow
+def test_the_interval_of_a_dead_volume_includes_how_well_the_pipe_is_known(rig: Rig) -> None:
+    result = traced(pair_of_runs(rig, V_cap=4e-5))
+    assert [(e.name, e.where) for e in result.effects] == [("dead_volume", "joint 2 cap")]
+    volume = result.effects[0].parameters["V_dead_2_cap"]
+    low, high = volume.ci95
+    assert low < 4e-5 < high
+    pipe = STATED.volume * rig.joints[1].cylinder.cap_pipe_volume
+    assert high - low > 2 * pipe
