@@ -316,7 +316,7 @@ def _traced(
     ]
     runs_before, runs_after = free_runs
     left = 0.0  # of training rows that hold noise alone
-    if not finding.held_out_only:
+    if verdict != CLEAN and not finding.held_out_only:
         left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
     result = Trace(
         verdict, fitted.effects, error.noise, error.before, error.after,

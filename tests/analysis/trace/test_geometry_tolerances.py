@@ -47,6 +47,7 @@ def test_wrong_numbers_within_their_tolerances_are_no_effect(rig: Rig) -> None:
     assert traced(runs, tolerances=None).verdict != "clean"
     result = traced(runs)
     assert (result.verdict, result.effects) == ("clean", ())
+    assert result.unexplained_fraction == 0.0
     (note,) = [n for n in result.notes if "are taken within the tolerances" in n]
     assert "as stated" in note
     for name in ("b", "M2", "W2", "Fv2", "C_pp_2"):
