@@ -30,6 +30,7 @@ from analysis.trace.fitted_model import FittedModel, identified, model_with_effe
 from analysis.trace.in_motion import (
     find,
     fitted_in_motion,
+    held_out_ratios,
     joints_with_friction,
     rest_phase_notes,
 )
@@ -71,6 +72,7 @@ from analysis.trace.search.geometry import geometry_for_smaller_set
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
+from analysis.trace.settings import SEARCH, TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
 from rig.model.records import (
     Run,
@@ -353,6 +355,10 @@ def _traced_within_tolerances(
     ]
     if again.verdict == UNEXPLAINED or (explained and sizes[0] >= sizes[1]):
         return None
+    for equation, ratio in held_out_ratios(finding.rows, finding.winner).items():
+        most = max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio)
+        if again.after[equation] > most * again.noise_floor[equation]:
+            return None
     note = geometry_note(geometry.words, finding.named, explained)
     return replace(again, notes=(note, *again.notes))
 

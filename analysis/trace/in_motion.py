@@ -236,17 +236,17 @@ def _friction_of(winner: Hypothesis, joint: int) -> list[Effect]:
 
 def _meets_noise(found: Finding, joints: Collection[int]) -> bool:
     """Return whether a finding leaves little over the noise in the torque balances of `joints`."""
-    ratios = _held_out_ratios(found.rows, found.winner)
+    ratios = held_out_ratios(found.rows, found.winner)
     return all(ratios[equation("torque", joint)] <= TRACE.noted_ratio for joint in joints)
 
 
 def equations_above_noise(rows: TraceRows, winner: Hypothesis) -> set[str]:
     """Return the equations whose choosing rows keep more than `TRACE.noted_ratio` noise floors."""
-    ratios = _held_out_ratios(rows, winner)
+    ratios = held_out_ratios(rows, winner)
     return {e for e, ratio in ratios.items() if ratio > TRACE.noted_ratio}
 
 
-def _held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
+def held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     """Return the error of a set in the choosing rows over the noise floor, by equation."""
     choosing = rows.unseen.choosing
     return removal.error_over_floor(choosing, held_out_residual(choosing, winner.fit))

@@ -24,7 +24,7 @@ from analysis.signals.conditioning import of_other_geometry
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.exact_fit import ExactFit, design_matrix, tangent
-from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise, is_preferred
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import SEARCH, TRACE
@@ -60,24 +60,32 @@ def geometry_for_smaller_set(
 ) -> Geometry | None:
     """Return the geometry beside which a set simpler than `winner` leaves as little, None without.
 
-    `explained`: the `winner` explains the records; where it does not, the other set may be of any
-    size, and it must leave no more than noise or form error.
+    `explained`: the `winner` explains the records, and no equation may keep more than with it or
+    than noise. Where it does not, the other set may be of any size, and form error may remain.
     """
     data = hypotheses.train_data
     numbers = data.rig.uncertain_numbers
     if not numbers or not (winner.effects or not explained):
         return None
     changes = residual_changes(data, winner.fit, numbers)
-    sets = [h for h in hypotheses.fitted.values() if not explained or h.size < winner.size]
-    for hypothesis in sorted((hypotheses.empty, *sets), key=lambda h: (h.size, h.total)):
+    most = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
+    best: tuple[Hypothesis, Array] | None = None
+    for hypothesis in (hypotheses.empty, *hypotheses.fitted.values()):
+        if explained and hypothesis.size >= winner.size:
+            continue
         deviations, left = _likeliest(data, hypothesis, changes)
-        most = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
-        if float(deviations @ deviations) <= most and all(  # chi square with J degrees of freedom
-            hypotheses.negligible(e, v) or (explained and v <= winner.excess_energy[e])
+        if float(deviations @ deviations) > most:  # chi square with J degrees of freedom
+            continue
+        beside = replace(hypothesis, excess_energy=left)
+        little = all(
+            v <= max(hypotheses.noise_band.by_equation[e], winner.excess_energy[e])
+            if explained
+            else hypotheses.negligible(e, v)
             for e, v in left.items()
-        ):
-            return Geometry(_moved(data.rig, deviations), numbers, deviations)
-    return None
+        )
+        if little and (best is None or is_preferred(beside, best[0], hypotheses.noise_band)):
+            best = beside, deviations
+    return None if best is None else Geometry(_moved(data.rig, best[1]), numbers, best[1])
 
 
 def _moved(rig: Rig, deviations: Array) -> Rig:
