@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.tolerances import Tolerances
 from tests.analysis.effects import one_joint as bench
 
 Array = NDArray[np.float64]
 RMS = 0.03
+STATED = Tolerances(area=0.005, volume=0.1, pin=4e-4, mid_length=5e-4)
 
 
 def experiment(
@@ -90,3 +92,12 @@ def pushed(run: Run, force: float, blocks: tuple[int, ...], keep: float = 0.3) -
         return np.asarray(force * np.where(here, np.sin(np.pi * inside) ** 2, 0.0))
 
     return with_force(run, push)
+
+
+def misread(run: Run, seed: int = 3, tolerances: Tolerances | None = STATED) -> Run:
+    """Return the run as records of a rig file whose numbers are off by `STATED`, one sigma each."""
+    rng = np.random.default_rng(seed)
+    rig = run.rig.model_copy(update={"tolerances": STATED})
+    for number in rig.uncertain_numbers:
+        rig = rig.with_moved(replace(number, sigma=number.sigma * rng.choice((-1.0, 1.0))))
+    return replace(run, rig=rig.model_copy(update={"tolerances": tolerances}))

@@ -22,19 +22,7 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.tolerances import Tolerances
 from tests.analysis.small_bench import TRUTH
-from tests.analysis.trace.hidden import pair_of_runs
-
-STATED = Tolerances(area=0.005, volume=0.1, pin=4e-4, mid_length=5e-4)
-SEED = 3
-
-
-def misread(run: Run, seed: int = SEED, tolerances: Tolerances | None = STATED) -> Run:
-    """Return the run as records of a rig file whose numbers are off by `STATED`, one sigma each."""
-    rng = np.random.default_rng(seed)
-    rig = run.rig.model_copy(update={"tolerances": STATED})
-    for number in rig.uncertain_numbers:
-        rig = rig.with_moved(replace(number, sigma=number.sigma * rng.choice((-1.0, 1.0))))
-    return replace(run, rig=rig.model_copy(update={"tolerances": tolerances}))
+from tests.analysis.trace.hidden import STATED, misread, pair_of_runs
 
 
 def traced(runs: tuple[Run, Run], tolerances: Tolerances | None = STATED) -> Trace:
