@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 from urllib.parse import SplitResult
 
@@ -85,16 +85,11 @@ OFF = OutputLaw()
 
 
 @dataclass(frozen=True)
-class ActiveLaw:
+class ActiveLaw(OutputLaw):
     """One joint's output law with its waveform [V] and the tick of the waveform's first sample."""
 
-    wave: Array
-    start: int
-    gain: float = 0.0
-    bias: float = 0.0
-    position_gain: float = 0.0
-    setpoint: float = 0.0
-    limit: float = 0.0
+    wave: Array = field(default_factory=lambda: np.zeros(1))
+    start: int = 0
 
     def volts(self, tick: int, position: float) -> float:
         """Return the output [V] at a tick and a position [m or rad]."""

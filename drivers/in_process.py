@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple
+from dataclasses import asdict
 from typing import Any, ClassVar, Protocol
 from urllib.parse import SplitResult
 
@@ -170,7 +170,7 @@ class InProcessDriver:
         if not self._streaming:
             raise DeviceError("the object does not stream (not started)")
         laws = [
-            ActiveLaw(wave, self._origin, *astuple(law))
+            ActiveLaw(**asdict(law), wave=wave, start=self._origin)
             for law, wave in zip(self._laws, self._played, strict=True)
         ]
         try:

@@ -18,7 +18,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -139,7 +139,7 @@ class PolledDriver:
             rig.channels.index(ch.channel(rig.position_kind, i + 1)) for i in range(len(rig.joints))
         ]
         self._uploaded: list[Array] = [np.zeros(1) for _ in rig.joints]
-        self._laws = [ActiveLaw(wave, 0) for wave in self._uploaded]
+        self._laws = [ActiveLaw(wave=wave) for wave in self._uploaded]
         self._resampler = Resampler()
         self._rows: deque[tuple[Row, Array, float]] = deque()
         self._origin: float | None = None
@@ -260,7 +260,7 @@ class PolledDriver:
         tick = self._next_tick()
         starts = [tick if restart else law.start for law in self._laws]
         self._laws = [
-            ActiveLaw(wave, start, *astuple(law))
+            ActiveLaw(**asdict(law), wave=wave, start=start)
             for wave, start, law in zip(self._uploaded, starts, laws, strict=True)
         ]
         return tick
@@ -448,7 +448,7 @@ class PolledDriver:
             )
 
     def _zero_laws(self) -> None:
-        self._laws = [ActiveLaw(law.wave, law.start) for law in self._laws]
+        self._laws = [ActiveLaw(wave=law.wave, start=law.start) for law in self._laws]
         self._volts = np.zeros(len(self._rig.joints))
 
     def _make_safe(self) -> None:
