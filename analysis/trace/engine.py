@@ -359,7 +359,7 @@ def _traced_within_tolerances(
         most = max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio)
         if again.after[equation] > most * again.noise_floor[equation]:
             return None
-    note = geometry_note(geometry.words, finding.named, explained)
+    note = geometry_note(geometry, finding.named, explained)
     return replace(again, notes=(note, *again.notes))
 
 

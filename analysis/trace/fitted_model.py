@@ -129,7 +129,7 @@ def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
 def _with_curve(
     estimate: Estimate, name: str, curve: Used, data: RegressionData, winner: Hypothesis
 ) -> Estimate:
-    """Return a parameter that a free curve shares, with an interval of all of both.
+    """Return a parameter that a free curve shares; its interval includes the whole curve.
 
     Half of it is the parameter itself and what would add as much to the rows as the curve does.
     """

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
+import numpy as np
+
 from analysis.effects.base import Effect
 from analysis.effects.free_flows import BulkModulusCurve
 from analysis.effects.free_forces import FrictionCurve, PositionForce
@@ -23,6 +25,7 @@ from analysis.trace.judge.held_out import refitted_names
 from analysis.trace.remaining import Remainder
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.exact_fit import ExactFit
+from analysis.trace.search.geometry import Geometry
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
@@ -30,6 +33,7 @@ from rig.model.records import Run
 from rig.model.units import plain
 
 # Begins what a note says of a torque whose rests are not judged; the sentence refers to it.
+MOST_NUMBERS: Final = 3  # of a rig file, in a note
 WITHOUT_RESTS: Final = "judged without the samples at which the joint rests"
 
 
@@ -163,8 +167,14 @@ def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
     ]
 
 
-def geometry_note(moved: str, named: Sequence[JudgedEffect], explained: bool) -> str:
-    """State the numbers `moved` within their tolerances, and the answer without that."""
+def geometry_note(geometry: Geometry, named: Sequence[JudgedEffect], explained: bool) -> str:
+    """State the numbers that are furthest from the rig file's, and the answer with those."""
+    numbers, deviations = geometry.rig.uncertain_numbers, geometry.deviations
+    moved = ", ".join(
+        f"{numbers[j].name} {abs(deviations[j]):.1f} times {numbers[j].stated} "
+        f"{'larger' if deviations[j] > 0.0 else 'smaller'}"
+        for j in np.argsort(-np.abs(deviations))[:MOST_NUMBERS]
+    )
     effects = ", ".join(f"{e.name} at {place_in_words(e.at)}" for e in named) or "no effect"
     answer = f"{effects} would be named" if explained else "the records would be unexplained"
     return (
@@ -227,6 +237,8 @@ def shared_parameters(winner: Hypothesis, after: Model) -> dict[str, tuple[Used,
         else:
             continue
         if name in after.parameters:
-            shared = f"{effect.name} at {effect.where} shares it; its interval includes all of both"
+            shared = (
+                f"{effect.name} at {effect.where} shares it; its interval includes the whole curve"
+            )
             out[name] = used, f"{name} is no measured {what}: {why}, and {shared}"
     return out

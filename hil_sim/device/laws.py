@@ -33,7 +33,7 @@ class Refused(Exception):
         self.joint = joint
 
 
-OFF = Law(np.zeros(1))  # every plant may look into its wave
+OFF = Law(np.zeros(1))  # plants read the waveform of every law
 
 
 @dataclass

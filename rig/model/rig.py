@@ -8,6 +8,8 @@ selects it by `type: electric` at its joints, and `Rig.model_validate` returns t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, Final, Literal, Self
 
 import numpy as np
@@ -197,6 +199,13 @@ class Rig(Part):
     def with_moved(self, number: UncertainNumber) -> Self:
         """Return the rig with one of its numbers increased by its tolerance."""
         return self.model_copy(update={"joints": number.moved(self.joints)})
+
+    def with_deviations(self, deviations: Iterable[float]) -> Self:
+        """Return the rig with each of its uncertain numbers increased by so many sigma."""
+        rig = self
+        for number, deviation in zip(self.uncertain_numbers, deviations, strict=True):
+            rig = rig.with_moved(replace(number, sigma=deviation * number.sigma))
+        return rig
 
     @property
     def electric(self) -> bool:

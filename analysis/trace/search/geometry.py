@@ -33,26 +33,13 @@ from rig.model.tolerances import UncertainNumber
 
 Array = NDArray[np.float64]
 
-SHOWN = 3  # numbers in a note
-
 
 @dataclass(frozen=True)
 class Geometry:
     """A rig whose uncertain numbers are moved by `deviations` (J,) [sigma]."""
 
     rig: Rig
-    numbers: tuple[UncertainNumber, ...]
     deviations: Array
-
-    @property
-    def words(self) -> str:
-        """The numbers that are moved furthest, in words."""
-        order = np.argsort(-np.abs(self.deviations))[:SHOWN]
-        return ", ".join(
-            f"{self.numbers[j].name} {abs(self.deviations[j]):.1f} times {self.numbers[j].stated} "
-            f"{'larger' if self.deviations[j] > 0.0 else 'smaller'}"
-            for j in order
-        )
 
 
 def geometry_for_smaller_set(
@@ -85,14 +72,7 @@ def geometry_for_smaller_set(
         )
         if little and (best is None or is_preferred(beside, best[0], hypotheses.noise_band)):
             best = beside, deviations
-    return None if best is None else Geometry(_moved(data.rig, best[1]), numbers, best[1])
-
-
-def _moved(rig: Rig, deviations: Array) -> Rig:
-    """Return the rig with its uncertain numbers moved by `deviations` (J,) [sigma]."""
-    for number, deviation in zip(rig.uncertain_numbers, deviations, strict=True):
-        rig = rig.with_moved(replace(number, sigma=float(deviation) * number.sigma))
-    return rig
+    return None if best is None else Geometry(data.rig.with_deviations(best[1].tolist()), best[1])
 
 
 def residual_changes(

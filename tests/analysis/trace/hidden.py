@@ -98,6 +98,5 @@ def misread(run: Run, seed: int = 3, tolerances: Tolerances | None = STATED) -> 
     """Return the run as records of a rig file whose numbers are off by `STATED`, one sigma each."""
     rng = np.random.default_rng(seed)
     rig = run.rig.model_copy(update={"tolerances": STATED})
-    for number in rig.uncertain_numbers:
-        rig = rig.with_moved(replace(number, sigma=number.sigma * rng.choice((-1.0, 1.0))))
+    rig = rig.with_deviations(rng.choice((-1.0, 1.0)) for _ in rig.uncertain_numbers)
     return replace(run, rig=rig.model_copy(update={"tolerances": tolerances}))

@@ -274,10 +274,7 @@ def stated_rig(rig: Rig, seed: int) -> Rig:
     """Return a rig file's machine: with tolerances, and numbers that are wrong by draws of them."""
     rng = np.random.default_rng([seed, 23])
     rig = rig.model_copy(update={"tolerances": STATED})
-    for number in rig.uncertain_numbers:
-        sigma = number.sigma * float(rng.standard_normal())
-        rig = rig.with_moved(replace(number, sigma=sigma))
-    return rig
+    return rig.with_deviations(rng.standard_normal(len(rig.uncertain_numbers)).tolist())
 
 
 def records_of(bench: Bench, steps: tuple[str, ...], seed: int, scale: float, repeats: int) -> Run:
