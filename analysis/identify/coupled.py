@@ -126,11 +126,11 @@ def conclude(
         "runs": list(sources),
         "records": [reduction.head.name for reduction in reductions],
         "rows": rows,
-        "checks_failed": [c.name for c in statements if not c.ok],
     }
     model = Model(rig, used, estimates, covariance, provenance)
     log.info("identified %d parameters from %d records", len(estimates), len(reductions))
-    return Identification(model, solutions, rows, masked, seconds, statements, geometry=geometry)
+    found = Identification(model, solutions, masked, seconds, geometry=geometry)
+    return found.with_checks(statements)
 
 
 def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:

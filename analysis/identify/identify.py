@@ -12,7 +12,10 @@ from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
 from analysis.identify.estimation import refuse_unknown
 from analysis.identify.geometry import tolerances_ignored
-from analysis.identify.methods import SearchOptions, identify_by
+from analysis.identify.methods.search import SearchOptions
+from analysis.identify.methods.sequential import sequential
+from analysis.identify.methods.simultaneous import simultaneous
+from analysis.identify.methods.swarm import search_parameters
 from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.settings import IDENTIFY
@@ -21,7 +24,6 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run, refuse_malformed, with_loads_stated
-from rig.model.rig import Rig
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 HYDRAULIC = ("sequential", "pso", "ga")
@@ -63,19 +65,21 @@ def identify(
             "expected coupled or simultaneous"
         )
     if method != "coupled":
-        result = identify_by(method, runs, used, filtering, reject_noise, rng, search)
-        return result if result.geometry is not None else _with_exact_geometry(rig, result)
+        if method == "sequential":
+            result = sequential(runs, used, filtering, reject_noise)
+        elif method == "simultaneous":
+            result = simultaneous(runs, used, filtering, reject_noise)
+        else:
+            rng, options = rng or np.random.default_rng(0), search or SearchOptions()
+            result = search_parameters(method, runs, used, filtering, rng, options)
+        if result.geometry is None and rig.uncertain_numbers:
+            ignored = tolerances_ignored(rig, method)
+            result = result.with_checks((*result.checks, ignored))
+        return result
     if any(isinstance(u.term, PortEffect) for u in used):
         (runs,) = with_identified_bulk_modulus(runs, used)
     result = coupled(runs, used, filtering, reject_noise, estimator, bootstrap, rng, progress)
     return replace(result, model=replace(result.model, rig=rig))
-
-
-def _with_exact_geometry(rig: Rig, result: Identification) -> Identification:
-    """Return the result of a method that ignores tolerances, with a check if the rig has some."""
-    if not rig.uncertain_numbers:
-        return result
-    return result.with_checks((*result.checks, tolerances_ignored(rig, result.method)))
 
 
 def _refuse_estimator(estimator: str, bootstrap: int) -> None:

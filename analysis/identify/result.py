@@ -25,7 +25,7 @@ PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between 
 
 @dataclass(frozen=True)
 class Identification:
-    """The result of an identification: model, conditioning, rows used, masked rows, checks.
+    """The result of an identification: model, solved rows by family, masked rows, checks.
 
     `built` are the rows it was solved from; none where they were not all in memory. `geometry`
     holds the shifts by the rig's tolerances; None where there are none, or the method ignores them.
@@ -33,10 +33,9 @@ class Identification:
 
     model: Model
     solutions: Mapping[str, Solution]
-    rows: Mapping[str, int]
     masked_rows: int
     solve_seconds: float
-    checks: tuple[Check, ...]
+    checks: tuple[Check, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
     built: tuple[RecordRows, ...] = field(default=(), repr=False, compare=False)
     geometry: geo.GeometryShifts | None = field(default=None, repr=False, compare=False)
@@ -45,6 +44,11 @@ class Identification:
     def method(self) -> str:
         """The method by which it was found."""
         return str(self.model.provenance["method"])
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """The number of rows used, by family."""
+        return {family: solution.rows for family, solution in self.solutions.items()}
 
     @property
     def estimates(self) -> Mapping[str, Estimate]:
@@ -71,7 +75,7 @@ def to_json(result: Identification) -> dict[str, Any]:
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()
         },
-        "rows": dict(result.rows),
+        "rows": result.rows,
         "masked_rows": result.masked_rows,
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],

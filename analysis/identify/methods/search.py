@@ -81,7 +81,6 @@ class SearchWindow:
     """
 
     first: int
-    samples: int
     start: State
     measured: Mapping[str, Array]
     spread: Mapping[str, float]
@@ -161,7 +160,7 @@ def make_task(
         valid = every[first : first + length]
         spread = {n: float(valid.sum() * y[valid].var()) for n, y in measured.items()}
         start = state_at(signals, int(first))
-        windows.append(SearchWindow(int(first), length, start, measured, spread, valid))
+        windows.append(SearchWindow(int(first), start, measured, spread, valid))
     return SearchTask(
         record.name, model, names, nominal / options.factor, nominal * options.factor,
         drive, tuple(windows),
@@ -204,12 +203,13 @@ def score(task: SearchTask, values: Mapping[str, float]) -> Score:
     ready = compiled(with_values(task.model, values), Effort.FIT)
     total, lost, samples, failure = 0.0, 0, 0, ""
     for window in task.windows:
-        samples += window.samples
+        length = len(window.valid)
+        samples += length
         if failure == DIVERGED:
-            lost += window.samples
+            lost += length
             continue
-        simulated = simulate(ready, task.drive, window.start, window.first, window.samples)
-        lost += simulated.outside + window.samples - simulated.filled
+        simulated = simulate(ready, task.drive, window.start, window.first, length)
+        lost += simulated.outside + length - simulated.filled
         if simulated.failure:
             failure = DIVERGED
         elif simulated.outside:

@@ -8,19 +8,23 @@ solved with the next step's; in E2 such parameters are solved from all rows with
 Neither result is unique: a parameter that several steps determine (b in all of them) has as many
 values as steps. All are reported, with their disagreement in units of their own 95 % intervals: max
 |v_i - v_j| / sqrt(h_i^2 + h_j^2).
+
+A known parameter moves to the right-hand side: of [X y] the rows become [X_u, y - X_k b_k] =
+[X y] T, and the noise moments N of the columns T' N T.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
 from analysis.identify.checks import Check, consistency
-from analysis.identify.methods.stages import StageOutcome, StepRows, as_solution, solve_stages
 from analysis.identify.reduction import (
     RecordReduction,
     clusters_of,
@@ -32,11 +36,83 @@ from analysis.identify.result import Identification, estimates_of
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import Filtering, parameters_of
+from analysis.regression.solve import RowCluster, Solution, half_width, merge, solve, square
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StepValue:
+    """One value of one coefficient: the step it came from, standard error, degrees of freedom."""
+
+    step: str
+    value: float
+    std: float
+    dof: float
+
+    @property
+    def half(self) -> float:
+        """Half width of the 95 % interval."""
+        return float(half_width(np.array(self.std), np.array(self.dof)))
+
+    @property
+    def precise(self) -> bool:
+        """Whether the interval is narrow enough for the value to be used."""
+        return bool(
+            np.isfinite(self.value) and self.half < IDENTIFY.stage_precision * abs(self.value)
+        )
+
+
+@dataclass(frozen=True)
+class StepRows:
+    """One family's rows of one step, reduced, with the noise moments of its columns."""
+
+    name: str
+    clusters: tuple[RowCluster, ...]
+    noise: Array
+
+
+@dataclass(frozen=True)
+class StepwiseFit:
+    """One family solved step by step: every step's own values and condition number, E1, E2.
+
+    `rows` counts the rows of all steps, `triangle` (k+1, k+1) represents them; `lost` states why
+    E1 has no value.
+    """
+
+    names: tuple[str, ...]
+    own: Mapping[str, Sequence[StepValue]]
+    first: Mapping[str, StepValue]
+    averaged: Mapping[str, StepValue]
+    condition: Mapping[str, float]
+    rows: int
+    triangle: Array
+    lost: Mapping[str, str]
+
+    def solution(self, values: Mapping[str, StepValue]) -> Solution:
+        """Return some of the values as a solution, with their residual over all rows."""
+        k, R = len(self.names), self.triangle
+        value, std, dof = (np.full(k, np.nan) for _ in range(3))
+        for i, name in enumerate(self.names):
+            if name in values:
+                estimate = values[name]
+                value[i], std[i], dof[i] = estimate.value, estimate.std, estimate.dof
+        residual = R[:k, k] - R[:k, :k] @ np.nan_to_num(value)
+        squares = float(np.sum(residual**2)) + float(R[k, k] ** 2)
+        lost = {
+            name: self.lost.get(name, "no step determines it")
+            for name in self.names
+            if name not in values
+        }
+        return Solution(
+            self.names, value, np.diag(std**2), dof, max(self.condition.values()), self.rows,
+            float(np.sqrt(squares / max(self.rows, 1))), np.full(k, np.nan), lost,
+        )  # fmt: skip
 
 
 def sequential(
@@ -52,19 +128,18 @@ def sequential(
     rig = ck.common_rig(runs)
     built = build_rows(rig, runs, terms, filtering)
     reductions = reduce_rows(rig, terms, built)
-    stages = _stages(rig, terms, reductions)
+    steps = _steps(rig, terms, reductions)
     masked = sum(reduction.masked for reduction in reductions)
     started = time.perf_counter()
     outcomes = {
-        family: solve_stages(parameters_of(rig, terms, family), stages[family], reject_noise)
+        family: _solved_by_steps(parameters_of(rig, terms, family), steps[family], reject_noise)
         for family in FAMILIES
     }
     seconds = time.perf_counter() - started
-    solutions = {f: as_solution(o, o.first) for f, o in outcomes.items()}
+    solutions = {f: o.solution(o.first) for f, o in outcomes.items()}
     estimates, covariance = estimates_of(rig, terms, solutions)
     rows = {family: outcome.rows for family, outcome in outcomes.items()}
     shown = {name: _shown(rig, terms, outcomes, name) for name in estimates}
-    heads = [reduction.head for reduction in reductions]
     statements = (
         _uniqueness(shown),
         *record_checks(rig, reductions, rows),
@@ -73,20 +148,20 @@ def sequential(
     provenance = {
         "method": "sequential",
         "runs": [run.source for run in runs],
-        "records": [head.name for head in heads],
+        "records": [reduction.head.name for reduction in reductions],
         "rows": rows,
-        "checks_failed": [c.name for c in statements if not c.ok],
     }
-    second = {f: as_solution(o, o.averaged) for f, o in outcomes.items()}
+    second = {f: o.solution(o.averaged) for f, o in outcomes.items()}
     extra = {"sequential": _json(outcomes, shown, estimates, estimates_of(rig, terms, second)[0])}
     model = Model(rig, tuple(terms), estimates, covariance, provenance)
-    return Identification(model, solutions, rows, masked, seconds, statements, extra, tuple(built))
+    found = Identification(model, solutions, masked, seconds, extra=extra, built=tuple(built))
+    return found.with_checks(statements)
 
 
-def _stages(
+def _steps(
     rig: Rig, terms: Sequence[Used], reductions: Sequence[RecordReduction]
 ) -> dict[str, list[StepRows]]:
-    """Return the stages of each family in the order of the steps."""
+    """Return the steps of each family in the order of the steps."""
     out: dict[str, list[StepRows]] = {}
     for family in FAMILIES:
         width = len(parameters_of(rig, terms, family)) + 1
@@ -104,13 +179,13 @@ def _stages(
 
 
 def _shown(
-    rig: Rig, terms: Sequence[Used], outcomes: Mapping[str, StageOutcome], name: str
+    rig: Rig, terms: Sequence[Used], outcomes: Mapping[str, StepwiseFit], name: str
 ) -> list[tuple[str, Estimate]]:
     """Return every step's own value of one parameter, as an estimate in the parameter's unit."""
     family, outcome = next((f, o) for f, o in outcomes.items() if name in o.names)
     out = []
     for value in outcome.own[name]:
-        solutions = {family: as_solution(outcome, {name: value})}
+        solutions = {family: outcome.solution({name: value})}
         out.append((value.step, estimates_of(rig, terms, solutions)[0][name]))
     return out
 
@@ -146,7 +221,7 @@ def _uniqueness(shown: Mapping[str, Sequence[tuple[str, Estimate]]]) -> Check:
 
 
 def _json(
-    outcomes: Mapping[str, StageOutcome],
+    outcomes: Mapping[str, StepwiseFit],
     shown: Mapping[str, Sequence[tuple[str, Estimate]]],
     first: Mapping[str, Estimate],
     averaged: Mapping[str, Estimate],
@@ -171,3 +246,101 @@ def _json(
             for family, outcome in outcomes.items()
         },
     }
+
+
+def _solved_by_steps(
+    names: tuple[str, ...], steps: Sequence[StepRows], reject_noise: bool
+) -> StepwiseFit:
+    """Solve one family step by step in both ways."""
+    own: dict[str, list[StepValue]] = {name: [] for name in names}
+    condition = {}
+    for step in steps:
+        alone = solve(names, step.clusters, step.noise, reject_noise)
+        condition[step.name] = alone.condition_number
+        for name, value in _values(step.name, alone).items():
+            if value.precise:
+                own[name].append(value)
+    first, lost = _use_first(names, steps, reject_noise)
+    averaged = _average(names, steps, own, reject_noise)
+    return StepwiseFit(
+        names, own, first, averaged, condition,
+        sum(c.rows for s in steps for c in s.clusters),
+        merge(c.triangle for s in steps for c in s.clusters), lost,
+    )  # fmt: skip
+
+
+def _values(step: str, solution: Solution) -> dict[str, StepValue]:
+    std = np.sqrt(np.diag(solution.covariance))
+    return {
+        name: StepValue(step, float(v), float(s), float(d))
+        for name, v, s, d in zip(solution.names, solution.value, std, solution.dof, strict=True)
+        if np.isfinite(v)
+    }
+
+
+def _use_first(
+    names: tuple[str, ...], steps: Sequence[StepRows], reject_noise: bool
+) -> tuple[dict[str, StepValue], dict[str, str]]:
+    """E1: solve each step with the parameters of the steps before it known."""
+    known: dict[str, StepValue] = {}
+    lost: dict[str, str] = {}
+    waiting: list[StepRows] = []
+    for place, step in enumerate(steps):
+        waiting.append(step)
+        if len(known) == len(names):
+            break
+        solution = _solve_unknown(names, waiting, known, reject_noise)
+        last = place == len(steps) - 1
+        for name, value in _values(step.name, solution).items():
+            if value.precise or last:
+                known[name] = value
+        lost = solution.unidentifiable
+        waiting = [s for s in waiting if _has_unknown(names, s, known)]
+    return known, {name: why for name, why in lost.items() if name not in known}
+
+
+def _has_unknown(names: tuple[str, ...], step: StepRows, known: Mapping[str, StepValue]) -> bool:
+    """Return whether a step's rows contain any parameter that is still unknown."""
+    columns = [i for i, name in enumerate(names) if name not in known]
+    return any(np.any(c.triangle[:, columns] != 0.0) for c in step.clusters)
+
+
+def _average(
+    names: tuple[str, ...],
+    steps: Sequence[StepRows],
+    own: Mapping[str, Sequence[StepValue]],
+    reject_noise: bool,
+) -> dict[str, StepValue]:
+    """E2: average the steps' own values; solve the others from all rows."""
+    known = {}
+    for name, values in own.items():
+        if values:
+            n = len(values)
+            std = float(np.sqrt(sum(v.std**2 for v in values))) / n
+            averaged = " ".join(v.step for v in values)
+            mean = float(np.mean([v.value for v in values]))
+            known[name] = StepValue(averaged, mean, std, float(sum(v.dof for v in values)))
+    if len(known) == len(names):
+        return known
+    rest = _values("all", _solve_unknown(names, steps, known, reject_noise))
+    return {name: known.get(name) or rest[name] for name in names if name in known or name in rest}
+
+
+def _solve_unknown(
+    names: tuple[str, ...],
+    steps: Sequence[StepRows],
+    known: Mapping[str, StepValue],
+    reject_noise: bool,
+) -> Solution:
+    """Solve the steps' rows for the unknown parameters; known values count as exact."""
+    k = len(names)
+    free = [i for i, name in enumerate(names) if name not in known]
+    T = np.zeros((k + 1, len(free) + 1))
+    T[free, range(len(free))] = 1.0
+    T[:k, -1] = [-known[name].value if name in known else 0.0 for name in names]
+    T[k, -1] = 1.0
+    clusters = [
+        replace(c, triangle=square(c.triangle @ T)) for step in steps for c in step.clusters
+    ]
+    noise = sum((T.T @ s.noise @ T for s in steps), np.zeros((len(free) + 1,) * 2))
+    return solve([names[i] for i in free], clusters, noise, reject_noise)

@@ -12,7 +12,6 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -42,37 +41,32 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 
-_PYMOO = {
-    "pso": "algorithms.soo.nonconvex.pso",
-    "ga": "algorithms.soo.nonconvex.ga",
-    "evaluator": "core.evaluator",
-    "problem": "core.problem",
-    "termination": "core.termination",
-    "static": "problems.static",
-}
-
-
 @dataclass(frozen=True)
 class SearchHistory:
     """A finished search: the best values, and the number of candidates that failed, by cause.
 
-    `errors` (generations,) is the best error so far after each generation, `first` the best of the
-    first one; `lost` counts candidates by cause, `lost_first` those of the first generation.
+    By generation: the best error so far, the number of candidates, and of those that were lost.
     """
 
     values: Mapping[str, float]
-    error: float
-    first: float
-    evaluations: int
-    errors: tuple[float, ...]
-    sizes: tuple[int, ...]
     lost: Mapping[str, int]
-    lost_first: int
-    lost_by_generation: tuple[int, ...]
+    errors: list[float]
+    sizes: list[int]
+    lost_by_generation: list[int]
     seconds: float
 
+    @property
+    def error(self) -> float:
+        """The best error of all."""
+        return self.errors[-1]
 
-def search(
+    @property
+    def evaluations(self) -> int:
+        """The number of candidates."""
+        return sum(self.sizes)
+
+
+def search_parameters(
     method: str,
     runs: Sequence[Run],
     terms: Sequence[Used],
@@ -108,7 +102,7 @@ def run_search(
     errors: list[float] = []
     sizes: list[int] = []
     lost = {COMPLEX: 0, DIVERGED: 0}
-    gone: list[int] = []
+    lost_by_generation: list[int] = []
     while True:
         population = algorithm.ask()
         if population is None or not len(population):
@@ -119,7 +113,7 @@ def run_search(
         scores = [score(task, _values(task, x)) for x in points]
         scored = np.array([s.error for s in scores])
         sizes.append(len(scores))
-        gone.append(sum(bool(s.failure) for s in scores))
+        lost_by_generation.append(sum(bool(s.failure) for s in scores))
         for s in scores:
             if s.failure:
                 lost[s.failure] += 1
@@ -130,37 +124,31 @@ def run_search(
         algorithm.tell(infills=population)
     seconds = time.perf_counter() - started
     log.info("%s: %d candidates in %.1f s, %s lost", method, sum(sizes), seconds, lost)
-    return SearchHistory(
-        _values(task, best), best_error, errors[0], sum(sizes), tuple(errors), tuple(sizes),
-        lost, gone[0], tuple(gone), seconds,
-    )  # fmt: skip
+    return SearchHistory(_values(task, best), lost, errors, sizes, lost_by_generation, seconds)
 
 
 def _pymoo(
     method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
 ) -> tuple[Any, Any, Callable[[Array], Any]]:
     """Return pymoo's algorithm, its evaluator, and the wrapper of errors (n,) that it takes."""
-    # An optional dependency, needed for searches only.
-    try:
-        core = {name: import_module(f"pymoo.{place}") for name, place in _PYMOO.items()}
+    try:  # an optional dependency, needed for searches only
+        from pymoo.algorithms.soo.nonconvex.ga import GA  # noqa: PLC0415
+        from pymoo.algorithms.soo.nonconvex.pso import PSO  # noqa: PLC0415
+        from pymoo.core.evaluator import Evaluator  # noqa: PLC0415
+        from pymoo.core.problem import Problem  # noqa: PLC0415
+        from pymoo.core.termination import NoTermination  # noqa: PLC0415
+        from pymoo.problems.static import StaticProblem  # noqa: PLC0415
     except ImportError as error:
         raise InputError(
             f"the methods pso and ga need the package pymoo ({error}); install bramah[search]"
         ) from error
     span = np.log10(task.high / task.low)
-    problem = core["problem"].Problem(n_var=len(span), n_obj=1, xl=np.zeros(len(span)), xu=span)
+    problem = Problem(n_var=len(span), n_obj=1, xl=np.zeros(len(span)), xu=span)
     size = min(options.population, options.evaluations)
-    algorithm = getattr(core[method], method.upper())(pop_size=size)
+    algorithm = PSO(pop_size=size) if method == "pso" else GA(pop_size=size)
     seed = int(rng.integers(2**31))
-    algorithm.setup(
-        problem, termination=core["termination"].NoTermination(), seed=seed, verbose=False
-    )
-    static = core["static"].StaticProblem
-    return (
-        algorithm,
-        core["evaluator"].Evaluator(),
-        lambda errors: static(problem, F=errors[:, None]),
-    )
+    algorithm.setup(problem, termination=NoTermination(), seed=seed, verbose=False)
+    return algorithm, Evaluator(), lambda errors: StaticProblem(problem, F=errors[:, None])
 
 
 def _values(task: SearchTask, point: Array) -> dict[str, float]:
@@ -177,18 +165,16 @@ def _identification(
     rig, used = task.model.rig, task.model.terms
     solutions = {family: _as_solution(method, task, history, family) for family in FAMILIES}
     estimates, covariance = estimates_of(rig, used, solutions)
-    statements = _statements(method, runs, task, history)
     provenance = {
         "method": method,
         "runs": [run.source for run in runs],
         "records": [task.record],
         "evaluations": history.evaluations,
-        "checks_failed": [c.name for c in statements if not c.ok],
     }
     model = Model(rig, used, estimates, covariance, provenance)
-    rows = dict.fromkeys(FAMILIES, 0)
     extra = {"search": history_json(task, history, options)}
-    return Identification(model, solutions, rows, 0, history.seconds, statements, extra)
+    found = Identification(model, solutions, 0, history.seconds, extra=extra)
+    return found.with_checks(_statements(method, runs, task, history))
 
 
 def _as_solution(method: str, task: SearchTask, history: SearchHistory, family: str) -> Solution:
@@ -213,20 +199,19 @@ def _statements(
     gone = sum(history.lost.values())
     share = 100.0 * gone / history.evaluations
     parameters = len(task.model.parameters)
-    span = np.log10(task.high / task.low)
-    place = np.array([np.log10(history.values[n] / low) for n, low in zip(task.names, task.low)])  # noqa: B905
-    stuck = [
-        name
-        for name, x, width in zip(task.names, place, span, strict=True)
-        if min(x, width - x) < IDENTIFY.at_bound * width
-    ]
+    stuck = []
+    for name, low, high in zip(task.names, task.low, task.high, strict=True):
+        place, width = np.log10(history.values[name] / low), np.log10(high / low)
+        if min(place, width - place) < IDENTIFY.at_bound * width:
+            stuck.append(name)
     records = [record for run in runs for record in run.records]
     return (
         Check(
             "state exists",
             gone == 0,
             f"{gone} of {history.evaluations} candidates ({share:.1f} %) lost their state: "
-            f"{_failures(history)}; of the first {history.sizes[0]}, {history.lost_first}",
+            f"{_failures(history)}; of the first {history.sizes[0]}, "
+            f"{history.lost_by_generation[0]}",
         ),
         Check(
             "all parameters",
@@ -245,7 +230,7 @@ def _statements(
             "output error",
             True,
             f"best relative output error {history.error:.4g} (the first generation's best: "
-            f"{history.first:.4g}); another search may end at other values",
+            f"{history.errors[0]:.4g}); another search may end at other values",
         ),
     )
 
@@ -254,18 +239,19 @@ def history_json(
     task: SearchTask, history: SearchHistory, options: SearchOptions
 ) -> dict[str, Any]:
     """Return the search as plain data."""
+    errors = [e if e < IDENTIFY.failed_error else None for e in history.errors]
     return {
         "record": task.record,
         "windows": [w.first for w in task.windows],
         "window_seconds": options.seconds,
         "evaluations": history.evaluations,
         "lost": dict(history.lost),
-        "lost_first_generation": history.lost_first,
-        "lost_by_generation": list(history.lost_by_generation),
-        "generation_sizes": list(history.sizes),
-        "error_first_generation": history.first if history.first < IDENTIFY.failed_error else None,
+        "lost_first_generation": history.lost_by_generation[0],
+        "lost_by_generation": history.lost_by_generation,
+        "generation_sizes": history.sizes,
+        "error_first_generation": errors[0],
         "error": history.error,
-        "error_by_generation": [e if e < IDENTIFY.failed_error else None for e in history.errors],
+        "error_by_generation": errors,
         "bounds": {
             name: [float(a), float(b)]
             for name, a, b in zip(task.names, task.low, task.high, strict=True)

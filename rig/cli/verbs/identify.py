@@ -191,7 +191,7 @@ def identify(
     import numpy as np
 
     from analysis.identify.identify import identify as identify_runs
-    from analysis.identify.methods import SearchOptions
+    from analysis.identify.methods.search import SearchOptions
     from analysis.identify.result import to_json
     from analysis.regression.rows import FILTERINGS
     from rig.cli.proof.twin_choice import save_identified

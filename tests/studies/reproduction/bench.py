@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from analysis.identify.identify import identify
-from analysis.identify.methods import SearchOptions
+from analysis.identify.methods.search import SearchOptions
 from analysis.identify.result import Identification
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.simulation.validate import RecordValidation, validate
