@@ -62,7 +62,7 @@ class PortEffect(SignalEffect):
 def bulk_modulus(rig: Rig) -> float:
     """Return the rig's nominal bulk modulus [Pa], or a usual one of oil in hoses.
 
-    `analysis.identify.port_flows` sets the nominal one to the identified one.
+    `analysis.identify.coupled` sets the nominal one to the identified one.
     """
     return rig.nominal.get(BULK, BULK_MODULUS)
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from analysis.effects.supply import BULK, PortEffect
 from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
@@ -19,7 +20,7 @@ from analysis.identify.estimation import (
     Refinement,
     refine,
 )
-from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows, widened
+from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows
 from analysis.identify.reduction import (
     RecordReduction,
     record_checks,
@@ -83,6 +84,33 @@ def coupled(
     return replace(result, built=tuple(built))
 
 
+def with_identified_bulk_modulus(
+    runs: Sequence[Run], terms: Sequence[Used], *more: Sequence[Run]
+) -> tuple[tuple[Run, ...], ...]:
+    """Return `runs` and `more` with the b [Pa] identified from `runs` as their rigs' nominal one.
+
+    Effects on the pressure at the valves' ports need the flow through them, A s' + V p' / b, in the
+    rows from which b is identified; a nominal b may be wrong by a factor of 2. So b is identified
+    first under those of `terms` that do not need the flow. All are returned unchanged where b is no
+    parameter or not determined. Raises InputError as `coupled` does.
+    """
+    every = (tuple(runs), *map(tuple, more))
+    rig = runs[0].rig
+    own = tuple(used for used in terms if not isinstance(used.term, PortEffect))
+    if not any(c.parameter == BULK for used in own for c in used.term.parameters(rig)):
+        return every
+    b = coupled(runs, own, estimator="ls").estimates.get(BULK)
+    if b is None or not b.identified or b.value <= 0.0:
+        return every
+    value = b.value
+
+    def with_nominal(run: Run) -> Run:
+        nominal = {**run.rig.nominal, BULK: value}
+        return replace(run, rig=run.rig.model_copy(update={"nominal": nominal}))
+
+    return tuple(tuple(map(with_nominal, part)) for part in every)
+
+
 def conclude(
     rig: Rig,
     sources: Sequence[str],
@@ -106,9 +134,9 @@ def conclude(
     estimates, covariance = estimates_of(rig, used, solutions)
     if refinement.bootstrap:
         estimates = with_ends(estimates, refinement.bootstrap)
-    known = (geometry_check(rig, used, estimates, geometry),) if "fluid" in rig.families else ()
+    known = (geometry_check(estimates, geometry),) if "fluid" in rig.families else ()
     if geometry is not None:
-        estimates, covariance = widened(rig, used, estimates, covariance, geometry)
+        estimates, covariance = geometry.widened(estimates, covariance)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(reduction.masked for reduction in reductions)
     statements = (

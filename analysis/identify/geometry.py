@@ -28,7 +28,7 @@ from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.rows import Rows, parameters_of, record_rows
 from analysis.regression.solve import Accumulator, RowCluster, solve
 from analysis.signals.conditioning import of_other_geometry
-from analysis.simulation.model import Estimate
+from analysis.simulation.model import Estimate, finite
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model.rig import Rig
 from rig.model.tolerances import UncertainNumber
@@ -43,17 +43,58 @@ NAME = "geometry"
 class GeometryShifts:
     """Shifts of the rows' coefficients when each of J uncertain numbers is one sigma larger.
 
-    `shifts` holds (k, J) for each family, its coefficients in the order of `names`.
+    `shifts` holds (k, J) for each family, its coefficients in the order of `names`; those of the
+    parameters in `reciprocal` are 1/parameter.
     """
 
     numbers: tuple[UncertainNumber, ...]
     names: Mapping[str, tuple[str, ...]]
     shifts: Mapping[str, Array]
+    reciprocal: frozenset[str]
 
     def covariance(self, family: str) -> Array:
         """Return the covariance (k, k) that the numbers add to one family's coefficients."""
         shift = self.shifts[family]
         return np.asarray(shift @ shift.T)
+
+    def of_parameters(self, estimates: Mapping[str, Estimate]) -> Array:
+        """Return the shifts (k, J) of the parameters in the order of `estimates`, to first order.
+
+        For a reciprocal coefficient c = 1/b that is - b^2 dc; for a parameter that is not in the
+        rows 0.
+        """
+        order = {name: row for row, name in enumerate(estimates)}
+        S = np.zeros((len(order), len(self.numbers)))
+        for family, names in self.names.items():
+            for name, shift in zip(names, self.shifts[family], strict=True):
+                if name in order:
+                    slope = -(estimates[name].value ** 2) if name in self.reciprocal else 1.0
+                    S[order[name]] = slope * shift
+        return S
+
+    def uncertainties(self, estimates: Mapping[str, Estimate]) -> dict[str, float]:
+        """Return each parameter's standard uncertainty due to the numbers, by name."""
+        stds = np.linalg.norm(self.of_parameters(estimates), axis=1)
+        return dict(zip(estimates, map(float, stds), strict=True))
+
+    def widened(
+        self, estimates: Mapping[str, Estimate], covariance: Array
+    ) -> tuple[dict[str, Estimate], Array]:
+        """Return the estimates and their covariance (k, k) with the tolerances included."""
+        S, stds = self.of_parameters(estimates), self.uncertainties(estimates)
+        grown = {name: wider(estimate, stds[name]) for name, estimate in estimates.items()}
+        return grown, covariance + S @ S.T
+
+    def to_json(self, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+        """Return every number with its sigma and the shift of each parameter, in SI."""
+        S = self.of_parameters(estimates)
+        return {
+            number.name: {
+                "sigma": number.sigma,
+                "shifts": {n: finite(shift) for n, shift in zip(estimates, S[:, j], strict=True)},
+            }
+            for j, number in enumerate(self.numbers)
+        }
 
 
 def shifts_of_rows(
@@ -79,23 +120,6 @@ def shifts_of_reductions(
     return _shifts(rig, terms, _collected(reductions), [_collected(each) for each in moved])
 
 
-def widened(
-    rig: Rig,
-    terms: Sequence[Used],
-    estimates: Mapping[str, Estimate],
-    covariance: Array,
-    geometry: GeometryShifts,
-) -> tuple[dict[str, Estimate], Array]:
-    """Return the estimates and their covariance (k, k) with the tolerances included."""
-    S = parameter_shifts(rig, terms, estimates, geometry)
-    stds = np.linalg.norm(S, axis=1)
-    grown = {
-        name: wider(estimate, float(std))
-        for (name, estimate), std in zip(estimates.items(), stds, strict=True)
-    }
-    return grown, covariance + S @ S.T
-
-
 def wider(estimate: Estimate, std: float) -> Estimate:
     """Return an estimate with a standard deviation `std` added in quadrature to either side."""
     value, (low, high) = estimate.value, estimate.ci95
@@ -104,34 +128,7 @@ def wider(estimate: Estimate, std: float) -> Estimate:
     return replace(estimate, std=math.hypot(estimate.std, std), ci95=ends)
 
 
-def parameter_shifts(
-    rig: Rig,
-    terms: Sequence[Used],
-    estimates: Mapping[str, Estimate],
-    geometry: GeometryShifts,
-) -> Array:
-    """Return the shifts (k, J) of the parameters in the order of `estimates`, to first order.
-
-    For a reciprocal coefficient c = 1/b that is - b^2 dc; for a parameter that is not in the rows
-    0.
-    """
-    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
-    order = {name: row for row, name in enumerate(estimates)}
-    S = np.zeros((len(order), len(geometry.numbers)))
-    for family, names in geometry.names.items():
-        for name, shift in zip(names, geometry.shifts[family], strict=True):
-            if name in order:
-                slope = -(estimates[name].value ** 2) if coefficients[name].reciprocal else 1.0
-                S[order[name]] = slope * shift
-    return S
-
-
-def geometry_check(
-    rig: Rig,
-    terms: Sequence[Used],
-    estimates: Mapping[str, Estimate],
-    geometry: GeometryShifts | None,
-) -> Check:
+def geometry_check(estimates: Mapping[str, Estimate], geometry: GeometryShifts | None) -> Check:
     """State, for every kind of tolerance, the number and parameter with the largest shift.
 
     Without tolerances (`geometry` None), state that the rig file's numbers are taken as exact:
@@ -144,7 +141,7 @@ def geometry_check(
             "areas, volumes and pin distances of the rig file are taken as exact: records may not "
             "show that one is wrong; state `tolerances` to have them in the intervals",
         )
-    S = parameter_shifts(rig, terms, estimates, geometry)
+    S = geometry.of_parameters(estimates)
     value = np.array([estimate.value for estimate in estimates.values()])
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.nan_to_num(S / np.abs(value)[:, None], nan=0.0, posinf=0.0, neginf=0.0)
@@ -173,26 +170,6 @@ def tolerances_ignored(rig: Rig, method: str) -> Check:
         f"the intervals of the method {method} take the geometry of {rig.name!r} as exact; "
         "--method coupled includes the tolerances of the rig file",
     )
-
-
-def to_json(
-    rig: Rig,
-    terms: Sequence[Used],
-    estimates: Mapping[str, Estimate],
-    geometry: GeometryShifts,
-) -> dict[str, Any]:
-    """Return every uncertain number with its sigma and the shift of each parameter, in SI."""
-    S = parameter_shifts(rig, terms, estimates, geometry)
-    return {
-        number.name: {
-            "sigma": number.sigma,
-            "shifts": {
-                name: float(shift) if math.isfinite(shift) else None
-                for name, shift in zip(estimates, S[:, j], strict=True)
-            },
-        }
-        for j, number in enumerate(geometry.numbers)
-    }
 
 
 def _rows_again(
@@ -229,7 +206,8 @@ def _shifts(rig: Rig, terms: Sequence[Used], own: Parts, moved: Sequence[Parts])
         ) - _solved(columns, own[family])[:, None]
         for family, columns in names.items()
     }  # fmt: skip
-    return GeometryShifts(rig.uncertain_numbers, names, shifts)
+    reciprocal = {c.parameter for u in terms for c in u.term.coefficients(rig) if c.reciprocal}
+    return GeometryShifts(rig.uncertain_numbers, names, shifts, frozenset(reciprocal))
 
 
 def _solved(names: Sequence[str], parts: Sequence[Part]) -> Array:

@@ -9,14 +9,13 @@ import numpy as np
 
 from analysis.effects.supply import PortEffect
 from analysis.identify import checks as ck
-from analysis.identify.coupled import coupled
+from analysis.identify.coupled import coupled, with_identified_bulk_modulus
 from analysis.identify.estimation import refuse_unknown
 from analysis.identify.geometry import tolerances_ignored
 from analysis.identify.methods.search import SearchOptions
 from analysis.identify.methods.sequential import sequential
 from analysis.identify.methods.simultaneous import simultaneous
 from analysis.identify.methods.swarm import search_parameters
-from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from analysis.identify.checks import Check
-from analysis.identify.geometry import GeometryShifts, widened
+from analysis.identify.geometry import GeometryShifts
 from analysis.identify.result import Identification, estimates_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.constrained import Feasible, Minimum, minimise
@@ -175,10 +175,10 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
             free = replace(solution, covariance=solution.covariance + geometry.covariance(family))
         costs[family] = _cost(rig, free, X, y, minimum)
     estimates, covariance = estimates_of(rig, result.model.terms, solutions)
-    held = None if geometry is None else replace(geometry, shifts=shifts)
-    if held is not None:
-        estimates, covariance = widened(rig, result.model.terms, estimates, covariance, held)
-    return Level(name, estimates, covariance, costs, held)
+    if geometry is not None:
+        geometry = replace(geometry, shifts=shifts)
+        estimates, covariance = geometry.widened(estimates, covariance)
+    return Level(name, estimates, covariance, costs, geometry)
 
 
 def _constrained(solution: Solution, P: Array, minimum: Minimum) -> Solution:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import geometry as geo
 from analysis.identify.checks import Check
+from analysis.identify.geometry import GeometryShifts
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.solve import Solution, half_width
@@ -38,7 +38,7 @@ class Identification:
     checks: tuple[Check, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
     built: tuple[RecordRows, ...] = field(default=(), repr=False, compare=False)
-    geometry: geo.GeometryShifts | None = field(default=None, repr=False, compare=False)
+    geometry: GeometryShifts | None = field(default=None, repr=False, compare=False)
 
     @property
     def method(self) -> str:
@@ -64,13 +64,12 @@ class Identification:
 
 def to_json(result: Identification) -> dict[str, Any]:
     """Return the identification as JSON data; null where a number does not exist."""
-    geometry, model = {}, result.model
+    geometry = {}
     if result.geometry is not None:
-        shifts = geo.to_json(model.rig, model.terms, result.estimates, result.geometry)
-        geometry = {"geometry": shifts}
+        geometry = {"geometry": result.geometry.to_json(result.estimates)}
     return {
         "method": result.method,
-        "estimator": str(model.provenance.get("estimator", PLAIN)),
+        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()
@@ -83,15 +82,6 @@ def to_json(result: Identification) -> dict[str, Any]:
         **geometry,
         **result.extra,
     }
-
-
-def by_geometry(result: Identification) -> dict[str, float]:
-    """Return each parameter's standard uncertainty due to the rig's tolerances, by name."""
-    if result.geometry is None:
-        return {}
-    model = result.model
-    S = geo.parameter_shifts(model.rig, model.terms, result.estimates, result.geometry)
-    return dict(zip(result.estimates, map(float, np.linalg.norm(S, axis=1)), strict=True))
 
 
 def estimates_of(

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, ordered
 from analysis.effects.mechanics import Payload
 from analysis.identify import checks as ck
+from analysis.identify.coupled import with_identified_bulk_modulus
 from analysis.identify.geometry import NAME as GEOMETRY
-from analysis.identify.port_flows import with_identified_bulk_modulus
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used

@@ -11,7 +11,7 @@ import numpy as np
 from analysis.effects.base import Effect, ordered
 from analysis.identify.coupled import coupled
 from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
-from analysis.identify.result import Identification, by_geometry, reciprocal_interval
+from analysis.identify.result import Identification, reciprocal_interval
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
 from analysis.simulation.model import Estimate, Model
@@ -170,7 +170,9 @@ def _identified_with_effects(
     found = identified(runs, (*train_data.terms, *winner.effects), rows.filters_like)
     shift = form_shift(train_data, winner.fit)
     model = with_form_errors(train_data, winner.fit, found.model, shift)
-    return at_nominal_temperature(model), by_geometry(found)
+    geometry = found.geometry
+    by_geometry = {} if geometry is None else geometry.uncertainties(found.estimates)
+    return at_nominal_temperature(model), by_geometry
 
 
 def identified(

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify.geometry import parameter_shifts
 from analysis.identify.identify import identify
 from analysis.identify.physical import physical, with_physics
 from analysis.identify.result import PLAIN, Identification, to_json
@@ -37,8 +36,7 @@ def stating(run: Run, tolerances: Tolerances | None) -> Run:
 def shifts(result: Identification) -> dict[str, np.ndarray]:
     """Return the shifts of each parameter by the uncertain numbers."""
     assert result.geometry is not None
-    model = result.model
-    S = parameter_shifts(model.rig, model.terms, result.estimates, result.geometry)
+    S = result.geometry.of_parameters(result.estimates)
     return dict(zip(result.estimates, S, strict=True))
 
 
@@ -204,11 +202,11 @@ def test_consistent_parameters_keep_the_tolerances(
         assert estimate.std == pytest.approx(np.hypot(free[name].std, more))
         assert np.linalg.norm(shifts(given)[name]) == pytest.approx(more)
     # What rigid bodies hold, R12 = l1 W2, no number of the rig file moves apart.
-    model, rigid = stated.model, physical(stated).levels[1]
+    rigid = physical(stated).levels[1]
     assert rigid.geometry is not None
-    S = parameter_shifts(model.rig, model.terms, rigid.estimates, rigid.geometry)
+    S = rigid.geometry.of_parameters(rigid.estimates)
     by_name = dict(zip(rigid.estimates, S, strict=True))
-    length = model.rig.joints[0].link_length
+    length = stated.model.rig.joints[0].link_length
     assert by_name["R12"] == pytest.approx(length * by_name["W2"], rel=1e-6)
     assert np.linalg.norm(by_name["W2"]) > 0.0
     # The paper's link length is rejected still, by fewer standard errors.
