@@ -29,25 +29,16 @@ from analysis.identify.estimators.instruments import (
     instrumental_variables,
     steps_without_instruments,
 )
-from analysis.identify.estimators.prior_rows import (
-    PriorRow,
-    prior_rows,
-    spread_with_priors,
-    with_prior_rows,
-)
-from analysis.identify.estimators.robust import robust
+from analysis.identify.estimators.robust import outlier_statement, robust
 from analysis.identify.estimators.shifts import (
     including,
     largest_shift,
+    noise_statement,
+    nuisance_statement,
     predicted_shift,
     shift_without,
     shifts_of,
     significant_shift,
-)
-from analysis.identify.estimators.statements import (
-    noise_statement,
-    nuisance_statement,
-    outlier_statement,
 )
 from analysis.identify.estimators.weighted import weighted_least_squares
 from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, with_columns
@@ -110,7 +101,6 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
     InputError for an estimator that needs repeats where a step has only one.
     """
-    refuse_unknown(job.estimator)
     counted = repeats_in_motion(
         job.rig, ((rows.conditioned.run, rows.record) for rows in job.built)
     )
@@ -127,36 +117,31 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
             f"row: {' '.join(single)}. Record more repeats (bramah run --repeats 4), or use "
             "--estimator output-error"
         )
+    estimator = "ls" if job.estimator == "auto" else job.estimator
+    plain = {p.family: _solve(p, "ls") for p in prepared}
     tests = {} if single else {p.family: _hausman(p) for p in prepared}
-    estimator = job.estimator
-    fits = {p.family: _solve(p, "ls" if estimator == "auto" else estimator) for p in prepared
-             if estimator != OUTPUT_ERROR}  # fmt: skip
     if not single:
-        plain = fits if estimator in ("ls", "auto") else None
-        reference = plain or {p.family: _solve(p, "ls") for p in prepared}
-        statement = noise_statement(shifts_of(prepared, tests, reference))
-        if estimator == "auto":
-            estimator = "ls" if statement.ok else "iv"
-            if not statement.ok:
-                fits = {p.family: _solve(p, "iv") for p in prepared}
+        errors = {family: error for family, (_, error, _) in plain.items()}
+        statement = noise_statement(shifts_of(prepared, tests, errors))
+        if job.estimator == "auto" and not statement.ok:
+            estimator = "iv"
         if not statement.ok and estimator in UNBIASED:
             words = "; the values given are those of instrumental variables instead"
             statement = replace(statement, ok=True, detail=statement.detail + words)
         checks.append(statement)
-    elif estimator == "auto":
-        estimator = "ls"
     if estimator == OUTPUT_ERROR:
         from analysis.identify.output_error.fit import output_error  # noqa: PLC0415 - compiles
 
         values = {
             name: float(v)
             for p in prepared
-            for name, v in zip(p.names, _solve(p, "ls")[0], strict=False)
+            for name, v in zip(p.names, plain[p.family][0], strict=False)
         }
         done = output_error(job.rig, job.runs, job.terms, values)
         checks.append(done.check)
-        new = {family: done.solution(family, solution) for family, solution in solutions.items()}
+        new = {f: merged(s, done.names, done.value, done.spread) for f, s in solutions.items()}
         return Refinement(new, tuple(checks), estimator)
+    fits = plain if estimator == "ls" else {p.family: _solve(p, estimator) for p in prepared}
     new = dict(solutions)
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
@@ -187,12 +172,11 @@ def _bootstrap_ends(
     rows = _prior_rows(p, kind(p.blocks), estimator)
 
     def estimate(blocks: Sequence[RepeatBlock]) -> Array:
-        return with_prior_rows(kind(blocks), rows).beta[: p.parameters]
+        return nu.with_prior_rows(kind(blocks), rows).beta[: p.parameters]
 
-    drawn = bootstrap(p.blocks, estimate, job.bootstrap, rng)
+    low, high = bootstrap(p.blocks, estimate, job.bootstrap, rng)
     # Towards the estimate by instruments, or with the nuisances that are left out.
-    low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
-    high = drawn.high[: p.parameters] - np.minimum(shift, 0.0)
+    low, high = low - np.maximum(shift, 0.0), high - np.minimum(shift, 0.0)
     ends = zip(p.names, low, high, strict=False)
     return {name: (float(a), float(b)) for name, a, b in ends}
 
@@ -273,33 +257,31 @@ def _family(
 def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:
     fit = _FITS[estimator](p.blocks)
     rows = _prior_rows(p, fit, estimator)
-    fit = with_prior_rows(fit, rows)
-    error = spread_with_priors(fit, rows)
-    return fit.beta[: p.parameters], _first(error, p.parameters), fit
+    fit = nu.with_prior_rows(fit, rows)
+    error, k = nu.spread_with_priors(fit, rows), p.parameters
+    error = CovarianceParts(error.covariance[:k, :k], error.dof[:k], error.systematic[:k])
+    return fit.beta[:k], error, fit
 
 
-def _prior_rows(p: FamilyBlocks, fit: EquationFit, estimator: str) -> tuple[PriorRow, ...]:
+def _prior_rows(p: FamilyBlocks, fit: EquationFit, estimator: str) -> tuple[nu.PriorRow, ...]:
     """Return the rows of prior knowledge beside those of a fit that is not joined with them."""
     plain = least_squares(fit.blocks) if estimator == "iv" else fit
-    return prior_rows(plain, nu.priors(p.names, plain.beta))
+    return nu.prior_rows(plain, nu.priors(p.names, plain.beta))
 
 
 def _hausman(p: FamilyBlocks) -> Hausman:
     plain = least_squares(common(p.blocks))
-    return hausman(plain, prior_rows(plain, nu.priors(p.names, plain.beta)))
-
-
-def _first(s: CovarianceParts, k: int) -> CovarianceParts:
-    return CovarianceParts(s.covariance[:k, :k], s.dof[:k], s.systematic[:k])
+    return hausman(plain, _prior_rows(p, plain, "ls"))
 
 
 def merged(
     solution: Solution, names: Sequence[str], beta: Array, error: CovarianceParts
 ) -> Solution:
-    """Return the solution with new values, covariance and dof for the parameters `names`."""
-    place = [solution.names.index(n) for n in names]
+    """Return the solution with new values, covariance and dof for those of `names` that it has."""
+    known = [k for k, name in enumerate(names) if name in solution.names]
+    place = [solution.names.index(names[k]) for k in known]
     value, dof = solution.value.copy(), solution.dof.copy()
     covariance = solution.covariance.copy()
-    value[place], dof[place] = beta, error.dof
-    covariance[np.ix_(place, place)] = error.covariance
+    value[place], dof[place] = beta[known], error.dof[known]
+    covariance[np.ix_(place, place)] = error.covariance[np.ix_(known, known)]
     return replace(solution, value=value, covariance=covariance, dof=dof)

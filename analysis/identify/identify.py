@@ -10,7 +10,7 @@ import numpy as np
 from analysis.effects.supply import PortEffect
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled, with_identified_bulk_modulus
-from analysis.identify.estimation import refuse_unknown
+from analysis.identify.estimation import OUTPUT_ERROR, refuse_unknown
 from analysis.identify.geometry import tolerances_ignored
 from analysis.identify.methods.search import SearchOptions
 from analysis.identify.methods.sequential import sequential
@@ -89,5 +89,5 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
             f"{bootstrap} bootstrap draws are too few for a 95 % interval; "
             f"take {IDENTIFY.least_draws} or more"
         )
-    if bootstrap and estimator in (PLAIN, "output-error"):
+    if bootstrap and estimator in (PLAIN, OUTPUT_ERROR):
         raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")

@@ -12,9 +12,13 @@ from analysis.identify.estimation import EstimationJob, _bootstrap_ends
 from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman, instrumental_variables
-from analysis.identify.estimators.nuisance import BETWEEN, TAU, Prior, implausible, priors
-from analysis.identify.estimators.prior_rows import (
+from analysis.identify.estimators.nuisance import (
+    BETWEEN,
+    TAU,
+    Prior,
+    implausible,
     prior_rows,
+    priors,
     spread_with_priors,
     with_prior_rows,
 )
@@ -22,11 +26,12 @@ from analysis.identify.estimators.shifts import (
     Shift,
     including,
     largest_shift,
+    noise_statement,
+    nuisance_statement,
     shift_without,
     shifts_of,
     significant_shift,
 )
-from analysis.identify.estimators.statements import noise_statement, nuisance_statement
 from analysis.identify.identify import identify
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
@@ -59,7 +64,7 @@ def test_a_shift_must_be_certain_and_large_to_speak_against_least_squares(case: 
     fit = least_squares(blocks)
     test = hausman(fit)
     error = spread([pieces(fit)], fit.inverse)
-    (shift,) = shifts_of([p], {"mechanical": test}, {"mechanical": (fit.beta, error, fit)})
+    (shift,) = shifts_of([p], {"mechanical": test}, {"mechanical": error})
     assert (shift.significant, shift.material) == (certain, large)
     said = noise_statement([shift])
     assert said.ok is not (certain and large)

@@ -11,7 +11,7 @@ Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), sec
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,32 +22,22 @@ from analysis.identify.estimators.equations import RepeatBlock, rows_of
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class BootstrapScatter:
-    """Bootstrapped standard error (k,) and the 95 % interval's ends (k,) in rows' coefficients."""
-
-    std: Array
-    low: Array
-    high: Array
-
-
 def bootstrap(
     blocks: Sequence[RepeatBlock],
     estimate: Callable[[Sequence[RepeatBlock]], Array],
     draws: int,
     rng: np.random.Generator,
-) -> BootstrapScatter:
-    """Return the scatter of `estimate` over `draws` resampled sets of blocks."""
+) -> tuple[Array, Array]:
+    """Return the ends (k,) of the 95 % intervals of `estimate`, from `draws` sets of blocks."""
     value = estimate(blocks)
     drawn = np.array([estimate(_resampled(blocks, rng)) for _ in range(draws)])
-    n = min(len(members) for members in _units(blocks).values())
+    counts = [len(members) for members in _units(blocks).values()]
+    n = min(counts)
     stretch = np.sqrt(n / max(n - 1, 1))
     if n > 1:
-        dof = sum(len(m) - 1 for m in _units(blocks).values())
-        stretch *= stdtrit(dof, 0.975) / ndtri(0.975)
+        stretch *= stdtrit(sum(counts) - len(counts), 0.975) / ndtri(0.975)
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0) - value
-    std = np.sqrt(n / max(n - 1, 1)) * drawn.std(axis=0, ddof=1)
-    return BootstrapScatter(std, value + stretch * low, value + stretch * high)
+    return value + stretch * low, value + stretch * high
 
 
 def _units(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str], list[tuple[int, int]]]:

@@ -266,18 +266,6 @@ def _state(b: RepeatBlock, record: Record) -> Array:
     return np.asarray(np.interp(b.time, record.time, smooth))
 
 
-def residual_scatter(blocks: Sequence[RepeatBlock], residuals: Sequence[Array]) -> list[Array]:
-    """Return each block's residuals minus the mean over its repeats, scaled to the noise.
-
-    The blocks must share their rows (`common`). With n repeats the deviations are sqrt((n-1)/n) of
-    the noise; this is corrected.
-    """
-    return [
-        (e - total / n) * np.sqrt(n / max(n - 1, 1))
-        for e, (total, n) in zip(residuals, over_repeats(blocks, residuals), strict=True)
-    ]
-
-
 def over_repeats(blocks: Sequence[RepeatBlock], arrays: Sequence[Array]) -> list[tuple[Array, int]]:
     """Return, for each block, the sum of its repeats' arrays and the number of repeats.
 

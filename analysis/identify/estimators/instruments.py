@@ -27,7 +27,7 @@ from analysis.identify.estimators.equations import (
     shared_ticks,
     solve,
 )
-from analysis.identify.estimators.prior_rows import PriorRow, with_prior_rows
+from analysis.identify.estimators.nuisance import PriorRow, with_prior_rows
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import stratified
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify.checks import Check
 from analysis.identify.estimators.equations import EquationFit, RepeatBlock, alike, least_squares
 from analysis.identify.settings import IDENTIFY
 
@@ -38,12 +39,19 @@ def robust(blocks: Sequence[RepeatBlock]) -> EquationFit:
     return fit
 
 
-def outlying(fit: EquationFit) -> dict[str, float]:
-    """Return the share of rows that have lost nine tenths of their weight, by record."""
+def outlier_statement(family: str, fit: EquationFit) -> Check:
+    """State the share of rows that have lost nine tenths of their weight, in the worst record."""
     lost: dict[str, list[float]] = {}
     for b, w in zip(fit.blocks, fit.w, strict=True):
         lost.setdefault(b.record, []).append(float(np.mean(w < 0.1)))
-    return {record: float(np.mean(shares)) for record, shares in lost.items()}
+    shares = {record: float(np.mean(of_equations)) for record, of_equations in lost.items()}
+    worst = max(shares, key=lambda record: shares[record])
+    return Check(
+        f"outliers {family}",
+        shares[worst] < IDENTIFY.few_outliers,
+        f"{100 * shares[worst]:.2g} % of the rows of record {worst!r} lie far outside the scatter "
+        "and were left out (the worst record)",
+    )
 
 
 def _huber(r: Array) -> Array:

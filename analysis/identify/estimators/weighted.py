@@ -17,7 +17,7 @@ from analysis.identify.estimators.equations import (
     RepeatBlock,
     common,
     least_squares,
-    residual_scatter,
+    over_repeats,
 )
 from analysis.identify.settings import IDENTIFY
 from rig.model.parse import InputError
@@ -30,15 +30,21 @@ def weighted_least_squares(blocks: Sequence[RepeatBlock]) -> EquationFit:
     blocks = common(blocks)
     fit = least_squares(blocks)
     for _ in range(IDENTIFY.weight_rounds):
-        whitened = _whitened(blocks, replace(fit, blocks=tuple(blocks)))
-        fit = least_squares(whitened)
+        fit = least_squares(_whitened(blocks, fit.beta))
     return fit
 
 
-def _whitened(blocks: Sequence[RepeatBlock], fit: EquationFit) -> list[RepeatBlock]:
-    """Return the blocks with unit noise, those of a pair of chambers mixed by inv(cholesky)."""
-    residuals = fit.residuals()
-    deviation = residual_scatter(blocks, residuals)
+def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
+    """Return the blocks with unit noise, those of a pair of chambers mixed by inv(cholesky).
+
+    The noise is that of y - X beta. With n repeats the deviations from their mean are
+    sqrt((n-1)/n) of it; this is corrected.
+    """
+    residuals = [b.y - b.X @ beta for b in blocks]
+    deviation = [
+        (e - total / n) * np.sqrt(n / max(n - 1, 1))
+        for e, (total, n) in zip(residuals, over_repeats(blocks, residuals), strict=True)
+    ]
     place = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
     factors: dict[tuple[int, str, str], Array] = {}
     out = list(blocks)

@@ -12,7 +12,7 @@ Bock (1981) and Schloeder; Ljung, System Identification (1999), section 3.6.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from analysis.identify.estimators.equations import Pieces
 from analysis.identify.output_error.windows import ReducedWindow, Windows
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import scaled_inverse
-from analysis.regression.solve import Solution
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -41,16 +40,6 @@ class OutputErrorFit:
     value: Array
     spread: CovarianceParts
     check: Check
-
-    def solution(self, family: str, solution: Solution) -> Solution:
-        """Return the family's solution with these values, covariance and dof."""
-        place = [self.names.index(n) for n in solution.names]
-        return replace(
-            solution,
-            value=self.value[place],
-            covariance=self.spread.covariance[np.ix_(place, place)],
-            dof=self.spread.dof[place],
-        )
 
 
 def output_error(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import beta as beta_law
 
-from analysis.identify.estimators.statements import NOISE_CHECK
+from analysis.identify.estimators.shifts import NOISE_CHECK
 from analysis.identify.result import Identification
 
 GOAL = (0.92, 0.98)
