@@ -54,8 +54,7 @@ def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
                 f"{runs[0].source or 'the first run'} and {run.source or 'another'} are of "
                 f"different rigs: {difference}; identify them apart"
             )
-    joints = set(range(1, len(runs[0].rig.joints) + 1))
-    if all(joints <= set(record.locked) for run in runs for record in run.records):
+    if all(is_hold(run.rig, record) for run in runs for record in run.records):
         raise InputError(
             "every record has every joint locked: nothing moved, so nothing can be identified; "
             "record a step that excites a joint"
@@ -75,14 +74,12 @@ def spans_of(record: Record) -> dict[str, tuple[float, float]]:
 
 
 def refuse_constant_channels(
-    rig: Rig, record: Record | RecordHead, spans: Mapping[str, tuple[float, float]] | None = None
+    rig: Rig, record: Record | RecordHead, spans: Mapping[str, tuple[float, float]]
 ) -> None:
     """Raise InputError for an excited joint that never moved or a channel that is constant.
 
-    `spans` are the channels' extremes, for a record of which only the head is in memory.
+    `spans` are the smallest and the largest sample of the record's channels (`spans_of`).
     """
-    if spans is None:
-        spans = spans_of(record) if isinstance(record, Record) else {}
     for i in range(1, len(rig.joints) + 1):
         if i in record.locked:
             continue
@@ -117,7 +114,7 @@ def refuse_constant_records(rig: Rig, runs: Iterable[Run]) -> None:
     """Raise InputError for a constant channel in a record (`refuse_constant_channels`)."""
     for run in runs:
         for record in run.records:
-            refuse_constant_channels(rig, record)
+            refuse_constant_channels(rig, record, spans_of(record))
 
 
 def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:

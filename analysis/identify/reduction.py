@@ -1,15 +1,14 @@
 """One record reduced to the quantities that an identification needs: triangles, counts, noise.
 
-A reduction has a few kilobytes for any length of the record. It is made where the samples are (in
-this process, in another, on a worker of a cluster) and only it is sent on;
-`analysis.identify.coupled` joins the reductions of all records. Every record is kept in SEGMENTS
-parts of its duration: a step of one record has no repeats to compare, and compares its parts.
+A reduction has a few kilobytes for any length of the record; `analysis.identify.coupled` joins
+those of all records. Every record is kept in `record_segments` parts of its duration: a step of one
+record has no repeats to compare, and compares its parts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -18,22 +17,15 @@ from numpy.typing import NDArray
 from analysis.identify import checks as ck
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, repeats_of
-from analysis.regression.chunks import InMemory, Source, divisible, source_rows
-from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import record_moments
 from analysis.regression.nonlinear import reduced
-from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
-from analysis.regression.settings import REGRESSION
+from analysis.regression.rows import Rows, parameters_of
 from analysis.regression.solve import Accumulator, RowCluster, Solution, solve
-from analysis.signals.conditioning import condition, lost_samples
-from analysis.signals.locks import motion_bands
-from analysis.signals.settings import SIGNALS
+from analysis.signals.conditioning import lost_samples
 from analysis.terms.base import FAMILIES, Used, family_of
-from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.records import Record, RecordHead, head_of
+from rig.model.records import RecordHead, head_of
 from rig.model.rig import Rig
-from rig.runs.stream import open_record
 
 Array = NDArray[np.float64]
 Part = tuple[Array, int]  # triangle (k+1, k+1) of [X y] and its rows
@@ -56,68 +48,6 @@ class RecordReduction:
     noise: Mapping[str, Array] | None = None
 
 
-@dataclass(frozen=True)
-class RecordTask:
-    """A record to reduce, by its path; picklable as long as terms and filtering are."""
-
-    rig: Rig
-    run: int
-    path: str
-    record: str
-    terms: tuple[Used, ...]
-    filtering: Callable[[Record], Filtering]
-    with_noise: bool
-    stretch: int = REGRESSION.chunk_samples
-    bands: tuple[float, ...] | None = None
-
-
-def reduce_task(task: RecordTask) -> RecordReduction:
-    """Reduce a record of a run folder; raises InputError naming record and channel."""
-    with open_record(task.path, task.record) as reader:
-        short = reader.head.samples <= task.stretch
-        source: Source = InMemory(reader.read()) if short else reader
-        return reduce_record(
-            task.rig, task.run, source, task.terms, task.filtering, task.with_noise, task.stretch,
-            None if task.bands is None else np.array(task.bands),
-        )  # fmt: skip
-
-
-def reduce_tasks(tasks: Sequence[RecordTask]) -> list[RecordReduction]:
-    """Reduce records of run folders one after the other; raises InputError as `reduce_task`."""
-    return [reduce_task(task) for task in tasks]
-
-
-@dataclass(frozen=True)
-class StepTask:
-    """The repeats of one step of a run folder, to find which joints move in it."""
-
-    rig: Rig
-    path: str
-    step: str
-    records: tuple[str, ...]
-
-
-def steps_of(rig: Rig, path: str, heads: Sequence[RecordHead]) -> list[StepTask]:
-    """Return the steps with a locked joint, whose repeats decide together which joints move."""
-    names: dict[str, list[str]] = {}
-    for head in heads:
-        names.setdefault(head.step, []).append(head.name)
-    locked = {head.step for head in heads if head.locked}
-    return [StepTask(rig, path, step, tuple(n)) for step, n in names.items() if step in locked]
-
-
-def bands_task(task: StepTask) -> tuple[float, ...]:
-    """Return the band (N,) [Hz] in which each joint moves in a step; keeps only positions."""
-    repeats = []
-    for name in task.records:
-        with open_record(task.path, name) as reader:
-            record = reader.read(0, min(reader.head.samples, SIGNALS.deciding_samples))
-            places = [ch.channel(task.rig.position_kind, i) for i in record.locked]
-            channels = {n: x for n, x in record.channels.items() if n in places}
-            repeats.append(replace(record, channels=channels))
-    return tuple(map(float, motion_bands(task.rig, repeats)))
-
-
 def reduce_rows(
     rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows]
 ) -> list[RecordReduction]:
@@ -130,7 +60,7 @@ def reduce_rows(
             disturbed.add(item.group)
             noise = record_moments(rig, terms, item.conditioned, item.rows)
         duration = record.samples / record.sample_rate
-        parts, masked = _folded(rig, terms, [item.rows], duration)
+        parts, masked = folded(rig, terms, [item.rows], duration)
         lost = int(lost_samples(rig, record).any(axis=1).sum())
         clipped = ck.clipped_counts(rig, record)
         run = item.conditioned.run
@@ -138,49 +68,7 @@ def reduce_rows(
     return out
 
 
-def first_of_steps(records: Sequence[Record | RecordHead]) -> set[str]:
-    """Return the names of the records whose noise represents all repeats of their step."""
-    first: dict[str, str] = {}
-    for record in records:
-        first.setdefault(record.step, record.name)
-    return set(first.values())
-
-
-def reduce_record(
-    rig: Rig,
-    run: int,
-    source: Source,
-    terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-    with_noise: bool,
-    stretch: int,
-    bands: Array | None = None,
-) -> RecordReduction:
-    """Reduce one record, a long one chunk by chunk; raises InputError for an unusable one.
-
-    `bands` (N,) [Hz] is the decision for all repeats of its step (`analysis.signals.locks`), by
-    default of this record alone.
-    """
-    head = source.head
-    filters = filtering(source.read(0, min(head.samples, stretch)))
-    lost, clipped = _inspect(rig, source, stretch)
-    if bands is None:
-        bands = motion_bands(rig, [source.read(0, min(head.samples, SIGNALS.deciding_samples))])
-    chunks = source_rows(rig, terms, source, filters, bands, stretch)
-    parts, masked = _folded(rig, terms, chunks, head.samples / head.sample_rate)
-    noise = None
-    if with_noise:
-        # The first chunk represents a long record.
-        count = min(head.samples, stretch) if divisible(filters) else head.samples
-        part = source.read(0, count)
-        signals = condition(rig, part, filters.channels, bands)
-        rows = record_rows(rig, terms, signals, filters)
-        moments = record_moments(rig, terms, ConditionedRecord(run, part, signals, filters), rows)
-        noise = {family: moment * (head.samples / count) for family, moment in moments.items()}
-    return RecordReduction(run, head, parts, masked, lost, clipped, noise)
-
-
-def _folded(
+def folded(
     rig: Rig, terms: Sequence[Used], chunks: Iterable[Mapping[str, Rows]], duration: float
 ) -> tuple[dict[str, tuple[Part, ...]], int]:
     """Return a triangle per family and part of a record of `duration` [s], and masked rows."""
@@ -207,23 +95,6 @@ def parts_of(rows: Rows, duration: float) -> list[slice]:
     )
     ends = [0, *map(int, edges), len(rows.time)]
     return [slice(a, b) for a, b in pairwise(ends)]
-
-
-def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int]]:
-    """Count lost and clipped samples; raises InputError for a constant channel or joint."""
-    head = source.head
-    lost, clipped = 0, dict[str, int]()
-    spans: dict[str, tuple[float, float]] = {}
-    for first in range(0, head.samples, stretch):
-        part = source.read(first, min(first + stretch, head.samples))
-        lost += int(lost_samples(rig, part).any(axis=1).sum())
-        for name, count in ck.clipped_counts(rig, part).items():
-            clipped[name] = clipped.get(name, 0) + count
-        for name, (low, high) in ck.spans_of(part).items():
-            before = spans.get(name, (np.inf, -np.inf))
-            spans[name] = (min(low, before[0]), max(high, before[1]))
-    ck.refuse_constant_channels(rig, head, spans)
-    return lost, clipped
 
 
 def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:

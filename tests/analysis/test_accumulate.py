@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy.linalg import lstsq
 
 from analysis.identify.identify import identify
-from analysis.identify.reduction import reduce_record, reduce_rows, solve_reductions
+from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.stacked_rows import build_rows
-from analysis.identify.streams.out_of_core import identify_folders
+from analysis.identify.streams.out_of_core import RecordTask, identify_folders, reduce_record
 from analysis.regression.chunks import InMemory, source_rows
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.regression.solve import Accumulator, triangle
@@ -174,7 +174,12 @@ def test_long_records_reduce_to_the_same_solution(multisine_run: Run, rig: Rig) 
             rig,
             TERMS,
             [
-                reduce_record(rig, 0, InMemory(r), TERMS, default_filtering, False, stretch)
+                reduce_record(
+                    RecordTask(
+                        rig, 0, "", r.name, TERMS, default_filtering, False, stretch=stretch
+                    ),
+                    InMemory(r),
+                )
                 for r in runs[0].records
             ],
         )

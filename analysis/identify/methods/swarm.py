@@ -81,7 +81,7 @@ def search_parameters(
     """
     rig = ck.common_rig(runs)
     record = single_joint_record(runs)
-    ck.refuse_constant_channels(rig, record)
+    ck.refuse_constant_channels(rig, record, ck.spans_of(record))
     task = make_task(rig, record, terms, filtering(record), options)
     history = run_search(method, task, options, rng)
     if history.error >= IDENTIFY.failed_error:

@@ -68,19 +68,6 @@ class _Record:
         return self.measured - np.column_stack([simulated[n] for n in self.names])[self.here]
 
 
-class FreeRuns:
-    """The free runs of all records under a model's parameters."""
-
-    def __init__(self, rig: Rig, runs: Sequence[Run], terms: Sequence[Used]) -> None:
-        self.rig, self.terms = rig, tuple(terms)
-        self.records = [_Record(rig, record) for record in condition_runs(rig, runs)]
-
-    def residual(self, values: Mapping[str, float]) -> list[Array]:
-        """Return every record's measured less simulated positions (n, F)."""
-        model = model_of(self.rig, self.terms, values)
-        return [record.residual(model) for record in self.records]
-
-
 def free_run_fit(
     rig: Rig, runs: Sequence[Run], terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Solution], Check]:
@@ -92,12 +79,13 @@ def free_run_fit(
     """
     (solution,) = solutions.values()
     refuse_undetermined(list(solution.unidentifiable))
-    ready = FreeRuns(rig, runs, terms)
+    records = [_Record(rig, record) for record in condition_runs(rig, runs)]
     scale = np.abs(solution.value)
 
     def stacked(share: Array) -> Array:
-        errors = ready.residual(dict(zip(solution.names, map(float, share * scale), strict=True)))
-        return np.concatenate([part.ravel() for part in errors])
+        values = dict(zip(solution.names, map(float, share * scale), strict=True))
+        model = model_of(rig, terms, values)
+        return np.concatenate([record.residual(model).ravel() for record in records])
 
     first = solution.value / scale
     optimum = least_squares(
@@ -107,12 +95,12 @@ def free_run_fit(
     after = float(np.sqrt(np.mean(optimum.fun**2)))
     jacobian = optimum.jac / scale
     inverse = scaled_inverse(jacobian.T @ jacobian)
-    error = spread([_pieces(ready.records, optimum, jacobian)], inverse)
-    unit = rig.unit_of(ready.records[0].names[0])
+    error = spread([_pieces(records, optimum, jacobian)], inverse)
+    unit = rig.unit_of(records[0].names[0])
     check = Check(
         "output error",
         bool(optimum.success),
-        f"free runs of {len(ready.records)} whole record(s) from their measured first state: "
+        f"free runs of {len(records)} whole record(s) from their measured first state: "
         f"{before:.3g} {unit} rms with least squares, {after:.3g} {unit} with these parameters"
         + ("" if optimum.success else f"; not settled after {optimum.nfev} steps"),
     )

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -78,14 +77,6 @@ def parts_of(terms: Sequence[Used], rate: float) -> int:
     return max(1, math.ceil(fastest * SAMPLES_PER_STEP / (rate * IDENTIFY.stable_step)))
 
 
-@dataclass(frozen=True)
-class ShootingWindow:
-    """A stretch of a record: its first sample and how many points are compared."""
-
-    first: int
-    points: int
-
-
 def shoot(
     ready: Compiled,
     pars: Array,
@@ -93,18 +84,19 @@ def shoot(
     inputs: Array,
     rate: float,
     locked: NDArray[np.bool_],
-    window: ShootingWindow,
+    first: int,
+    points: int,
     every: int,
     parts: int,
 ) -> Array | None:
     """Return the states (P, points, size) from `starts` (P, size) with `pars` (P, parameters).
 
-    A point every 2 x `every` samples, each two samples in `parts` steps. None where a simulation
-    failed.
+    A point every 2 x `every` samples from the sample `first` on, each two samples in `parts` steps.
+    None where a simulation failed.
     """
-    out = np.zeros((len(starts), window.points, starts.shape[1]))
+    out = np.zeros((len(starts), points, starts.shape[1]))
     good = _shoot(
         ready.address, ready.context, pars, ready.geometry, ready.work(), starts, inputs, rate,
-        locked, window.first, every, parts, out,
+        locked, first, every, parts, out,
     )  # fmt: skip
     return out if good else None

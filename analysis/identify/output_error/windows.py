@@ -13,7 +13,6 @@ from analysis.effects.base import ordered
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.output_error.shooting import (
     SAMPLES_PER_STEP,
-    ShootingWindow,
     parts_of,
     shoot,
 )
@@ -41,13 +40,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlacedWindow:
-    """A window ready to simulate: inputs, measured outputs (points, 3 F), its record and part."""
+    """A window ready to simulate: its record and part, first sample, outputs (points, 3 F)."""
 
     record: int
     stratum: int
     repeat: int
     part: int
-    shooting: ShootingWindow
+    first: int
     measured: Array
 
 
@@ -149,8 +148,10 @@ class Windows:
             for part, first in enumerate(chosen):
                 at = first + SAMPLES_PER_STEP * every * np.arange(points)
                 self.placed.append(
-                    PlacedWindow(len(self.sources) - 1, strata[one.group], record.repeat, part,
-                             ShootingWindow(first, points), measured[at])
+                    PlacedWindow(
+                        len(self.sources) - 1, strata[one.group], record.repeat, part, first,
+                        measured[at],
+                    )
                 )  # fmt: skip
         if not self.placed:
             raise InputError(
@@ -178,8 +179,8 @@ class Windows:
     def sigma(self) -> dict[int, Array]:
         """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
         sensors = self.rig.sensors
-        taps = noise_gain(self.rig)
-        base = np.array([sensors.piston.noise, *[sensors.chamber_pressure.noise] * 2]) * taps
+        gain = float(np.linalg.norm(channel_filter(self.rig.sample_rate).taps[0]))
+        base = np.array([sensors.piston.noise, *[sensors.chamber_pressure.noise] * 2]) * gain
         steps = [(r[1] - r[0]) / (1 << bits) for r, bits in (
             (sensors.piston.range, sensors.piston.bits),
             (sensors.chamber_pressure.range, sensors.chamber_pressure.bits))]  # fmt: skip
@@ -193,7 +194,7 @@ class Windows:
     def measured_start(self, window: PlacedWindow) -> Array:
         """Return a window's first state [q, q', p_cap, p_rod] as measured, (4 N,)."""
         source = self.sources[window.record]
-        s, k = source.signals, window.shooting.first
+        s, k = source.signals, window.first
         return np.concatenate((s.q[k], s.qd[k], s.p_cap[k], s.p_rod[k]))
 
     def _state_places(self, window: PlacedWindow) -> NDArray[np.int64]:
@@ -273,11 +274,10 @@ class Windows:
             y0[row, place] += size
         chosen = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
         if y0.shape[1] > len(start):
-            first = window.shooting.first
-            y0[:, len(start) :] = [perturbed.hidden[k][first] for k in chosen]
+            y0[:, len(start) :] = [perturbed.hidden[k][window.first] for k in chosen]
         states = shoot(
             ready, np.ascontiguousarray(perturbed.pars[chosen]), y0, source.inputs,
-            source.signals.rate, source.locked, window.shooting, self.every,
+            source.signals.rate, source.locked, window.first, len(window.measured), self.every,
             parts_of(self.terms, self.rig.sample_rate),
         )  # fmt: skip
         if states is None:
@@ -322,8 +322,3 @@ class Windows:
             (np.stack(piston, axis=-1), states[..., 2 * N + free], states[..., 3 * N + free]),
             axis=-1,
         )
-
-
-def noise_gain(rig: Rig) -> float:
-    """Return the rms gain of the channel filter for white noise."""
-    return float(np.linalg.norm(channel_filter(rig.sample_rate).taps[0]))
