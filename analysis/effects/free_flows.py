@@ -41,7 +41,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.orifice import root_of_drop, signed_root
+from analysis.terms.hydraulics import root_of_drop, signed_root
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 from rig.model.units import plain

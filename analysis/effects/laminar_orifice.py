@@ -25,7 +25,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.orifice import Orifice, edge_columns, root_of_drop, signed_root
+from analysis.terms.hydraulics import Orifice, edge_columns, root_of_drop, signed_root
 from rig.model.rig import Rig
 
 TRANSITION: Final = "dp_laminar"

@@ -23,8 +23,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.gravity import Gravity
-from analysis.terms.inertia import Inertia, inertia_map
+from analysis.terms.mechanics import Gravity, Inertia, inertia_map
 from analysis.terms.sine_cosine import sine_cosine
 from rig.model.electric import UNKNOWN
 from rig.model.parameters import inertia_names

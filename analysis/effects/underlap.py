@@ -25,7 +25,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.orifice import root_of_drop, signed_root
+from analysis.terms.hydraulics import root_of_drop, signed_root
 from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
 

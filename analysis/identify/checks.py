@@ -18,7 +18,7 @@ from analysis.signals.conditioning import clipped_samples
 from analysis.simulation.model import Estimate, rig_difference
 from analysis.simulation.model_draws import far_from_nominal
 from analysis.simulation.settings import SIMULATION
-from analysis.terms.inertia import chain_matrix, mass_matrix
+from analysis.terms.mechanics import chain_matrix, mass_matrix
 from rig.model import channels as ch
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError

@@ -1,10 +1,10 @@
 """Physically possible parameters (rigid bodies, real oil), and their cost in the residual.
 
 Level 1, *signs*: friction, flow gains and 1/b are not negative, and the chain's R is positive
-semidefinite. M_ij(q) sums R_kl cos(theta_k - theta_l) (`terms.inertia`), and the cosines form a
+semidefinite. M_ij(q) sums R_kl cos(theta_k - theta_l) (`terms.mechanics`), and the cosines form a
 Gram matrix, so by Schur's product theorem M(q) is then so in every posture; with all links in line
 M(q) is made of R alone, so no weaker condition holds in all postures. Level 2, *rigid bodies*: R_ij
-= l_i W_j for i < j besides, l_i being the rig's link lengths (`terms.inertia`). Both levels
+= l_i W_j for i < j besides, l_i being the rig's link lengths (`terms.mechanics`). Both levels
 together say exactly that there are links with masses m_k > 0, first moments h_k and pseudo-inertias
 [[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:
     R_kk = I_k + l_k^2 m_beyond(k),  W_k = h_k + l_k m_beyond(k),  m_beyond(k) = sum_{j>k} m_j;
@@ -34,7 +34,7 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.constrained import Feasible, Minimum, minimise
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Estimate, estimate_json, finite
-from analysis.terms.inertia import chain_matrix, inertia_map
+from analysis.terms.mechanics import chain_matrix, inertia_map
 from rig.model.parameters import inertia_names
 from rig.model.parse import InputError
 from rig.model.rig import Rig

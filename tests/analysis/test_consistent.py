@@ -13,7 +13,7 @@ from analysis.identify.identify import identify
 from analysis.identify.physical import feasible, physical, to_json, with_physics
 from analysis.identify.result import Identification
 from analysis.regression.constrained import minimise
-from analysis.terms.inertia import inertia_map
+from analysis.terms.mechanics import inertia_map
 from rig.model.parameters import mechanical_names
 from rig.model.parse import InputError
 from rig.model.records import Run

@@ -8,7 +8,7 @@ import pytest
 from analysis.regression.rows import parameters_of
 from analysis.terms import baseline, make
 from analysis.terms.base import Used, equation
-from analysis.terms.inertia import chain_matrix, mass_matrix
+from analysis.terms.mechanics import chain_matrix, mass_matrix
 from analysis.terms.sine_cosine import sine_cosine
 from hil_sim.plant.kernel import angular
 from hil_sim.plant.kernel_data import JOINT

@@ -8,7 +8,7 @@ import pytest
 from analysis.regression.rows import right_sides
 from analysis.signals.conditioning import Signals
 from analysis.terms import base, baseline, known, make
-from analysis.terms.inertia import chain_matrix, mass_matrix
+from analysis.terms.mechanics import chain_matrix, mass_matrix
 from rig.model.parameters import inertia_names, parameter_names
 from rig.model.parse import InputError
 from rig.model.rig import Rig

@@ -49,8 +49,7 @@ from analysis.identify.estimators.equations import EquationFit, pieces
 from analysis.identify.settings import IDENTIFY
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Coefficient, Columns, Term, Used, equation
-from analysis.terms.compressibility import Compressibility
-from analysis.terms.orifice import root_of_drop
+from analysis.terms.hydraulics import Compressibility, root_of_drop
 from rig.model import channels as ch
 from rig.model.parameters import gain_names
 from rig.model.records import Run

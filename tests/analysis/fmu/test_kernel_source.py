@@ -94,7 +94,7 @@ def test_some_kernel_changes_something(in_c: ctypes.CDLL) -> None:
     """The comparison above would pass for functions that do nothing."""
     arguments = state(np.random.default_rng(1))
     pointers = [a.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for a in arguments]
-    in_c.orifice__kernel(CONTRIBUTE, *pointers)
+    in_c.hydraulics__orifice(CONTRIBUTE, *pointers)
     assert np.abs(arguments[4]).max() > 0
 
 

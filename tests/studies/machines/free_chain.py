@@ -24,7 +24,7 @@ from analysis.signals.conditioning import Signals
 from analysis.signals.filters import channel_filter, row_filter, row_step
 from analysis.terms import make
 from analysis.terms.base import equation
-from analysis.terms.inertia import chain_matrix
+from analysis.terms.mechanics import chain_matrix
 from rig.model.parameters import mechanical_names
 from rig.model.rig import Rig
 

@@ -1,4 +1,4 @@
-"""The four metering edges of every joint's valve."""
+"""Flow rows of the paper's model: compressible oil in the chambers, and the valve's orifices."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from numba import njit
 
 from analysis.signals.conditioning import Mask, Signals
 from analysis.terms.base import (
+    COMP_CAP,
+    COMP_ROD,
     CONTRIBUTE,
     FLOW_CAP,
     FLOW_ROD,
@@ -20,6 +22,8 @@ from analysis.terms.base import (
     P_ROD,
     P_S,
     P_TANK,
+    V_CAP,
+    V_ROD,
     Array,
     Coefficient,
     Columns,
@@ -34,7 +38,38 @@ from rig.model.rig import Rig
 
 
 @kernel
-def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+def _compressibility(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            out[COMP_CAP, i] += par[0] * x[V_CAP, i]
+            out[COMP_ROD, i] += par[0] * x[V_ROD, i]
+
+
+@dataclass(frozen=True)
+class Compressibility(Term):
+    """- (1/b) V dp/dt in the flow rows of each chamber, linear in 1/b.
+
+    Source: Sakai and Maeshima, section II.
+    """
+
+    name: ClassVar[str] = "compressibility"
+    kernel: ClassVar[Kernel] = _compressibility
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return b [Pa], the rows' coefficient being 1/b."""
+        return (Coefficient("b", parameter_unit("b"), "fluid", reciprocal=True),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return - V dp/dt of each chamber, V being that of the moving piston."""
+        out: Columns = {}
+        for i in signals.excited_joints:
+            out[equation("flow_cap", i)] = {"b": -signals.V_cap[:, i] * signals.pd_cap[:, i]}
+            out[equation("flow_rod", i)] = {"b": -signals.V_rod[:, i] * signals.pd_rod[:, i]}
+        return out
+
+
+@kernel
+def _orifice(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase != CONTRIBUTE:
         return
     p_s, p_t = bench[P_S], bench[P_TANK]
@@ -60,7 +95,7 @@ class Orifice(Term):
     """
 
     name: ClassVar[str] = "orifice"
-    kernel: ClassVar[Kernel] = _kernel
+    kernel: ClassVar[Kernel] = _orifice
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return C_pp C_pm C_mp C_mm of each joint."""
@@ -123,4 +158,4 @@ def root_of_drop(drop: Array) -> Array:
     return np.copysign(np.sqrt(np.abs(drop)), drop)
 
 
-TERMS = (Orifice,)
+TERMS = (Compressibility, Orifice)
