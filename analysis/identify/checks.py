@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import Solution
-from analysis.signals.conditioning import clipped_samples
+from analysis.signals.conditioning import clipped_samples, is_used
 from analysis.simulation.model import Estimate, rig_difference
 from analysis.simulation.model_draws import far_from_nominal
 from analysis.simulation.settings import SIMULATION
@@ -122,7 +122,7 @@ def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
     return {
         name: int(mask.sum())
         for name, mask in clipped_samples(rig, record).items()
-        if ch.kind_of(name)[1] not in record.locked or name.startswith(rig.position_kind)
+        if is_used(rig, record, name)
     }
 
 

@@ -116,7 +116,7 @@ def conclude(
     sources: Sequence[str],
     used: tuple[Used, ...],
     reductions: Sequence[RecordReduction],
-    reject_noise: bool,
+    reject_noise: bool = True,
     refined: Callable[[Mapping[str, Solution]], Refinement] | None = None,
     geometry: GeometryShifts | None = None,
 ) -> Identification:

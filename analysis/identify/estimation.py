@@ -44,7 +44,7 @@ from analysis.identify.estimators.weighted import weighted_least_squares
 from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, with_columns
 from analysis.regression.rows import parameters_of
 from analysis.regression.solve import MOSTLY_NOISE, Solution
-from analysis.terms.base import Used
+from analysis.terms.base import Used, inverted
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -185,12 +185,13 @@ def _prepare(
     job: EstimationJob, solutions: Mapping[str, Solution]
 ) -> tuple[list[FamilyBlocks], list[Check]]:
     """Build rows with the nuisance columns, without one that the data contradict (reported)."""
-    values: dict[str, float] = {}
-    for s in solutions.values():
-        for name, v in zip(s.names, s.value, strict=True):
-            values[name] = float(1.0 / v) if name == "b" and v != 0 else float(v)
-    extra = list(nu.nuisance_terms(job.terms, job.runs, values))
+    coefficients = {
+        name: float(v) for s in solutions.values() for name, v in zip(s.names, s.value, strict=True)
+    }
+    values = inverted(job.rig, job.terms, coefficients)
+    extra = nu.nuisance_terms(job.terms, job.runs, values)
     built = with_columns(job.rig, job.terms, job.built, extra)
+    records = {(rows.conditioned.run, rows.record.name): rows.record for rows in built}
     checks: list[Check] = []
     out = []
     for family, solution in solutions.items():
@@ -202,7 +203,10 @@ def _prepare(
         # Without their columns, other parameters of the same motion would take their part.
         noisy = [n for n, why in solution.unidentifiable.items() if why == MOSTLY_NOISE]
         nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
-        prepared = _family(built, family, columns, determined, nuisances)
+        names = (*determined, *nuisances)
+        kept = [columns.index(name) for name in names]
+        blocks = levelled(blocks_of(built, family, kept), records)
+        prepared = FamilyBlocks(family, names, len(determined), tuple(blocks))
         if nuisances:
             prepared, stated = _plausible(prepared)
             checks += stated
@@ -238,20 +242,6 @@ def _without(p: FamilyBlocks, name: str) -> FamilyBlocks:
     at = p.names.index(name)
     blocks = tuple(replace(b, X=np.delete(b.X, at, axis=1)) for b in p.blocks)
     return replace(p, names=(*p.names[:at], *p.names[at + 1 :]), blocks=blocks)
-
-
-def _family(
-    built: Sequence[RecordRows],
-    family: str,
-    columns: Sequence[str],
-    determined: Sequence[str],
-    nuisances: Sequence[str],
-) -> FamilyBlocks:
-    names = (*determined, *nuisances)
-    kept = [list(columns).index(n) for n in names]
-    records = {(rows.conditioned.run, rows.record.name): rows.record for rows in built}
-    blocks = levelled(blocks_of(built, family, kept), records)
-    return FamilyBlocks(family, names, len(determined), tuple(blocks))
 
 
 def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:

@@ -168,8 +168,10 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
         # An estimator's solution may differ from the triangle's: project the estimator's.
         minimum = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
         P = _projection(X, minimum)
-        solutions[family] = _constrained(solution, P, minimum)
-        free = solution
+        solutions[family] = free = solution
+        if len(minimum.active):  # no variance is left along the directions held
+            covariance = P @ solution.covariance @ P.T
+            solutions[family] = replace(solution, value=minimum.beta, covariance=covariance)
         if geometry is not None:
             shifts[family] = P @ geometry.shifts[family]
             free = replace(solution, covariance=solution.covariance + geometry.covariance(family))
@@ -179,13 +181,6 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
         geometry = replace(geometry, shifts=shifts)
         estimates, covariance = geometry.widened(estimates, covariance)
     return Level(name, estimates, covariance, costs, geometry)
-
-
-def _constrained(solution: Solution, P: Array, minimum: Minimum) -> Solution:
-    """Return the constrained solution; its covariance is zero along the directions held."""
-    if not len(minimum.active):
-        return solution
-    return replace(solution, value=minimum.beta, covariance=P @ solution.covariance @ P.T)
 
 
 def _projection(X: Array, minimum: Minimum) -> Array:

@@ -7,6 +7,7 @@ record has no repeats to compare, and compares its parts.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -115,10 +116,7 @@ def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowC
 
 def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None:
     """Return the summed noise moments (k+1, k+1) of all records; one represents each step."""
-    counts: dict[tuple[int, str], int] = {}
-    for reduction in reductions:
-        key = (reduction.run, reduction.head.step)
-        counts[key] = counts.get(key, 0) + 1
+    counts = Counter((reduction.run, reduction.head.step) for reduction in reductions)
     weighted = [
         counts[reduction.run, reduction.head.step] * reduction.noise[family]
         for reduction in reductions

@@ -90,8 +90,10 @@ def estimates_of(
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
     coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
     estimates: dict[str, Estimate] = {}
-    blocks = []
+    count = sum(len(solution.names) for solution in solutions.values())
+    covariance = np.zeros((count, count))
     for solution in solutions.values():
+        own = slice(len(estimates), len(estimates) + len(solution.names))
         std = np.sqrt(np.diag(solution.covariance))
         half = half_width(std, solution.dof)
         slopes = np.ones(len(std))
@@ -99,13 +101,7 @@ def estimates_of(
             c = coefficients[name]
             note = solution.unidentifiable.get(name, "")
             estimates[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
-        blocks.append(solution.covariance * np.outer(slopes, slopes))
-    names = list(estimates)
-    covariance = np.zeros((len(names), len(names)))
-    start = 0
-    for block in blocks:
-        covariance[start : start + len(block), start : start + len(block)] = block
-        start += len(block)
+        covariance[own, own] = solution.covariance * np.outer(slopes, slopes)
     return estimates, covariance
 
 

@@ -138,18 +138,24 @@ def align_reach(rig: Rig, rate: float) -> int:
 
 def lost_samples(rig: Rig, record: Record) -> Mask:
     """Return where (n, N) a joint's sample, or one of the bench's, never arrived (NaN)."""
-    lost = np.zeros((record.samples, len(rig.joints)), dtype=bool)
-    for name in rig.channels:
-        if name in record.channels:
-            missing = np.isnan(record.channels[name])
-            if not missing.any():
-                continue
-            kind, joint = ch.kind_of(name)
-            if joint is None:
-                lost |= missing[:, None]
-            elif joint not in record.locked or kind == rig.position_kind:
-                lost[:, joint - 1] |= missing
-    return lost
+    masks = {n: np.isnan(record.channels[n]) for n in rig.channels if n in record.channels}
+    return _by_joint(rig, record, masks)
+
+
+def is_used(rig: Rig, record: Record, name: str) -> bool:
+    """Return whether rows need a channel: of a locked joint they need its position only."""
+    kind, joint = ch.kind_of(name)
+    return joint not in record.locked or kind == rig.position_kind
+
+
+def _by_joint(rig: Rig, record: Record, masks: Mapping[str, Mask]) -> Mask:
+    """Return where (n, N) a joint's mask (n,), or one of the bench's, holds on a used channel."""
+    out = np.zeros((record.samples, len(rig.joints)), dtype=bool)
+    for name, mask in masks.items():
+        joint = ch.kind_of(name)[1]
+        if is_used(rig, record, name) and mask.any():
+            out[:, slice(None) if joint is None else slice(joint - 1, joint)] |= mask[:, None]
+    return out
 
 
 def condition(
@@ -285,17 +291,10 @@ def _geometry(
 
 
 def _valid(rig: Rig, record: Record, reach: int) -> Mask:
-    n = record.samples
-    bad = np.zeros((n, len(rig.joints)), dtype=bool)
-    for name, mask in clipped_samples(rig, record).items():
-        kind, joint = ch.kind_of(name)
-        if joint is None:
-            if kind == ch.SUPPLY:
-                bad[mask] = True
-        elif joint not in record.locked or kind == rig.position_kind:
-            bad[mask, joint - 1] = True
-    bad = _spread(bad, reach)
-    bad[:reach] = bad[n - reach :] = True
+    clipped = clipped_samples(rig, record)
+    clipped.pop(ch.TEMPERATURE, None)
+    bad = _spread(_by_joint(rig, record, clipped), reach)
+    bad[:reach] = bad[record.samples - reach :] = True
     return np.asarray(~bad)
 
 

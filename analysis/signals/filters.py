@@ -152,13 +152,14 @@ def moving_average(rate: float) -> FirSmoother:
     return differenced("moving average, 20 samples", h0, rate, order=2)
 
 
-def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:
-    """Return a Butterworth run forwards and backwards, with 8th-order differences.
+def butterworth(rate: float, cutoff: float) -> FirSmoother:
+    """Return a Butterworth of order 4 run forwards and backwards, with 8th-order differences.
 
     Its response is cut where it has decayed to 1e-6. `cutoff` [Hz] is -6 dB, both ways together.
     """
     from scipy.signal import butter, sosfiltfilt  # noqa: PLC0415 - loads slowly
 
+    order = 4
     half = int(np.ceil(6 * order * rate / (2 * np.pi * cutoff)))
     impulse = np.zeros(2 * half + 1)
     impulse[half] = 1.0

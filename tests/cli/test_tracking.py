@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.identify.identify import identify
+from analysis.identify.result import PLAIN
 from analysis.identify.streams.online import Tracker, track
-from analysis.identify.streams.out_of_core import identify_folders
 from drivers.base import SampleBlock
 from rig.bench.observers import Observers
 from rig.bench.session import Bench
@@ -23,6 +24,7 @@ from rig.model.rig import Rig
 from rig.runs.recorder import RecordMeta
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
+from rig.runs.store import load_run
 from tests.analysis import small_bench
 from tests.cli.bench import SHORT, bramah, bramah_here, simulated
 from tests.services.fake_driver import FakeDriver
@@ -198,7 +200,7 @@ def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "tracked: b " in done.stderr
     kept = json.loads((run / "tracked.json").read_text())["parameters"]
-    expected = identify_folders([str(run)], reject_noise=False).estimates
+    expected = identify([load_run(run)], reject_noise=False, estimator=PLAIN).estimates
     for name in ("b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2"):
         assert kept[name]["value"] == pytest.approx(expected[name].value, rel=1e-9)
     records = [e["record"] for e in read_events(run) if e["event"] == "tracked"]

@@ -72,7 +72,6 @@ class RecordTask:
 def identify_folders(
     folders: Sequence[str],
     filtering: Callable[[Record], Filtering] = default_filtering,
-    reject_noise: bool = True,
     pool: Pool | None = None,
     effects: Sequence[str] = (),
     like: Model | None = None,
@@ -128,7 +127,7 @@ def identify_folders(
     count = len(tasks) // len(rigs)
     own, *moved = (reductions[k : k + count] for k in range(0, len(tasks), count))
     geometry = shifts_of_reductions(rig, used, own, moved)
-    return conclude(rig, [h.source for h in heads], used, own, reject_noise, geometry=geometry)
+    return conclude(rig, [head.source for head in heads], used, own, geometry=geometry)
 
 
 def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]:
