@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
-from analysis.identify.reduction import Part, RecordReduction
+from analysis.identify.reduction import Part, RecordReduction, folded
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.rows import Rows, parameters_of, record_rows
-from analysis.regression.solve import Accumulator, RowCluster, solve
+from analysis.regression.solve import RowCluster, solve
 from analysis.signals.conditioning import of_other_geometry
 from analysis.simulation.model import Estimate, finite
-from analysis.terms.base import FAMILIES, Used, family_of
+from analysis.terms.base import FAMILIES, Used
 from rig.model.rig import Rig
 from rig.model.tolerances import UncertainNumber
 
@@ -104,8 +104,8 @@ def shifts_of_rows(
     if not rig.uncertain_numbers:
         return None
     others = map(rig.with_moved, rig.uncertain_numbers)
-    parts = [_folded(other, terms, _rows_again(rig, terms, built, other)) for other in others]
-    return _shifts(rig, terms, _folded(rig, terms, (item.rows for item in built)), parts)
+    moved = [folded(other, terms, _rows_again(rig, terms, built, other))[0] for other in others]
+    return _shifts(rig, terms, folded(rig, terms, (item.rows for item in built))[0], moved)
 
 
 def shifts_of_reductions(
@@ -179,15 +179,6 @@ def _rows_again(
     for item in built:
         signals = of_other_geometry(rig, item.conditioned.signals, other)
         yield record_rows(other, terms, signals, item.conditioned.filtering)
-
-
-def _folded(rig: Rig, terms: Sequence[Used], records: Iterable[Mapping[str, Rows]]) -> Parts:
-    """Return one triangle for each family of the rows of all records."""
-    sums = {family: Accumulator(len(parameters_of(rig, terms, family))) for family in FAMILIES}
-    for rows_by_equation in records:
-        for equation, rows in rows_by_equation.items():
-            sums[family_of(equation)].fold(rows.matrix, rows.rhs)
-    return {family: ((part.triangle, part.rows),) for family, part in sums.items()}
 
 
 def _collected(reductions: Sequence[RecordReduction]) -> Parts:

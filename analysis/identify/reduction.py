@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +60,7 @@ def reduce_rows(
             disturbed.add(item.group)
             noise = record_moments(rig, terms, item.conditioned, item.rows)
         duration = record.samples / record.sample_rate
-        parts, masked = folded(rig, terms, [item.rows], duration)
+        parts, masked = folded(rig, terms, [item.rows], duration, IDENTIFY.record_segments)
         lost = int(lost_samples(rig, record).any(axis=1).sum())
         clipped = ck.clipped_counts(rig, record)
         run = item.conditioned.run
@@ -70,32 +69,28 @@ def reduce_rows(
 
 
 def folded(
-    rig: Rig, terms: Sequence[Used], chunks: Iterable[Mapping[str, Rows]], duration: float
+    rig: Rig,
+    terms: Sequence[Used],
+    chunks: Iterable[Mapping[str, Rows]],
+    duration: float = 0.0,
+    segments: int = 1,
 ) -> tuple[dict[str, tuple[Part, ...]], int]:
-    """Return a triangle per family and part of a record of `duration` [s], and masked rows."""
+    """Return, by family, a triangle for each of the equal `segments` of a duration [s].
+
+    Also the number of masked rows.
+    """
     columns = {family: len(parameters_of(rig, terms, family)) for family in FAMILIES}
-    sums = {
-        family: [Accumulator(count) for _ in range(IDENTIFY.record_segments)]
-        for family, count in columns.items()
-    }
+    sums = {f: [Accumulator(count) for _ in range(segments)] for f, count in columns.items()}
+    edges = np.linspace(0.0, duration, segments + 1)[1:-1]
     masked = 0
     for rows_by_equation in chunks:
         for name, rows in rows_by_equation.items():
             masked += rows.masked
-            for part, inside in enumerate(parts_of(rows, duration)):
-                sums[family_of(name)][part].fold(rows.matrix[inside], rows.rhs[inside])
-    return {
-        f: tuple((part.triangle, part.rows) for part in every) for f, every in sums.items()
-    }, masked
-
-
-def parts_of(rows: Rows, duration: float) -> list[slice]:
-    """Cut rows in the order of time into `record_segments` equal parts of a duration [s]."""
-    edges = np.searchsorted(
-        rows.time, np.linspace(0.0, duration, IDENTIFY.record_segments + 1)[1:-1]
-    )
-    ends = [0, *map(int, edges), len(rows.time)]
-    return [slice(a, b) for a, b in pairwise(ends)]
+            cuts = np.searchsorted(rows.time, edges)
+            pieces = zip(np.split(rows.matrix, cuts), np.split(rows.rhs, cuts), strict=True)
+            for total, (matrix, rhs) in zip(sums[family_of(name)], pieces, strict=True):
+                total.fold(matrix, rhs)
+    return {f: tuple((part.triangle, part.rows) for part in s) for f, s in sums.items()}, masked
 
 
 def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:

@@ -26,7 +26,7 @@ from scipy.special import fdtrc
 from analysis.identify.estimators.equations import Pieces
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import scaled_inverse
-from analysis.regression.solve import satterthwaite, stratified
+from analysis.regression.solve import half_width, satterthwaite, stratified
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,11 @@ class CovarianceParts:
     covariance: Array
     dof: Array
     systematic: Array
+
+    @property
+    def half(self) -> Array:
+        """The half widths (k,) of the 95 % intervals."""
+        return half_width(np.sqrt(np.diag(self.covariance)), self.dof)
 
 
 def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:

@@ -20,7 +20,7 @@ from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.estimators.equations import FamilyBlocks
 from analysis.identify.estimators.instruments import Hausman
 from analysis.identify.settings import IDENTIFY
-from analysis.regression.solve import Solution, half_width
+from analysis.regression.solve import Solution
 
 Array = NDArray[np.float64]
 
@@ -68,8 +68,8 @@ def shift_without(value: Array, without: Array, error: CovarianceParts, count: i
     A shift within `IDENTIFY.shift_of_interval` of the 95 % half width counts as 0.
     """
     shift = without[:count] - value[:count]
-    half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)[:count]
-    return np.where(np.abs(shift) > IDENTIFY.shift_of_interval * half, shift, 0.0)
+    least = IDENTIFY.shift_of_interval * error.half[:count]
+    return np.where(np.abs(shift) > least, shift, 0.0)
 
 
 def largest_shift(names: Sequence[str], value: Array, shift: Array) -> tuple[str, float]:
@@ -92,7 +92,7 @@ def shifts_of(
     shifts = []
     for p in prepared:
         test, error = tests[p.family], errors[p.family]
-        half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)
+        half = error.half
         for i, name in enumerate(p.names[: p.parameters]):
             size = abs(float(test.difference[i]))
             # The rows contain 1/b: a larger 1/b is a smaller b.

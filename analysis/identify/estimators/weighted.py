@@ -46,13 +46,21 @@ def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
         for e, (total, n) in zip(residuals, over_repeats(blocks, residuals), strict=True)
     ]
     place = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
+
+    def other_chamber(b: RepeatBlock) -> int | None:
+        """Return the place of the other chamber's block where it has the same rows."""
+        kind, joint = b.equation.rsplit("_", 1)
+        other = {"flow_cap": "flow_rod", "flow_rod": "flow_cap"}.get(kind)
+        i = place.get((b.run, b.record, f"{other}_{joint}"))
+        return i if i is not None and len(blocks[i].y) == len(b.y) else None
+
     factors: dict[tuple[int, str, str], Array] = {}
     out = list(blocks)
     for i, b in enumerate(blocks):
-        other = place.get((b.run, b.record, b.equation.replace("flow_cap", "flow_rod")), i)
-        if b.equation.startswith("flow_rod") and _paired(blocks, place, b):
-            continue
-        pair = [i] if other == i or len(blocks[other].y) != len(b.y) else [i, other]
+        other = other_chamber(b)
+        if other is not None and b.equation.startswith("flow_rod"):
+            continue  # mixed with its cap chamber
+        pair = [i] if other is None else [i, other]
         if b.shared not in factors:
             members = [
                 (m, *(place[c.run, c.record, blocks[p].equation] for p in pair[1:]))
@@ -69,13 +77,6 @@ def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
             y = sum(L[row, c] * blocks[j].y for c, j in enumerate(pair))
             out[target] = replace(blocks[target], X=np.asarray(X), y=np.asarray(y))
     return out
-
-
-def _paired(
-    blocks: Sequence[RepeatBlock], place: dict[tuple[int, str, str], int], b: RepeatBlock
-) -> bool:
-    cap = place.get((b.run, b.record, b.equation.replace("flow_rod", "flow_cap")))
-    return cap is not None and len(blocks[cap].y) == len(b.y)
 
 
 def _whitener(deviation: Array, b: RepeatBlock) -> Array:

@@ -49,9 +49,9 @@ def output_error(
 
     Raises InputError for a start that is incomplete or that cannot be simulated at all.
     """
-    names = tuple(c.parameter for used in terms for c in used.term.coefficients(rig))
+    names = [c.parameter for used in terms for c in used.term.coefficients(rig)]
     refuse_undetermined([n for n in names if not np.isfinite(start.get(n, np.nan))])
-    search = Search(Windows(rig, runs, tuple(terms), names))
+    search = Search(Windows(rig, runs, terms))
     return search.run(np.array([*(start[n] for n in names), start.get(nu.KAPPA, 0.0)]))
 
 

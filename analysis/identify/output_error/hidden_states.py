@@ -22,7 +22,6 @@ from analysis.effects.base import Effect, Shape, shape_values, shapes_of
 from analysis.identify.output_error.fit import Search
 from analysis.identify.output_error.windows import Windows
 from analysis.identify.settings import IDENTIFY
-from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import inverted
 from rig.model.parse import InputError
@@ -96,13 +95,12 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> ShootingEstimate 
     except (InputError, np.linalg.LinAlgError) as error:
         log.info("%s is not fitted by shooting: %s", effect.name, error)
         return None
-    half = half_width(np.sqrt(np.diag(search.spread.covariance)), search.spread.dof)
     shapes = {}
     for name, shape in bounds.items():
         k = windows.names.index(name)
-        value, std = float(search.value[k]), float(np.sqrt(search.spread.covariance[k, k]))
-        ends = (value - float(half[k]), value + float(half[k]))
-        shapes[name] = Estimate(value, shape.unit, std, ends)
+        value, half = float(search.value[k]), float(search.spread.half[k])
+        std = float(np.sqrt(search.spread.covariance[k, k]))
+        shapes[name] = Estimate(value, shape.unit, std, (value - half, value + half))
     return ShootingEstimate(effect.name, effect.where, shapes, len(windows.placed), search.check.ok)
 
 
@@ -125,9 +123,7 @@ def window_error(runs: Sequence[Run], model: Model, effect: Effect) -> float:
     return float(np.sqrt(sum(r.rest for r in good) / sum(r.residual.size for r in good)))
 
 
-def _windows(
-    runs: Sequence[Run], model: Model, effect: Effect, free: frozenset[str]
-) -> Windows:  # fmt: skip
+def _windows(runs: Sequence[Run], model: Model, effect: Effect, free: frozenset[str]) -> Windows:
     """Return windows of the records in which the effect's joint moves; InputError without one."""
     moving = [
         replace(run, records=tuple(r for r in run.records if effect.joint + 1 not in r.locked))
@@ -136,9 +132,8 @@ def _windows(
     rig = model.rig
     if not any(run.records for run in moving):
         raise InputError(f"joint {effect.joint + 1} moves in no record")
-    names = tuple(c.parameter for u in model.terms for c in u.term.coefficients(rig))
     shapes = tuple(s.parameter for s in _shapes(model, effect))
-    return Windows(rig, moving, model.terms, names, shapes, IDENTIFY.shape_seconds, free)
+    return Windows(rig, moving, model.terms, shapes, IDENTIFY.shape_seconds, free)
 
 
 def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:

@@ -96,14 +96,13 @@ class PerturbedModel:
 class Windows:
     """The data of one fit by windows, and their simulations.
 
-    `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms. With
-    `free` only those named there are free. At most `seconds` of data are used.
+    Parameters are the terms' coefficients and those `shapes` of theirs that are named. With `free`
+    only those named there are free. At most `seconds` of data are used.
     """
 
     def __init__(
-        self, rig: Rig, runs: Sequence[Run], terms: tuple[Used, ...], names: tuple[str, ...],
-        shapes: tuple[str, ...] = (), seconds: float = IDENTIFY.window_seconds,
-        free: frozenset[str] | None = None,
+        self, rig: Rig, runs: Sequence[Run], terms: Sequence[Used], shapes: tuple[str, ...] = (),
+        seconds: float = IDENTIFY.window_seconds, free: frozenset[str] | None = None,
     ) -> None:  # fmt: skip
         self.rig, self.terms, self.seconds, self.free = rig, ordered(terms), seconds, free
         self.places = {
@@ -112,7 +111,7 @@ class Windows:
             for j, name in enumerate(used.term.shape_names())
             if name in shapes
         }
-        names = (*names, *shapes)
+        names = (*(c.parameter for u in terms for c in u.term.coefficients(rig)), *shapes)
         self.warm = (
             free is None
             and "b" in names

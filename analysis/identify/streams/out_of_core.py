@@ -18,6 +18,7 @@ from analysis.identify.coupled import conclude
 from analysis.identify.geometry import shifts_of_reductions
 from analysis.identify.reduction import RecordReduction, folded
 from analysis.identify.result import Identification
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.chunks import InMemory, Source, divisible, source_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import record_moments
@@ -196,7 +197,8 @@ def reduce_record(task: RecordTask, source: Source) -> RecordReduction:
     else:
         bands = np.array(task.bands)
     chunks = source_rows(rig, terms, source, filters, bands, stretch)
-    parts, masked = folded(rig, terms, chunks, head.samples / head.sample_rate)
+    duration = head.samples / head.sample_rate
+    parts, masked = folded(rig, terms, chunks, duration, IDENTIFY.record_segments)
     noise = None
     if task.with_noise:
         # The first chunk represents a long record.
