@@ -27,7 +27,7 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
     """State, for each family with undetermined parameters, what is determined, what would help."""
     out = []
     for family, solution in solutions.items():
-        if not solution.unidentifiable or not len(solution.triangle):
+        if not solution.unidentifiable:
             continue
         k = len(solution.names)
         noise = solution.noise[:k, :k] if len(solution.noise) else None

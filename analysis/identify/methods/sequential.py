@@ -15,6 +15,7 @@ A known parameter moves to the right-hand side: of [X y] the rows become [X_u, y
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +42,6 @@ from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
-from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ class StepRows:
     """One family's rows of one step, reduced, with the noise moments of its columns."""
 
     name: str
-    clusters: tuple[RowCluster, ...]
+    clusters: Sequence[RowCluster]
     noise: Array
 
 
@@ -128,18 +128,24 @@ def sequential(
     rig = ck.common_rig(runs)
     built = build_rows(rig, runs, terms, filtering)
     reductions = reduce_rows(rig, terms, built)
-    steps = _steps(rig, terms, reductions)
+    names = {family: parameters_of(rig, terms, family) for family in FAMILIES}
+    steps = {family: _steps(reductions, family, len(names[family])) for family in FAMILIES}
     masked = sum(reduction.masked for reduction in reductions)
     started = time.perf_counter()
-    outcomes = {
-        family: _solved_by_steps(parameters_of(rig, terms, family), steps[family], reject_noise)
-        for family in FAMILIES
-    }
+    outcomes = {f: _solved_by_steps(names[f], steps[f], reject_noise) for f in FAMILIES}
     seconds = time.perf_counter() - started
     solutions = {f: o.solution(o.first) for f, o in outcomes.items()}
     estimates, covariance = estimates_of(rig, terms, solutions)
     rows = {family: outcome.rows for family, outcome in outcomes.items()}
-    shown = {name: _shown(rig, terms, outcomes, name) for name in estimates}
+    # Every step's own values, as estimates in the parameter's unit.
+    shown = {
+        name: {
+            value.step: estimates_of(rig, terms, {f: o.solution({name: value})})[0][name]
+            for value in values
+        }
+        for f, o in outcomes.items()
+        for name, values in o.own.items()
+    }
     statements = (
         _uniqueness(shown),
         *record_checks(rig, reductions, rows),
@@ -158,71 +164,49 @@ def sequential(
     return found.with_checks(statements)
 
 
-def _steps(
-    rig: Rig, terms: Sequence[Used], reductions: Sequence[RecordReduction]
-) -> dict[str, list[StepRows]]:
-    """Return the steps of each family in the order of the steps."""
-    out: dict[str, list[StepRows]] = {}
-    for family in FAMILIES:
-        width = len(parameters_of(rig, terms, family)) + 1
-        out[family] = []
-        for step in dict.fromkeys(reduction.head.step for reduction in reductions):
-            part = [reduction for reduction in reductions if reduction.head.step == step]
-            noise = noise_of(part, family)
-            clusters = tuple(clusters_of(part, family))
-            if clusters:
-                noise = np.zeros((width, width)) if noise is None else noise
-                out[family].append(StepRows(step, clusters, noise))
-        if not out[family]:
-            raise InputError(f"every {family} row of the records is masked; take other records")
-    return out
-
-
-def _shown(
-    rig: Rig, terms: Sequence[Used], outcomes: Mapping[str, StepwiseFit], name: str
-) -> list[tuple[str, Estimate]]:
-    """Return every step's own value of one parameter, as an estimate in the parameter's unit."""
-    family, outcome = next((f, o) for f, o in outcomes.items() if name in o.names)
+def _steps(reductions: Sequence[RecordReduction], family: str, columns: int) -> list[StepRows]:
+    """Return the steps that have rows of a family, whose rows have so many columns."""
     out = []
-    for value in outcome.own[name]:
-        solutions = {family: outcome.solution({name: value})}
-        out.append((value.step, estimates_of(rig, terms, solutions)[0][name]))
+    for step in dict.fromkeys(reduction.head.step for reduction in reductions):
+        part = [reduction for reduction in reductions if reduction.head.step == step]
+        clusters, noise = clusters_of(part, family), noise_of(part, family)
+        if clusters:
+            noise = np.zeros((columns + 1, columns + 1)) if noise is None else noise
+            out.append(StepRows(step, clusters, noise))
+    if not out:
+        raise InputError(f"every {family} row of the records is masked; take other records")
     return out
 
 
-def disagreement(values: Sequence[Estimate]) -> float:
-    """Return the largest difference of two values over their common 95 % half width."""
-    halves = [v.half for v in values]
+def disagreement(by_step: Mapping[str, Estimate]) -> float:
+    """Return the largest difference of two steps' values over their common 95 % half width."""
     return max(
         (
-            abs(a.value - b.value) / float(np.hypot(halves[i], halves[j]))
-            for i, a in enumerate(values)
-            for j, b in enumerate(values[:i])
+            abs(a.value - b.value) / float(np.hypot(a.half, b.half))
+            for a, b in itertools.combinations(by_step.values(), 2)
         ),
         default=0.0,
     )
 
 
-def _uniqueness(shown: Mapping[str, Sequence[tuple[str, Estimate]]]) -> Check:
+def _uniqueness(shown: Mapping[str, Mapping[str, Estimate]]) -> Check:
     """State which parameters have several values, and by how much the worst of them disagree."""
-    several = {name: by_step for name, by_step in shown.items() if len(by_step) > 1}
-    if not several:
+    apart = {n: disagreement(by_step) for n, by_step in shown.items() if len(by_step) > 1}
+    if not apart:
         return Check("one value each", True, "no parameter is identified by more than one step")
-    by_size = sorted(several, key=lambda n: -disagreement([e for _, e in several[n]]))
     texts = []
-    for name in by_size[: IDENTIFY.worst_shown]:
-        values = ", ".join(f"{step} {estimate.value:.5g}" for step, estimate in several[name])
-        apart = disagreement([e for _, e in several[name]])
-        texts.append(f"{name}: {values} ({apart:.1f} of their 95 % intervals apart)")
+    for name in sorted(apart, key=lambda n: -apart[n])[: IDENTIFY.worst_shown]:
+        values = ", ".join(f"{step} {estimate.value:.5g}" for step, estimate in shown[name].items())
+        texts.append(f"{name}: {values} ({apart[name]:.1f} of their 95 % intervals apart)")
     return Check(
         "one value each", False,
-        f"{len(several)} parameters have several values, worst: " + "; ".join(texts),
+        f"{len(apart)} parameters have several values, worst: " + "; ".join(texts),
     )  # fmt: skip
 
 
 def _json(
     outcomes: Mapping[str, StepwiseFit],
-    shown: Mapping[str, Sequence[tuple[str, Estimate]]],
+    shown: Mapping[str, Mapping[str, Estimate]],
     first: Mapping[str, Estimate],
     averaged: Mapping[str, Estimate],
 ) -> dict[str, Any]:
@@ -231,11 +215,11 @@ def _json(
     return {
         "steps": list(next(iter(outcomes.values())).condition),
         "per_step": {
-            name: [{"step": step, **estimate_json(e)} for step, e in by_step]
+            name: [{"step": step, **estimate_json(e)} for step, e in by_step.items()]
             for name, by_step in shown.items()
         },
         "disagreement": {
-            name: finite(disagreement([e for _, e in by_step]))
+            name: finite(disagreement(by_step))
             for name, by_step in shown.items()
             if len(by_step) > 1
         },

@@ -178,16 +178,14 @@ class Windows:
     def sigma(self) -> dict[int, Array]:
         """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
         sensors = self.rig.sensors
+        outputs = (sensors.piston, sensors.chamber_pressure, sensors.chamber_pressure)
         gain = float(np.linalg.norm(channel_filter(self.rig.sample_rate).taps[0]))
-        base = np.array([sensors.piston.noise, *[sensors.chamber_pressure.noise] * 2]) * gain
-        steps = [(r[1] - r[0]) / (1 << bits) for r, bits in (
-            (sensors.piston.range, sensors.piston.bits),
-            (sensors.chamber_pressure.range, sensors.chamber_pressure.bits))]  # fmt: skip
-        floor = np.array([steps[0], steps[1], steps[1]]) / np.sqrt(12)
+        steps = np.array([(s.range[1] - s.range[0]) / (1 << s.bits) for s in outputs])
+        noise = np.maximum(np.array([s.noise for s in outputs]) * gain, steps / np.sqrt(12))
         out = {}
-        for s in self.placed:
-            free = int((~self.sources[s.record].locked).sum())
-            out[s.stratum] = np.repeat(np.maximum(base, floor), free)
+        for window in self.placed:
+            free = int((~self.sources[window.record].locked).sum())
+            out[window.stratum] = np.repeat(noise, free)
         return out
 
     def measured_start(self, window: PlacedWindow) -> Array:
