@@ -20,6 +20,7 @@ from scipy.special import ndtri, stdtrit
 from analysis.identify.estimators.equations import RepeatBlock, rows_of
 
 Array = NDArray[np.float64]
+Units = dict[tuple[int, str], list[tuple[int, int]]]  # by (run, step): (repeat, part or -1)
 
 
 def bootstrap(
@@ -29,9 +30,9 @@ def bootstrap(
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Return the ends (k,) of the 95 % intervals of `estimate`, from `draws` sets of blocks."""
-    value = estimate(blocks)
-    drawn = np.array([estimate(_resampled(blocks, rng)) for _ in range(draws)])
-    counts = [len(members) for members in _units(blocks).values()]
+    value, units = estimate(blocks), _units(blocks)
+    drawn = np.array([estimate(_resampled(blocks, units, rng)) for _ in range(draws)])
+    counts = [len(members) for members in units.values()]
     n = min(counts)
     stretch = np.sqrt(n / max(n - 1, 1))
     if n > 1:
@@ -40,27 +41,27 @@ def bootstrap(
     return value + stretch * low, value + stretch * high
 
 
-def _units(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str], list[tuple[int, int]]]:
+def _units(blocks: Sequence[RepeatBlock]) -> Units:
     """Return the units to draw in each stratum: (repeat, -1), or (only repeat, part)."""
-    repeats: dict[tuple[int, str], set[int]] = {}
-    for b in blocks:
-        repeats.setdefault(b.stratum, set()).add(b.repeat)
-    out: dict[tuple[int, str], list[tuple[int, int]]] = {}
-    for stratum, repeat_blocks in repeats.items():
-        if len(repeat_blocks) > 1:
-            out[stratum] = [(r, -1) for r in sorted(repeat_blocks)]
+    out: Units = {}
+    for stratum in dict.fromkeys(b.stratum for b in blocks):
+        own = [b for b in blocks if b.stratum == stratum]
+        repeats = sorted({b.repeat for b in own})
+        if len(repeats) > 1:
+            out[stratum] = [(repeat, -1) for repeat in repeats]
         else:
-            (only,) = repeat_blocks
-            parts = {int(s) for b in blocks if b.stratum == stratum for s in np.unique(b.segment)}
-            out[stratum] = [(only, s) for s in sorted(parts)]
+            parts = np.unique(np.concatenate([b.segment for b in own]))
+            out[stratum] = [(repeats[0], part) for part in parts.tolist()]
     return out
 
 
-def _resampled(blocks: Sequence[RepeatBlock], rng: np.random.Generator) -> list[RepeatBlock]:
+def _resampled(
+    blocks: Sequence[RepeatBlock], units: Units, rng: np.random.Generator
+) -> list[RepeatBlock]:
     out = []
-    for stratum, units in _units(blocks).items():
-        for copy, pick in enumerate(rng.integers(0, len(units), len(units))):
-            repeat, part = units[int(pick)]
+    for stratum, members in units.items():
+        for copy, pick in enumerate(rng.integers(0, len(members), len(members))):
+            repeat, part = members[int(pick)]
             for b in blocks:
                 if b.stratum == stratum and b.repeat == repeat:
                     out.append(_piece(b, part, copy))
