@@ -100,7 +100,7 @@ def validate_record(
     # Sensors are corrected by the model's sensor effects before anything is compared.
     channels = aligned_channels(rig, record)
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
-    measured = _compared(rig, channels, signals)
+    measured = compared(rig, channels, signals)
     ready, drive = compiled(model), drive_of(signals)
     hidden = hidden_paths(model, signals)
     first_of_all = first_state(rig, record, signals, channels)
@@ -152,11 +152,11 @@ def arrived(rig: Rig, record: Record) -> Mask:
     return np.asarray(~lost)
 
 
-def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
+def compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
     """Return the measured piston and pressures (electric: position) of the excited joints."""
     return {
         ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
-        for i in map(int, np.flatnonzero(signals.excited))
+        for i in signals.excited_joints
         for kind in rig.simulated_kinds
     }
 
@@ -179,7 +179,7 @@ def first_state(rig: Rig, record: Record, signals: Signals, channels: Mapping[st
     t = np.arange(count) / record.sample_rate
     state = state_at(signals, 0)
     q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
-    for i in map(int, np.flatnonzero(signals.excited)):
+    for i in signals.excited_joints:
 
         def fitted(kind: str, joint: int = i) -> Array:
             samples = channels[ch.channel(kind, joint + 1)][:count]

@@ -35,9 +35,8 @@ from analysis.simulation.simulate import (
     simulate,
     state_at,
 )
-from analysis.simulation.validate import arrived
+from analysis.simulation.validate import arrived, compared
 from analysis.terms.base import Used
-from rig.model import channels as ch
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -148,15 +147,11 @@ def make_task(
             f"record {record.name!r} of {record.samples / record.sample_rate:g} s is too short "
             f"for a window of {options.seconds:g} s; take a longer one"
         )
-    channels, every = aligned_channels(rig, record), arrived(rig, record)
-    shown = [
-        ch.channel(kind, i + 1)
-        for i in map(int, np.flatnonzero(signals.excited))
-        for kind in (ch.PISTON, ch.CAP, ch.ROD)
-    ]
+    channels = compared(rig, aligned_channels(rig, record), signals)
+    every = arrived(rig, record)
     windows = []
     for first in np.unique(np.linspace(reach, reach + room, options.windows).astype(int)):
-        measured = {name: channels[name][first : first + length] for name in shown}
+        measured = {name: x[first : first + length] for name, x in channels.items()}
         valid = every[first : first + length]
         spread = {n: float(valid.sum() * y[valid].var()) for n, y in measured.items()}
         start = state_at(signals, int(first))

@@ -33,9 +33,8 @@ from analysis.regression.solve import Solution
 from analysis.signals.conditioning import Mask, aligned_channels
 from analysis.simulation.model import Model, as_loaded, model_of
 from analysis.simulation.simulate import DrivingInput, Effort, State, compiled, drive_of, simulate
-from analysis.simulation.validate import arrived, first_state
+from analysis.simulation.validate import arrived, compared, first_state
 from analysis.terms.base import Used
-from rig.model import channels as ch
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -51,12 +50,11 @@ class _Record:
         self.key, self.repeat = conditioned.group, record.repeat
         self.drive: DrivingInput = drive_of(signals)
         self.start: State = first_state(rig, record, signals, channels)
-        self.names = [
-            ch.channel(rig.position_kind, i + 1) for i in map(int, np.flatnonzero(signals.excited))
-        ]
+        measured = compared(rig, channels, signals)
+        self.names = tuple(measured)
         self.loaded = record.loaded
         self.here: Mask = arrived(rig, record)
-        self.measured: Array = np.column_stack([channels[n] for n in self.names])[self.here]
+        self.measured: Array = np.column_stack(list(measured.values()))[self.here]
 
     def residual(self, model: Model) -> Array:
         """Return measured less simulated positions (n, F)."""
