@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,13 +14,7 @@ from analysis.effects.supply import BULK, PortEffect
 from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
-from analysis.identify.estimation import (
-    OUTPUT_ERROR,
-    UNBIASED,
-    EstimationJob,
-    Refinement,
-    refine,
-)
+from analysis.identify.estimation import UNBIASED, EstimationJob, Refinement, refine
 from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows
 from analysis.identify.reduction import (
     RecordReduction,
@@ -64,23 +59,17 @@ def coupled(
     """
     rig = ck.common_rig(runs)
     estimator = _fitting_estimator(rig, used, estimator, bootstrap)
-
-    def refined(solutions: Mapping[str, Solution]) -> Refinement:
-        if rig.electric and estimator == OUTPUT_ERROR:
-            from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
-
-            fitted, check = free_run_fit(rig, runs, used, solutions)
-            return Refinement(fitted, (check,), estimator)
-        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
-        return refine(job, solutions)
-
     built = build_rows(rig, runs, used, filtering, progress)
-    reductions = reduce_rows(rig, used, built)
-    sources = [run.source for run in runs]
+    job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
     result = conclude(
-        rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined,
+        rig,
+        [run.source for run in runs],
+        used,
+        reduce_rows(rig, used, built),
+        reject_noise,
+        None if estimator == PLAIN else functools.partial(refine, job),
         shifts_of_rows(rig, used, built),
-    )  # fmt: skip
+    )
     return replace(result, built=tuple(built))
 
 

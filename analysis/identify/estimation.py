@@ -20,7 +20,6 @@ from analysis.identify.estimators.equations import (
     blocks_of,
     common,
     least_squares,
-    levelled,
     pieces,
 )
 from analysis.identify.estimators.instruments import (
@@ -101,6 +100,11 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
     `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
     InputError for an estimator that needs repeats where a step has only one.
     """
+    if job.rig.electric and job.estimator == OUTPUT_ERROR:
+        from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
+
+        fitted, check = free_run_fit(job.rig, job.runs, job.terms, solutions)
+        return Refinement(fitted, (check,), job.estimator)
     counted = repeats_in_motion(
         job.rig, ((rows.conditioned.run, rows.record) for rows in job.built)
     )
@@ -191,7 +195,6 @@ def _prepare(
     values = inverted(job.rig, job.terms, coefficients)
     extra = nu.nuisance_terms(job.terms, job.runs, values)
     built = with_columns(job.rig, job.terms, job.built, extra)
-    records = {(rows.conditioned.run, rows.record.name): rows.record for rows in built}
     checks: list[Check] = []
     out = []
     for family, solution in solutions.items():
@@ -205,8 +208,8 @@ def _prepare(
         nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
         names = (*determined, *nuisances)
         kept = [columns.index(name) for name in names]
-        blocks = levelled(blocks_of(built, family, kept), records)
-        prepared = FamilyBlocks(family, names, len(determined), tuple(blocks))
+        blocks = tuple(blocks_of(built, family, kept))
+        prepared = FamilyBlocks(family, names, len(determined), blocks)
         if nuisances:
             prepared, stated = _plausible(prepared)
             checks += stated

@@ -197,14 +197,13 @@ def _projection(X: Array, minimum: Minimum) -> Array:
 
 
 def _cost(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) -> Cost:
-    k = len(minimum.beta)
+    k, C = len(minimum.beta), minimum.active
+    if not len(C):
+        return Cost(0.0, (), (), 1.0)
     rest = solution.triangle[k, k] ** 2
     before = float(np.sum((y - X @ solution.value) ** 2)) + rest
     after = float(np.sum((y - X @ minimum.beta) ** 2)) + rest
     growth = float(np.sqrt(after / before) - 1.0) if before > 0 else 0.0
-    C = minimum.active
-    if not len(C):
-        return Cost(0.0, (), (), 1.0)
     apart = C @ solution.value
     gap = tuple(
         _constraint_text(label, rig, solution, row, value)

@@ -29,7 +29,7 @@ class RepeatBlock:
     """Rows of one equation of one record: X (m, k), y (m,), time (m,) [s].
 
     `segment` (m,) is the part of the excitation's period that each row lies in, `level` (m,) the
-    bin of the equation's own state (`levelled`).
+    bin of the equation's own state.
     """
 
     run: int
@@ -108,7 +108,7 @@ def segments(time: Array, period: float, shared: tuple[float, float] | None = No
 
 
 def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> list[RepeatBlock]:
-    """Return the blocks of one family with the columns `kept`."""
+    """Return the blocks of one family with the columns `kept`, sorted into segments and levels."""
     every = [(record_rows, rows) for record_rows in built for rows in record_rows.family(family)]
     shared: dict[tuple[int, str, str], tuple[float, float]] = {}
     for record_rows, rows in every:
@@ -127,7 +127,7 @@ def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> 
                 np.zeros(len(rows.rhs), dtype=np.int64),
             )
         )  # fmt: skip
-    return blocks
+    return _levelled(blocks, {(*r.group, r.record.name): r.record for r in built})
 
 
 def solve(blocks: Sequence[RepeatBlock], Z: Sequence[Array], w: Sequence[Array]) -> EquationFit:
@@ -231,8 +231,8 @@ def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
     )  # fmt: skip
 
 
-def levelled(
-    blocks: Sequence[RepeatBlock], records: Mapping[tuple[int, str], Record]
+def _levelled(
+    blocks: Sequence[RepeatBlock], records: Mapping[tuple[int, str, str], Record]
 ) -> list[RepeatBlock]:
     """Return the blocks with `level`, the bin of the state that the equation's law depends on.
 
@@ -244,7 +244,7 @@ def levelled(
     for number, (_, mine) in enumerate(sorted(alike(blocks).items())):
         own = [blocks[k] for k in mine]
         ticks = np.concatenate([b.ticks for b in own])
-        state = np.concatenate([_state(b, records[b.run, b.record]) for b in own])
+        state = np.concatenate([_state(b, records[*b.stratum, b.record]) for b in own])
         times, place = np.unique(ticks, return_inverse=True)
         mean = np.bincount(place, state) / np.bincount(place)
         rank = np.empty(len(times), dtype=np.int64)

@@ -103,7 +103,7 @@ class LaminarTransition(Term):
         for i in signals.excited_joints:
             u = signals.u[:, i]
             openings = np.maximum(u, 0.0), np.minimum(u, 0.0)
-            out |= _at_edges(signals, i, self.gains, TAU, openings, _lost)
+            out |= _at_edges(signals, i, self.gains, TAU, openings, _transition)
         return out
 
 
@@ -166,7 +166,8 @@ def _at_edges(
     return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
 
 
-def _lost(drop: Array) -> Array:
+def _transition(drop: Array) -> Array:
+    """Return - dp^(-3/2) / 4 of drops (n,) [Pa]; below `least_drop` it is held."""
     held = np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop)
     return np.asarray(-0.25 / (held * np.sqrt(held)))
 
