@@ -12,10 +12,10 @@ from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled, with_identified_bulk_modulus
 from analysis.identify.estimation import OUTPUT_ERROR, refuse_unknown
 from analysis.identify.geometry import tolerances_ignored
+from analysis.identify.methods.population_search import search_parameters
 from analysis.identify.methods.search import SearchOptions
 from analysis.identify.methods.sequential import sequential
 from analysis.identify.methods.simultaneous import simultaneous
-from analysis.identify.methods.swarm import search_parameters
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering

@@ -112,12 +112,12 @@ class Windows:
             if name in shapes
         }
         names = (*(c.parameter for u in terms for c in u.term.coefficients(rig)), *shapes)
-        self.warm = (
+        self.with_temperature = (
             free is None
             and "b" in names
             and all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
         )
-        self.names = (*names, nu.KAPPA) if self.warm else names
+        self.names = (*names, nu.KAPPA) if self.with_temperature else names
         self.sources: list[WindowSource] = []
         self.placed: list[PlacedWindow] = []
         self._without_influence: dict[int, set[int]] = {}
@@ -208,7 +208,7 @@ class Windows:
     def _perturbed(self, theta: Array, source: WindowSource) -> PerturbedModel:
         """Compile the model with every parameter perturbed, and compute its hidden states."""
         sizes = IDENTIFY.sensitivity_step * np.where(theta == 0.0, 1.0, np.abs(theta))
-        if self.warm:
+        if self.with_temperature:
             b = abs(theta[self.names.index("b")])
             sizes[-1] = IDENTIFY.sensitivity_step * b
         rows = [theta, *(theta + n * e for n, e in zip(sizes, np.eye(len(theta)), strict=True))]
@@ -230,7 +230,7 @@ class Windows:
             shape = list(terms[k].shape)
             shape[j] = values.pop(name)
             terms[k] = replace(terms[k], shape=tuple(shape))
-        if self.warm:
+        if self.with_temperature:
             values["b"] += kelvin * values.pop(nu.KAPPA)
         return model_of(self.rig, terms, inverted(self.rig, terms, values))
 
