@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 
 from analysis.identify.result import estimates_of
 from analysis.identify.settings import IDENTIFY
-from analysis.regression.chunks import Locks, divisible, overlap, stretch_rows
+from analysis.regression.chunks import Locks, overlap, stretch_rows
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
 from analysis.regression.solve import Accumulator, RowCluster, Solution, merge, solve
 from analysis.simulation.model import Estimate
 from analysis.terms import baseline_of
-from analysis.terms.base import Term, Used, family_of
+from analysis.terms.base import Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 
 class RowFeed:
-    """Rows of one record, built while its samples arrive."""
+    """Rows of one record, built while its samples arrive; the filters must be of finite length."""
 
     def __init__(
         self,
@@ -52,10 +52,9 @@ class RowFeed:
         filtering: Filtering,
         families: Collection[str],
     ) -> None:
-        if not divisible(filtering):
-            raise InputError("rows can only be made on-line by filters of finite length")
         N = len(rig.joints)
-        self._rig, self._terms, self._head, self._filtering = rig, terms, head, filtering
+        self.head = head
+        self._rig, self._terms, self._filtering = rig, terms, filtering
         self._families = families
         self._chunk = round(IDENTIFY.online_chunk * head.sample_rate)
         self._locks = Locks(np.full(N, np.inf), np.zeros(N))
@@ -66,7 +65,7 @@ class RowFeed:
     @property
     def delay(self) -> float:
         """The largest delay of a row [s]."""
-        return (self._spare + self._chunk) / self._head.sample_rate
+        return (self._spare + self._chunk) / self.head.sample_rate
 
     def feed(self, channels: Mapping[str, Array]) -> dict[str, Rows]:
         """Take the next samples, NaN where lost; return the completed rows, if any."""
@@ -84,7 +83,7 @@ class RowFeed:
         part: dict[str, Array] = {n: np.concatenate([w[n] for w in self._waiting]) for n in names}
         own = (self._first, last)
         rows = stretch_rows(
-            self._rig, self._terms, self._head.record(part), self._offset, own,
+            self._rig, self._terms, self.head.record(part), self._offset, own,
             self._filtering, self._locks, self._families,
         )  # fmt: skip
         step = self._filtering.step
@@ -228,7 +227,7 @@ class Tracker:
     """Follows parameters through the records of a run: `begin`, `feed` ..., `end` or `discard`.
 
     `memory` [s] is the time constant of forgetting, infinite for none. Raises InputError for one
-    that is not positive, and from `begin` for filters of infinite length.
+    that is not positive.
     """
 
     def __init__(
@@ -242,41 +241,36 @@ class Tracker:
         if families is None:  # the families that do not depend on locked joints, if any
             families = rig.families[-1:]
         self._rig, self._families = rig, tuple(families)
-        used = map(Used, baseline_of(rig))
-        self._terms = tuple(term for term in used if self._concerns(term))
+        self._terms = tuple(
+            Used(term)
+            for term in baseline_of(rig)
+            if any(c.family in self._families for c in term.coefficients(rig))
+        )
         names = {family: parameters_of(rig, self._terms, family) for family in families}
         self._kept = {family: _Filter(every, memory) for family, every in names.items()}
         self._running = self._kept
-        self._head: RecordHead | None = None
         self._feed: RowFeed | None = None
         self._start = 0.0
         self._clock = -np.inf
         self.record_rows = 0  # of the present record, or of the last one
 
-    def _concerns(self, used: Used) -> bool:
-        """Return whether a term acts in the families followed."""
-        prepares = type(used.term).prepare is not Term.prepare
-        return prepares or any(
-            c.family in self._families for c in used.term.coefficients(self._rig)
-        )
-
     def begin(self, head: RecordHead) -> None:
         """Begin a record, of which `samples` may be unknown; `start` [s] is the device's time."""
         # Imported records all start at 0: they are then placed one after the other.
         self._start = max(head.start, self._clock)
-        self._head, self.record_rows = head, 0
+        self.record_rows = 0
         filters = default_filtering(head.record({}))
         self._feed = RowFeed(self._rig, self._terms, head, filters, self._families)
         self._running = copy.deepcopy(self._kept)
 
     def feed(self, channels: Mapping[str, Array]) -> bool:
         """Take the record's next samples, NaN where lost; return whether the estimates are new."""
-        return self._feed is not None and self._fold(self._feed.feed(channels))
+        return self._feed is not None and self._fold(self._feed.head, self._feed.feed(channels))
 
     def end(self) -> None:
         """End the record and keep its rows."""
         if self._feed is not None:
-            self._fold(self._feed.finish())
+            self._fold(self._feed.head, self._feed.finish())
             for solution in self._running.values():
                 solution.condense()
         self._kept, self._feed = self._running, None
@@ -285,13 +279,13 @@ class Tracker:
         """End the record and drop its rows."""
         self._running, self._feed = self._kept, None
 
-    def _fold(self, by_equation: Mapping[str, Rows]) -> bool:
-        if self._head is None or not by_equation:
+    def _fold(self, head: RecordHead, by_equation: Mapping[str, Rows]) -> bool:
+        if not by_equation:
             return False
         for family, running in self._running.items():
             rows = [r for name, r in by_equation.items() if family_of(name) == family]
             if rows:
-                running.fold(self._head, rows, self._start)
+                running.fold(head, rows, self._start)
                 self.record_rows += sum(len(r.rhs) for r in rows)
                 self._clock = max([self._clock, *(self._start + r.time[-1:].sum() for r in rows)])
         return True
