@@ -275,7 +275,7 @@ class PositionForce(Effect):
         several poses, or there is no weight.
         """
         i = self.joint
-        below = any(s.moving is not None and s.moving[:i].any() for s in evidence.signals)
+        below = any(s.moving[:i].any() for s in evidence.signals)
         if below or rig.gravity == 0 or getattr(rig, "prismatic", False):
             return None
         place = evidence.of_joint(i, lambda x: x.s[:, i])

@@ -284,7 +284,8 @@ def right_parts(
         if family == "fluid":  # below zero the oil cavitates, and the flow balance does not hold
             sensors &= (signals.p_cap if kind == "flow_cap" else signals.p_rod)[:, i] >= 0.0
         sines = filtered_sines(signals, filtering, name)
-        out[name] = RightPart(side, time, sensors, _lost(signals, joints), sines)
+        lost = np.asarray(signals.lost[:, joints].any(axis=1))
+        out[name] = RightPart(side, time, sensors, lost, sines)
     return out
 
 
@@ -309,12 +310,6 @@ def without_sines(columns: Array, sines: Array) -> Array:
     if not sines.size:
         return columns
     return np.asarray(columns - sines @ np.linalg.lstsq(sines, columns, rcond=None)[0])
-
-
-def _lost(signals: Signals, joints: slice) -> Mask:
-    if signals.lost is None:
-        return np.zeros(len(signals.t), dtype=bool)
-    return np.asarray(signals.lost[:, joints].any(axis=1))
 
 
 def assembled(

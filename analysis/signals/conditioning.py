@@ -60,8 +60,8 @@ class Signals:
     temperature: Array
     excited: Mask
     valid: Mask
-    lost: Mask | None = None
-    bands: Array | None = None
+    lost: Mask
+    bands: Array
     weight: Array | None = None
     loaded: bool | None = None
 
@@ -71,9 +71,9 @@ class Signals:
         return int(self.s.shape[1])
 
     @property
-    def moving(self) -> Mask | None:
+    def moving(self) -> Mask:
         """The joints (N,) whose motion is the measured one; the others stand still."""
-        return None if self.bands is None else self.bands > 0.0
+        return self.bands > 0.0
 
     @property
     def excited_joints(self) -> list[int]:
@@ -273,7 +273,7 @@ def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
 
 
 def _geometry(
-    rig: Rig, s: Array, sd: Array, sdd: Array, moving: Mask | None
+    rig: Rig, s: Array, sd: Array, sdd: Array, moving: Mask
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
     """Return q, dq/dt, d2q/dt2, G, absolute angles and chamber volumes (cap, rod), each (n, N).
 
@@ -281,8 +281,7 @@ def _geometry(
     """
     q, G, slope = np.empty_like(s), np.empty_like(s), np.empty_like(s)
     for i, joint in enumerate(rig.joints):
-        still = moving is not None and not moving[i]
-        q[:, i], G[:, i], slope[:, i] = joint.geometry(s[:1, i] if still else s[:, i])
+        q[:, i], G[:, i], slope[:, i] = joint.geometry(s[:, i] if moving[i] else s[:1, i])
     qd = sd / G
     theta = rig.base_angle + np.cumsum(q.T, axis=0).T
     volumes = [rig.chamber_volumes(i, s[:, i]) for i in range(len(rig.joints))]

@@ -37,6 +37,7 @@ def signals_of(rig: Rig, q: Array, qd: Array, qdd: Array, rng: np.random.Generat
         V_rod=np.column_stack([v[1] for v in volumes]),
         p_s=rng.uniform(6.8e6, 7e6, n), p_tank=np.zeros(n), temperature=np.full(n, 40.0),
         excited=np.ones(N, dtype=bool), valid=np.ones((n, N), dtype=bool),
+        lost=np.zeros((n, N), dtype=bool), bands=np.full(N, np.inf),
     )  # fmt: skip
 
 

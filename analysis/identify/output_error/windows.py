@@ -136,9 +136,9 @@ class Windows:
             every = self.every
             points = round(IDENTIFY.window * record.sample_rate) // (SAMPLES_PER_STEP * every)
             length = points * SAMPLES_PER_STEP * every
-            good: Mask = np.asarray(signals.valid[:, free].all(axis=1))
-            if signals.lost is not None:  # of any joint: the locked ones drive the others
-                good = np.asarray(good & ~signals.lost.any(axis=1))
+            # No sample of any joint may be lost: the locked ones drive the others.
+            lost = signals.lost.any(axis=1)
+            good: Mask = np.asarray(signals.valid[:, free].all(axis=1) & ~lost)
             firsts = self._fitting(good, length)
             chosen = firsts[:: max(1, -(-len(firsts) // most))][:most]
             measured = np.column_stack(

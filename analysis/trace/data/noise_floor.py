@@ -220,9 +220,8 @@ def noise_by_neighbours(
 def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
     """Return the moving joints' states (m, k) at the instants of rows, each of unit deviation."""
     signals, at = conditioned.signals, conditioned.samples_at(rows.time)
-    joints = signals.excited if signals.moving is None else signals.moving
     kinds = (signals.q, signals.qd, signals.u, signals.p_cap, signals.p_rod)
-    columns = np.column_stack([kind[np.ix_(at, joints)] for kind in kinds])
+    columns = np.column_stack([kind[np.ix_(at, signals.moving)] for kind in kinds])
     spread = columns.std(axis=0)
     return np.asarray(columns[:, spread > 0] / spread[spread > 0])
 

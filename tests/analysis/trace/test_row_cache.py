@@ -51,6 +51,7 @@ def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
     arrays = {name: np.ones((n, N)) for name in (*fields, "V_cap", "V_rod")}
     bench = {name: np.ones(n) for name in ("t", "p_s", "p_tank", "temperature")}
     marks = {"excited": np.ones(N, dtype=bool), "valid": np.ones((n, N), dtype=bool)}
+    marks |= {"lost": np.zeros((n, N), dtype=bool), "bands": np.full(N, np.inf)}
     signals = Signals(rate=1e3, **arrays, **bench, **marks)
     values, made = SignalCache(), []
 

@@ -245,4 +245,5 @@ def _signals(rate: float, q: Array, qd: Array, qdd: Array) -> Signals:
         theta=np.cumsum(q, axis=1), G=np.ones_like(q), p_cap=none, p_rod=none, pd_cap=none,
         pd_rod=none, V_cap=none, V_rod=none, p_s=zero, p_tank=zero, temperature=zero,
         excited=np.ones(q.shape[1], dtype=bool), valid=np.ones(q.shape, dtype=bool),
+        lost=np.zeros(q.shape, dtype=bool), bands=np.full(q.shape[1], np.inf),
     )  # fmt: skip
