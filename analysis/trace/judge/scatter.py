@@ -109,16 +109,18 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     Two errors are added as squares. (1) Where an effect has another form (`Effect.other_forms`),
     that is fitted too and shifts each coefficient, but for its own under another load, where they
     mean something else. The shift counts by sqrt(E / (E + D)), with E the energy above noise that
-    the chosen form leaves, at least `TRACE.form_noise`, and D what the other leaves more: in full
-    where the other is as good, and not at all where it is physically impossible. (2) An effect may
+    is left in the rows on which the effect acts, at least `TRACE.form_noise`, and D what the other
+    form leaves more: in full where the other is as good, and not at all where it is physically
+    impossible. (2) An effect may
     not grow in proportion, with x (1 + e |x| / rms x) in place of its contribution x to the rows.
     Where e exceeds `TRACE.standard_errors` of its noise, the shift that it makes counts.
     """
-    own = max(fit.energy - len(fit.residual), TRACE.form_noise)
     squares = _growth_shift_squares(train_data, fit)
-    for other in fits_in_other_forms(train_data, fit):
+    for used, other in fits_in_other_forms(train_data, fit):
         if not _is_possible(train_data.rig, other):
             continue
+        left = fit.residual[contribution(train_data, fit, used) != 0.0]
+        own = max(float(left @ left) - len(left), TRACE.form_noise)
         share = own / (own + max(0.0, other.energy - fit.energy))
         incomparable = _of_other_meaning(train_data.rig, fit, other)
         for name, value in other.beta.items():

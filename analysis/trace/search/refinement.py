@@ -262,13 +262,13 @@ def _from_unit(x: float, shape: Shape) -> float:
     return shape.low + x * (shape.high - shape.low)
 
 
-def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
-    """Return the fits with each effect in each of its other forms."""
+def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[tuple[Used, ExactFit]]:
+    """Return each effect with each fit in which it has another of its forms."""
     out = []
     for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
             terms = with_term(fit.terms, used, Used(used.term, shape))
-            out.append(_with_searched_shapes(data, terms, SEARCH.steps))
+            out.append((used, _with_searched_shapes(data, terms, SEARCH.steps)))
     return out
