@@ -40,6 +40,9 @@ FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing t
 # On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
 # 1 mm/s does not (2 %).
 TRANSITION: Final = 1e-4
+# The spread of the velocity in a contact without memory.
+NORMAL, CAUCHY = 0.0, 1.0
+TWO_OVER_PI: Final = 2.0 / math.pi
 
 
 @dataclass(frozen=True)
@@ -103,8 +106,15 @@ def transition(name: str, among: ContactRange) -> Shape:
     return Shape(name, unit, *bounds, (among.speed,), resolution=True, detail=True)
 
 
-def memoryless(v: Array, speed: float) -> Array:
-    """Return z = erf(v / w) (n,) of a velocity v (n,) [m/s] and a transition speed w [m/s]."""
+def tail(name: str) -> Shape:
+    """Return the shape of a contact whose spread is Cauchy's; without it, it is normal."""
+    return Shape(name, "1", CAUCHY, CAUCHY, (CAUCHY,), detail=True, fixed=True)
+
+
+def memoryless(v: Array, speed: float, tail: float = NORMAL) -> Array:
+    """Return z (n,) of a velocity v (n,) [m/s], the transition speed w [m/s] and a tail."""
+    if tail == CAUCHY:
+        return np.asarray(TWO_OVER_PI * np.arctan(v / speed))
     return np.asarray(erf(v / speed))
 
 
@@ -165,13 +175,21 @@ def contact_levels(s, extending, retracting):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def slide(v, y, distance, stiffening, speed):  # type: ignore[no-untyped-def]
+def mean_sign(v, speed, tail):  # type: ignore[no-untyped-def]
+    """Return z of one velocity v [m/s], as `memoryless` does."""
+    if tail == CAUCHY:
+        return TWO_OVER_PI * math.atan(v / speed)
+    return math.erf(v / speed)
+
+
+@njit(cache=True, error_model="numpy")
+def slide(v, y, distance, stiffening, speed, tail):  # type: ignore[no-untyped-def]
     """Return (z, dy/dt) of the deflection y = d z, its relaxation bounded at `FASTEST`.
 
-    Without a distance the contact has no memory, and `speed` is its transition speed.
+    Without a distance the contact has no memory, but a transition speed and a spread's tail.
     """
     if distance <= 0.0:
-        return math.erf(v / speed), 0.0
+        return mean_sign(v, speed, tail), 0.0
     pace = 1.0 + stiffening * abs(v)
     relax = abs(v) / distance
     return y / distance, pace * (v - relax * y) / (1.0 + pace * relax / FASTEST)

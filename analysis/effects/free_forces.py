@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
-from analysis.effects.contact import contact_range, path_unit, slide
+from analysis.effects.contact import NORMAL, contact_range, path_unit, slide
 from analysis.effects.curve import (
     LAST,
     curve_at,
@@ -62,7 +62,7 @@ def _over_speed(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped
     if phase == CONTRIBUTE:
         i = int(par[0])
         v = x[SD, i]
-        state, dz[0] = slide(v, z[0], par[1], 0.0, par[2])
+        state, dz[0] = slide(v, z[0], par[1], 0.0, par[2], NORMAL)
         force = state * curve_at(abs(v), par, 3, 4) + abs(state) * curve_at(abs(v), par, 15, 4)
         out[TORQUE, i] -= x[G, i] * force * max(0.0, 1.0 + par[27] * (x[S, i] - par[28]))
 

@@ -10,8 +10,9 @@ the faster it is (stiffening k; of rubber: Ferry 1980):
 The piston's path alone decides z, so that the rows use the measured piston; the simulation
 integrates the deflection y = d z [m] as a hidden state. A presliding distance of 0 means the
 contact without memory, z = erf(s'/w) with the transition speed w (`TRANSITION` in a model without a
-shape). d, k and w are shape parameters; the rows decide between a distance and a transition speed.
-Stribeck's and asymmetric friction have k = 0.
+shape), or 2/pi atan(s'/w) of one level and of levels by direction. d, k and w are shape parameters;
+the rows decide between a distance and a transition speed. Stribeck's and asymmetric friction have
+k = 0.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ import numpy as np
 
 from analysis.effects.base import Array, Effect, Shape, beyond
 from analysis.effects.contact import (
+    CAUCHY,
     FASTEST,
+    NORMAL,
     STIFFENING,
     TRANSITION,
     contact_range,
@@ -36,6 +39,7 @@ from analysis.effects.contact import (
     presliding,
     slide,
     stiffening,
+    tail,
     transition,
     worked,
 )
@@ -66,8 +70,9 @@ class Friction(Effect):
     """Common parts of the four forms: joint, the contact's state z, with memory or without.
 
     Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen. A
-    shape with a transition speed has no memory, and 0 for distance and stiffening. `before` and
-    `after` count the shape parameters before and after the contact's own.
+    shape with a transition speed has no memory, and 0 for distance and stiffening; where the
+    contact is `tailed` it may state the tail of the spread. `before` and `after` count the shape
+    parameters before and after the contact's own.
     """
 
     mechanism = "friction_curve"
@@ -75,6 +80,7 @@ class Friction(Effect):
     family = "friction"
     quantity = "velocity"
     stiffens: ClassVar[bool] = False
+    tailed: ClassVar[bool] = False
     before: ClassVar[int] = 0
     after: ClassVar[int] = 0
     where: str = "joint 1"
@@ -84,13 +90,14 @@ class Friction(Effect):
         return (f"presliding_{self.joint + 1}",)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name distances, stiffening where the contact stiffens, and transition speed."""
+        """Name distances, stiffening where the contact stiffens, transition speed and tail."""
         joint = self.joint + 1
         rate = (f"stiffening_{joint}",) if self.stiffens else ()
-        return (*self.distance_names(), *rate, f"transition_{joint}")
+        spread = (f"tail_{joint}",) if self.tailed else ()
+        return (*self.distance_names(), *rate, f"transition_{joint}", *spread)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return presliding distances [m], stiffening [s/m] and transition speed [m/s].
+        """Return presliding distances [m], stiffening [s/m], transition speed [m/s] and tail.
 
         On an electric joint they are in its own unit.
         """
@@ -98,7 +105,8 @@ class Friction(Effect):
         rate = (stiffening(f"stiffening_{joint}"),) if self.stiffens else ()
         among = contact_range(rig, self.joint)
         distances = (presliding(name, among) for name in self.distance_names())
-        return (*distances, *rate, transition(f"transition_{joint}", among))
+        spread = (tail(f"tail_{joint}"),) if self.tailed else ()
+        return (*distances, *rate, transition(f"transition_{joint}", among), *spread)
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where the contact has a memory and can stiffen."""
@@ -107,17 +115,25 @@ class Friction(Effect):
         return (tuple(shape),)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the contact without memory, of a shape that has one."""
-        if not len(shape) or not self.remembers(shape):
+        """Return the contact without memory of a shape with one, else that of the other tail."""
+        if not len(shape):
             return ()
         place = self._speed_place()
+        if not self.remembers(shape):
+            other = () if self.tail_of(shape) == CAUCHY else (CAUCHY,)
+            return ((*shape[: place + 1], *other),) if self.tailed else ()
         none = (0.0,) * (place - self.before)
         speed = contact_range(rig, self.joint).speed
         return ((*shape[: self.before], *none, speed, *shape[place + 1 :]),)
 
     def _speed_place(self) -> int:
-        """Return the place of the transition speed in a shape, the last of the contact's own."""
-        return len(self.shape_names()) - self.after - 1
+        """Return the place of the transition speed in a shape."""
+        return len(self.shape_names()) - self.after - 1 - self.tailed
+
+    def tail_of(self, shape: Sequence[float]) -> float:
+        """Return the tail of the spread of a contact without memory, `NORMAL` if not given."""
+        place = self._speed_place() + 1
+        return shape[place] if self.tailed and len(shape) > place else NORMAL
 
     def remembers(self, shape: Sequence[float]) -> bool:
         """Return whether the contact has memory: a presliding distance above 0."""
@@ -171,23 +187,24 @@ class Friction(Effect):
         """Return z (n,) along the measured path."""
         distance, _, speed = self.contact_of(shape)
         if not self.remembers(shape):
-            return memoryless(signals.sd[:, self.joint], speed)
+            return memoryless(signals.sd[:, self.joint], speed, self.tail_of(shape))
         return np.asarray(contact_state(self.path(signals, shape), distance))
 
     def over_speed(self, speed: Array, shape: Sequence[float]) -> Array:
         """Return z (n,) in steady motion at speeds (n,) [m/s] above 0."""
         if self.remembers(shape):
             return np.ones(len(speed))
-        return memoryless(speed, self.contact_of(shape)[2])
+        return memoryless(speed, self.contact_of(shape)[2], self.tail_of(shape))
 
     def row(self, columns: Mapping[str, Array]) -> Columns:
         """Return columns of the joint's torque row."""
         return {equation("torque", self.joint): dict(columns)}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), coefficients, distance, stiffening, transition speed."""
+        """Return joint (0-based), coefficients, distance, stiffening, transition speed, tail."""
         linear = [values[c.parameter] for c in self.coefficients(rig)]
-        return np.array([self.joint, *linear, *self.contact_of(shape)], dtype=np.float64)
+        contact = (*self.contact_of(shape), self.tail_of(shape))
+        return np.array([self.joint, *linear, *contact], dtype=np.float64)
 
 
 def force_limit(rig: Rig, joint: int) -> float:
@@ -207,7 +224,7 @@ FALLS: Final = 0.5  # of the level, up to the joint's speed limit: a level by Co
 def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3], par[4])
+        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3], par[4], par[5])
         out[TORQUE, i] -= par[1] * x[G, i] * state
 
 
@@ -221,6 +238,7 @@ class CoulombFriction(Friction):
     name = "coulomb_friction"
     least = (15.0,)  # [N]
     stiffens = True
+    tailed = True
     variable = "the sign of the piston's velocity"
     confounders = ("stribeck_friction", "asymmetric_friction", "pressure_dependent_friction")
     separated_by = (
@@ -256,7 +274,7 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         if par[3] > 0.0:
             level = max(level, LEAST_LEVEL)
         # At a constant stiffness the distance goes with the level.
-        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0, par[4])
+        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0, par[4], NORMAL)
         out[TORQUE, i] -= par[1] * level * x[G, i] * state
 
 

@@ -5,7 +5,6 @@ The contact's law is that of `contact`, with a level that changes along the path
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -15,8 +14,10 @@ import numpy as np
 from analysis.effects.base import Array, Shape, beyond
 from analysis.effects.contact import (
     FASTEST,
+    NORMAL,
     contact_levels,
     contact_under_load,
+    mean_sign,
     slide,
 )
 from analysis.effects.friction import Friction, force_limit, force_unit
@@ -47,7 +48,7 @@ def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped
         i = int(par[0])
         v = x[SD, i]
         if par[3] <= 0.0:
-            state = math.erf(v / par[5])
+            state = mean_sign(v, par[5], par[6])
             out[TORQUE, i] -= (par[1] if state > 0.0 else par[2]) * x[G, i] * state
             return
         scale = (par[1] + par[2]) / par[3]
@@ -70,6 +71,7 @@ class AsymmetricFriction(Friction):
     """
 
     hydraulic = True
+    tailed = True
     name = "asymmetric_friction"
     least = (30.0, 10.0)  # [N] either way
     variable = "the direction of the piston's motion"
@@ -118,10 +120,11 @@ class AsymmetricFriction(Friction):
         return np.asarray(shape[0] * force / (extending + retracting))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), levels, presliding distances (0 for none), transition speed."""
+        """Return joint (0-based), levels, distances (0 for none), transition speed and tail."""
         linear = [values[name] for name in self._names()]
         distances = shape[:2] if len(shape) else (0.0, 0.0)
-        return np.array([self.joint, *linear, *distances, self.contact_of(shape)[2]])
+        contact = (*distances, self.contact_of(shape)[2], self.tail_of(shape))
+        return np.array([self.joint, *linear, *contact])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a driving direction, too much, and directions that do not differ."""
@@ -155,7 +158,7 @@ def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
         i = int(par[0])
         v, load = x[SD, i], abs(x[P_CAP, i] + par[6] * x[P_ROD, i])
         if par[2] <= 0.0 or par[5] <= 0.0:
-            state, dz[0] = slide(v, z[0], par[2], par[3], par[4])
+            state, dz[0] = slide(v, z[0], par[2], par[3], par[4], NORMAL)
             out[TORQUE, i] -= par[1] * load * x[G, i] * state
             return
         stiffness = par[5] / par[2]

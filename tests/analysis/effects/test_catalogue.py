@@ -42,8 +42,8 @@ CONTRACT = {
 # Forms of edge, line and seal, no sizes.
 COMPARED = range(40, 400, 45)  # samples of `state` at which kernels and rows are compared
 DETAILS = (
-    "return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition", "exponent",
-    "spread", "steepness", "sharpness",
+    "return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition", "tail",
+    "exponent", "spread", "steepness", "sharpness",
 )  # fmt: skip
 
 
@@ -198,7 +198,9 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
         for start in e.in_detail(rig, e.shape_of(rig, ())):
             # The simulation's line follows at once.
             shape = (*start[:2], 0.0) if e.name == "supply_sag" else start
-            forms += [(e, one) for one in (shape, *e.other_forms(rig, shape))]
+            others = e.other_forms(rig, shape)
+            others += tuple(form for other in others for form in e.other_forms(rig, other))
+            forms += [(e, one) for one in dict.fromkeys((shape, *others))]
     for e, shape in forms:
         signals = consistent(rig, state, e, shape) if e.stage == SUPPLY else state
         values, par = packed(e, rig, shape)

@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import erf
+from scipy.stats import cauchy, norm
 
 from analysis.effects.contact import (
+    CAUCHY,
     GRID_RATIO,
     contact_range,
     contact_state,
     contact_under_load,
+    memoryless,
     worked,
 )
 from analysis.effects.friction import CoulombFriction, StribeckFriction
-from analysis.effects.friction_levels import PressureDependentFriction
+from analysis.effects.friction_levels import AsymmetricFriction, PressureDependentFriction
 from analysis.signals.conditioning import condition
 from analysis.terms.base import Used
 from rig.model.records import Run
@@ -64,6 +67,25 @@ def test_a_level_that_does_not_change_is_the_plain_contact() -> None:
     s = place(np.arange(2000) / 2000)
     force = contact_under_load(s, np.full(len(s), 3.0), 3.0 / DISTANCE)
     assert force == pytest.approx(3.0 * contact_state(s, DISTANCE))
+
+
+def test_without_memory_a_contact_is_the_mean_sign_of_a_velocity_that_is_spread() -> None:
+    """P(v > 0) - P(v < 0) of a normal spread, and of Cauchy's, whose tails are heavier."""
+    v, w = np.linspace(-0.2, 0.2, 41), 4e-3
+    spread = norm(v, w / np.sqrt(2))
+    assert memoryless(v, w) == pytest.approx(spread.sf(0.0) - spread.cdf(0.0))
+    heavier = cauchy(v, w)
+    assert memoryless(v, w, CAUCHY) == pytest.approx(heavier.sf(0.0) - heavier.cdf(0.0))
+
+
+def test_a_level_without_memory_has_either_tail_and_returns_to_the_other(rig: Rig) -> None:
+    for effect in (CoulombFriction("joint 1"), AsymmetricFriction("joint 1")):
+        normal = (0.0, 0.0, 2e-3)
+        (heavy,) = effect.other_forms(rig, normal)
+        assert heavy == (*normal, CAUCHY)
+        assert effect.shape_names()[-1] == "tail_1"
+        assert effect.other_forms(rig, heavy) == (normal,)
+    assert "tail_1" not in StribeckFriction("joint 1").shape_names()
 
 
 def test_a_shape_without_the_detail_is_a_contact_that_does_not_stiffen(

@@ -1,7 +1,7 @@
 """Joint 2 of the seed bench in forms that share no formula with `analysis.effects`.
 
-Dry friction is a function of the velocity at the same instant (a hyperbolic tangent, an algebraic
-sigmoid, or Karnopp's band of standstill), never of the path; the supply sags in proportion to the
+Dry friction is a function of the velocity at the same instant (a hyperbolic tangent, two algebraic
+sigmoids, or Karnopp's band of standstill), never of the path; the supply sags in proportion to the
 flow drawn, at once or behind a lag; a leak is laminar or goes by the root of the pressure, edges
 may be laminar at small drops. Viscous friction may have slopes by direction or a cube; a spring may
 harden; a spool may have play and its edges a taper; the return may stand under the pressure of a
@@ -34,7 +34,7 @@ SETTLE = 4.0  # [s] before the record begins
 CENTRING = 0.3  # [V/m] that keep the piston about mid-stroke
 PUMP = 11.7e-3 / 60  # [m^3/s]
 RMS = 0.03  # [V] of the spool in training records; held-out ones have seven tenths
-TANH, SIGMOID, KARNOPP = range(3)
+TANH, SIGMOID, KARNOPP, SLOW = range(4)
 (
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
@@ -117,6 +117,8 @@ def _dry(v, s, force, hidden):
         return level if v > 0.0 else -level
     level *= math.exp(hidden[TIGHTER] * s)
     x = v / hidden[WIDTH]
+    if hidden[FORM] == SLOW:  # it approaches its level as 1 / x
+        return level * x / (1.0 + abs(x))
     return level * (x / math.sqrt(1.0 + x * x) if hidden[FORM] == SIGMOID else math.tanh(x))
 
 

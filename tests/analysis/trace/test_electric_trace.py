@@ -134,9 +134,12 @@ def test_a_revolute_joint_rubs_along_an_angle() -> None:
     """Belts and gears give by milliradians before they slip, a seal by a few hundredths of a mm."""
     arm, carriage = load_rig("electric-2dof"), load_rig("emps")
     for name in ("coulomb_friction", "friction_curve"):
-        units = {s.unit for s in make_effect(name).shapes(arm)}
-        assert units <= {"rad", "rad/s", "s/m", "1/rad"}
-        assert {s.unit for s in make_effect(name).shapes(carriage)} <= {"m", "m/s", "s/m", "1/m"}
+        units = [
+            {s.unit for s in make_effect(name).shapes(rig) if not s.parameter.startswith("tail")}
+            for rig in (arm, carriage)
+        ]
+        assert units[0] <= {"rad", "rad/s", "s/m", "1/rad"}
+        assert units[1] <= {"m", "m/s", "s/m", "1/m"}
     assert make_effect("coulomb_friction").outside(arm, (3e-3,)) == ""
     assert "m lies at the edge" in make_effect("coulomb_friction").outside(carriage, (3e-3,))
     assert make_effect("coulomb_friction").variable_on(arm) == "the sign of the joint's velocity"
