@@ -1,7 +1,8 @@
 """Which rule of the trace changes which answer: each switched off, the same records traced again.
 
-The records' columns and fits are made once and kept for all rules that leave them alone. What
-comes after the verdict (hidden states by shooting, free runs, clues) is left out.
+The records' columns and fits are made once and kept for all rules that leave them alone, and a rule
+that does not act on a bench is not switched off there. What comes after the verdict (hidden states
+by shooting, free runs, clues) is left out.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from analysis.trace.judge import held_out
 from analysis.trace.judge.shooting import ShootingResult
 from analysis.trace.result import Trace
 from analysis.trace.search import hypothesis_set
-from rig.model.records import Run
+from rig.model.records import Record, Run
 from rig.runs.rigs import load_rig
 from tests.studies.foreign.bench import runs_of
 from tests.studies.foreign.cases import OUTSIDE, PAIR, SINGLE, Case, case_of
 from tests.studies.foreign.study import answer_of, bounds
 from tests.studies.pages import Section, Table
-from tests.studies.trace.rules import FAULTS, RULES, Rule, by_name, switched_off
+from tests.studies.trace.rules import FAULTS, RULES, Rule, by_name, switched_off, watched
 
 log = logging.getLogger(__name__)
 
@@ -73,13 +74,43 @@ class Kept:
         """Return the function remembering what it returned for a key."""
 
         def remembered(*arguments: Any, **named: Any) -> Any:
-            at = (function.__name__, key(*arguments))
+            at = (function.__name__, key(*arguments, **named))
             if at not in self.results:
                 self.results[at] = function(*arguments, **named)
-                self.alive.append(arguments)
+                self.alive.append((arguments, named))
             return self.results[at]
 
         return remembered
+
+
+def _arguments(*arguments: Any, **named: Any) -> tuple[Any, ...]:
+    """Return a key of arguments: by value where they can be hashed, else by identity."""
+    return (*map(_key, arguments), *((name, _key(value)) for name, value in sorted(named.items())))
+
+
+def _key(value: Any) -> Any:
+    """Return the value if it can be hashed, a sequence as the keys of its items, else its id."""
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_key, value))
+    try:
+        hash(value)
+    except TypeError:
+        return id(value)
+    return value
+
+
+def _contents(runs: Sequence[Run]) -> tuple[Any, ...]:
+    """Return what differs between runs of a trace: records by name, their channels by mean."""
+    return tuple(
+        (record.name, *(float(x.mean()) for x in record.channels.values()))
+        for run in runs
+        for record in run.records
+    )
+
+
+def _filters(runs: Sequence[Run], filtering: Callable[[Record], Any]) -> tuple[str, ...]:
+    """Return the row filters of the records of runs."""
+    return tuple(repr(filtering(record)) for run in runs for record in run.records)
 
 
 @contextmanager
@@ -89,14 +120,36 @@ def decisions_only(kept: Kept) -> Iterator[None]:
         (
             trace_rows,
             "conditioned_records",
-            lambda _, runs, filtering, *__: (tuple(map(id, runs)), filtering),
+            lambda rig, runs, filtering, families: (
+                rig.model_dump_json(),
+                _contents(runs),
+                families,
+                _filters(runs, filtering),
+            ),
         ),
-        (trace_rows, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
-        (engine, "with_identified_bulk_modulus", lambda runs, *_: tuple(map(id, runs))),
-        (fitted_model, "coupled", lambda runs, *_, **k: tuple(map(id, runs))),
-        (hypothesis_set, "refine", lambda data, terms, *_: (id(data), terms)),
-        (hypothesis_set, "rebased", lambda data, model: (id(data), id(model))),
-        (hypothesis_set, "variant_columns", lambda data, chosen, *_: (id(data), tuple(chosen))),
+        (
+            trace_rows,
+            "regression_data",
+            lambda _, terms, members, beta=None, cache=None, **named: (
+                terms,
+                id(members),
+                repr(beta),
+                repr(named),
+            ),
+        ),
+        (engine, "with_identified_bulk_modulus", lambda runs, *_: _contents(runs)),
+        (
+            fitted_model,
+            "coupled",
+            lambda runs, terms, filtering, **_: (
+                _contents(runs),
+                tuple(terms),
+                _filters(runs, filtering),
+            ),
+        ),
+        (hypothesis_set, "refine", _arguments),
+        (hypothesis_set, "rebased", _arguments),
+        (hypothesis_set, "variant_columns", _arguments),
     )
     changes = (
         *((module, name, kept(getattr(module, name), key)) for module, name, key in remembered),
@@ -116,10 +169,13 @@ def decisions_only(kept: Kept) -> Iterator[None]:
 def answers(
     case: Case, runs: tuple[Run, list[Run]], rules: Sequence[Rule] = RULES
 ) -> Iterator[Answer]:
-    """Trace a bench with all rules, then without each."""
+    """Trace a bench with all rules, then without each that acts."""
     kept = Kept()
-    every = Rule(ALL, "", ())
-    for rule in (every, *rules):
+    started = time.process_time()
+    with decisions_only(kept), watched(rules) as acting:
+        found = engine.trace([runs[0]], runs[1], look_ahead=False)
+    yield _answer(case, Rule(ALL, "", ()), found, time.process_time() - started)
+    for rule in (rule for rule in rules if rule.name in acting):
         started = time.process_time()
         with switched_off(rule), decisions_only(kept.but("refine") if rule.refits else kept):
             found = engine.trace([runs[0]], runs[1], look_ahead=False)
@@ -244,8 +300,9 @@ def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Sectio
         Section("", (
             f"{len(base)} benches of textbook physics (`python -m tests.studies foreign`), drawn "
             "by seed, hide in turn two effects, one, two, and a cause outside the catalogue; each "
-            f"is traced with all rules and again without each of {len(RULES)}. With all rules "
-            f"{settled} answers are right, in class or a right refusal "
+            f"is traced with all rules and again without each of {len(RULES)} that acts there: one "
+            "whose functions return anything else than what replaces them, or a setting. With all "
+            f"rules {settled} answers are right, in class or a right refusal "
             f"({100 * low:.0f} to {100 * high:.0f} %, one-sided 95 % bounds), {wrong} "
             f"{'is' if wrong == 1 else 'are'} wrong or partial. Made by:",
             f"```sh\n{command}\n```",
@@ -254,7 +311,7 @@ def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Sectio
             "alarm, that occurs only without the rule. *Won* and *cured* are the reverse of "
             "*lost* and *wrong*: answers that the rule makes worse.",
             Table("Answers that change without a rule",
-                  ("rule", "without it", "benches", "changed", "lost", "wrong", "won", "cured"),
+                  ("rule", "without it", "acts on", "changed", "lost", "wrong", "won", "cured"),
                   rows),
             "No answer changes on these benches without: " + (", ".join(idle) or "none") + ". So "
             "few benches do not prove that a rule has no use: see the small benches below.",

@@ -7,8 +7,8 @@ statistic, and the tests assert that each of both is noticed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, Final
 
@@ -35,12 +35,14 @@ class Rule:
     """A rule: what its absence means, and the (object, attribute, value) that switch it off.
 
     `refits`: the fits themselves change, and none may be kept from another rule's trace.
+    `comparable`: what replaces its functions changes nothing, and may be called beside them.
     """
 
     name: str
     off: str
     changes: tuple[Change, ...]
     refits: bool = False
+    comparable: bool = True
 
 
 @contextmanager
@@ -55,6 +57,56 @@ def switched_off(rule: Rule) -> Iterator[None]:
     finally:
         for subject, name, value in reversed(kept):
             _put(subject, name, value)
+
+
+@contextmanager
+def watched(rules: Sequence[Rule]) -> Iterator[set[str]]:
+    """Trace with all rules while the context lasts; yields the rules that act, by name.
+
+    A rule acts if what replaces any of its functions returns anything else on any call. One that
+    changes settings, or that is not `comparable`, counts as acting.
+    """
+    acting: set[str] = set()
+    with ExitStack() as stack:
+        for rule in rules:
+            if not (rule.comparable and all(callable(value) for *_, value in rule.changes)):
+                acting.add(rule.name)
+                continue
+            for subject, name, other in rule.changes:
+                both = _compared(rule.name, getattr(subject, name), other, acting)
+                stack.enter_context(switched_off(Rule("", "", ((subject, name, both),))))
+        yield acting
+
+
+def _compared(
+    rule: str, function: Callable[..., Any], other: Callable[..., Any], acting: set[str]
+) -> Callable[..., Any]:
+    """Return a function that adds its rule to `acting` where the other returns anything else."""
+
+    def noted(values: Iterator[Any]) -> Iterator[Any]:
+        for value in values:  # one that is replaced yields nothing
+            acting.add(rule)
+            yield value
+
+    def called(*arguments: Any, **named: Any) -> Any:
+        result = function(*arguments, **named)
+        if isinstance(result, Iterator):
+            return noted(result)
+        if rule not in acting and not _same(result, other(*arguments, **named)):
+            acting.add(rule)
+        return result
+
+    return called
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two results are known to be the same; arrays in them count as unlike."""
+    if one is other:
+        return True
+    try:
+        return bool(one == other)
+    except ValueError:
+        return False
 
 
 def _put(subject: Any, name: str, value: Any) -> None:
@@ -173,7 +225,8 @@ RULES: Final = (
     Rule("parts of a law", "a breakaway and the level below it are tried one by one",
          ((HypothesisSet, "with_parts_beside", lambda *_: iter(())),)),
     Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
-         ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),)),
+         ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),),
+         comparable=False),
     Rule("nearer start", "a further effect begins at its size by first-order columns",
          ((hypothesis_set, "at_best_size", lambda _, used, _others: used),)),
     Rule("exact columns", "first-order columns alone find the effects",
