@@ -22,7 +22,7 @@ from analysis.regression.rows import Array, Rows, in_common, record_rows
 from analysis.signals.filters import Smoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
-from rig.model.parts import AnySensor
+from rig.model.parts import AnySensor, converter_step
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
@@ -31,7 +31,7 @@ _HARMONICS = 50  # of a rounding error as a function of the signal: 99 % of its 
 
 def sensor_variance(sensor: AnySensor) -> float:
     """Return the variance of one sample [SI^2]: stated noise and the converter's rounding."""
-    return float(sensor.noise**2 + _converter_step(sensor) ** 2 / 12.0)
+    return float(sensor.noise**2 + converter_step(sensor) ** 2 / 12.0)
 
 
 def repeated_rounding(sensor: AnySensor) -> float:
@@ -51,7 +51,7 @@ def mean_rounding(sensor: AnySensor, x: Array) -> Array:
     and Kollar, Quantization Noise, 2008, ch. 4).
     """
     amplitudes = _rounding_amplitudes(sensor)
-    phase, total = 2.0 * np.pi * x / _converter_step(sensor), np.zeros_like(x)
+    phase, total = 2.0 * np.pi * x / converter_step(sensor), np.zeros_like(x)
     for k, amplitude in enumerate(amplitudes, start=1):
         if amplitude > 1e-3 * amplitudes[0]:
             total += (-1) ** k * amplitude * np.sin(k * phase)
@@ -59,14 +59,9 @@ def mean_rounding(sensor: AnySensor, x: Array) -> Array:
 
 
 def _rounding_amplitudes(sensor: AnySensor) -> Array:
-    step, k = _converter_step(sensor), np.arange(1, _HARMONICS + 1)
+    step, k = converter_step(sensor), np.arange(1, _HARMONICS + 1)
     scale = np.exp(-2.0 * (np.pi * k * sensor.noise / step) ** 2)
     return np.asarray(step / (np.pi * k) * scale)
-
-
-def _converter_step(sensor: AnySensor) -> float:
-    low, high = sensor.range
-    return float((high - low) / ((1 << sensor.bits) - 1))
 
 
 def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
@@ -88,7 +83,7 @@ def with_added_rounding(
     """
 
     def error(sensor: AnySensor, x: Array) -> Array:
-        moved = rng.uniform() * _converter_step(sensor)
+        moved = rng.uniform() * converter_step(sensor)
         return mean_rounding(sensor, smoother.apply(bridged(x)) + moved)
 
     return _disturbed(rig, record, error)

@@ -19,6 +19,7 @@ from analysis.signals.locks import held_positions, motion_bands, within_band
 from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
 from rig.model.parse import InputError
+from rig.model.parts import converter_step
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
@@ -243,7 +244,7 @@ def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
         if name in record.channels:
             sensor = rig.sensors.of(ch.kind_of(name)[0])
             low, high = sensor.range
-            step = (high - low) / ((1 << sensor.bits) - 1)
+            step = converter_step(sensor)
             x = np.asarray(record.channels[name])
             low, high = low + 0.5 * step, high - 0.5 * step
             if x.min() > low and x.max() < high:  # nearly always; not with a lost sample

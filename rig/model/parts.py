@@ -237,6 +237,12 @@ class TemperatureSensor(_Sensor):
 AnySensor = SpoolSensor | PistonSensor | PressureSensor | TemperatureSensor
 
 
+def converter_step(sensor: AnySensor) -> float:
+    """Return the step of a sensor's converter, from one code to the next [its unit]."""
+    low, high = sensor.range
+    return float((high - low) / ((1 << sensor.bits) - 1))
+
+
 class Sensors(Part):
     """One description per kind of channel; those of the bench are optional."""
 

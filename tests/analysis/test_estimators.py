@@ -17,6 +17,7 @@ from analysis.identify.estimators.equations import least_squares, pieces
 from analysis.identify.identify import identify
 from analysis.identify.output_error import fit as output_error_fit
 from analysis.identify.output_error.fit import output_error
+from analysis.identify.output_error.windows import Windows
 from analysis.identify.result import Identification, to_json
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import MOSTLY_NOISE, Solution, solve
@@ -156,6 +157,19 @@ def test_weights_from_measured_noise_do_not_move_what_is_right(multisine_run: Ru
     assert max(error(found, name) for name in TRUTH) < 0.004
 
 
+def test_weights_do_without_a_chamber_that_one_repeat_lacks(multisine_run: Run) -> None:
+    """A rod pressure above the supply throughout: its rows are masked, those of the cap are not."""
+    records = list(multisine_run.records)
+    k = next(i for i, r in enumerate(records) if r.name == "step1_r2")
+    high = 1.01 * multisine_run.rig.supply.pressure
+    pressure = np.full_like(records[k].channels["rod_pressure_2"], high)
+    pressure += 0.02 * records[k].channels["rod_pressure_2"]
+    channels = {**records[k].channels, "rod_pressure_2": pressure}
+    records[k] = replace(records[k], channels=channels)
+    found = identify([replace(multisine_run, records=tuple(records))], estimator="wls")
+    assert max(error(found, name) for name in ("b", "C_pp_2", "C_mp_2")) < 0.01
+
+
 def test_copies_of_one_record_have_no_scatter_to_weigh_by(multisine_run: Run) -> None:
     first = [r for r in multisine_run.records if r.repeat == 1]
     copies = [replace(r, repeat=2, name=f"{r.step}_r2") for r in first]
@@ -181,6 +195,10 @@ def test_spikes_in_one_record_are_set_aside_by_the_robust_loss(multisine_run: Ru
     said = check(robust, "outliers fluid")
     assert not said.ok
     assert "'step2_r2'" in said.detail
+    # A record of the same name in another run has no part in it.
+    both = identify([multisine_run, spoilt], estimator="robust")
+    share, _, _ = check(both, "outliers fluid").detail.partition(" %")
+    assert float(share) == pytest.approx(float(said.detail.partition(" %")[0]), rel=0.2)
 
 
 @pytest.mark.slow
@@ -205,6 +223,27 @@ def test_output_error_converges_from_a_start_five_percent_off(
     early = output_error(one.rig, [one], [Used(term) for term in baseline()], start).check
     assert not early.ok
     assert "not settled: the last still moved a parameter by" in early.detail
+
+
+def test_windows_compare_the_same_instants_of_a_record_at_half_the_rigs_rate(
+    multisine_run: Run,
+) -> None:
+    record = multisine_run.records[0]
+    thinned = replace(
+        record,
+        sample_rate=record.sample_rate / 2,
+        channels={name: x[::2] for name, x in record.channels.items()},
+        period=None if record.period is None else record.period // 2,
+    )
+    terms = [Used(term) for term in baseline()]
+    whole, half = (
+        Windows(multisine_run.rig, [replace(multisine_run, records=(r,))], terms)
+        for r in (record, thinned)
+    )
+    assert len(whole.placed) == len(half.placed)
+    for one, other in zip(whole.placed, half.placed, strict=True):
+        assert one.first == pytest.approx(2 * other.first, abs=30)
+        assert one.measured.shape == other.measured.shape
 
 
 def test_output_error_needs_a_model_that_is_complete(multisine_run: Run) -> None:

@@ -41,16 +41,16 @@ def robust(blocks: Sequence[RepeatBlock]) -> EquationFit:
 
 def outlier_statement(family: str, fit: EquationFit) -> Check:
     """State the share of rows that have lost nine tenths of their weight, in the worst record."""
-    lost: dict[str, list[float]] = {}
+    lost: dict[tuple[int, str], list[float]] = {}
     for b, w in zip(fit.blocks, fit.w, strict=True):
-        lost.setdefault(b.record, []).append(float(np.mean(w < 0.1)))
-    shares = {record: float(np.mean(of_equations)) for record, of_equations in lost.items()}
-    worst = max(shares, key=lambda record: shares[record])
+        lost.setdefault((b.run, b.record), []).append(float(np.mean(w < 0.1)))
+    shares = {place: float(np.mean(of_equations)) for place, of_equations in lost.items()}
+    (_, record), share = max(shares.items(), key=lambda item: item[1])
     return Check(
         f"outliers {family}",
-        shares[worst] < IDENTIFY.few_outliers,
-        f"{100 * shares[worst]:.2g} % of the rows of record {worst!r} lie far outside the scatter "
-        "and were left out (the worst record)",
+        share < IDENTIFY.few_outliers,
+        f"{100 * share:.2g} % of the rows of record {record!r} lie far outside the scatter and "
+        "were left out (the worst record)",
     )
 
 

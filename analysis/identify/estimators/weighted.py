@@ -54,24 +54,24 @@ def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
         i = place.get((b.run, b.record, f"{other}_{joint}"))
         return i if i is not None and len(blocks[i].y) == len(b.y) else None
 
-    factors: dict[tuple[int, str, str], Array] = {}
+    factors: dict[tuple[tuple[int, str, str], int], Array] = {}
     out = list(blocks)
     for i, b in enumerate(blocks):
         other = other_chamber(b)
         if other is not None and b.equation.startswith("flow_rod"):
             continue  # mixed with its cap chamber
         pair = [i] if other is None else [i, other]
-        if b.shared not in factors:
-            members = [
-                (m, *(place[c.run, c.record, blocks[p].equation] for p in pair[1:]))
-                for m, c in enumerate(blocks)
-                if c.shared == b.shared
+        key = b.shared, len(pair)
+        if key not in factors:
+            alike = [(m, other_chamber(c)) for m, c in enumerate(blocks) if c.shared == b.shared]
+            # A repeat may lack the other chamber: one of its pressures is masked throughout.
+            members = [pair_of for pair_of in alike if None not in pair_of[: len(pair)]]
+            stacked = [
+                np.column_stack([deviation[j] for j in pair_of[: len(pair)] if j is not None])
+                for pair_of in members
             ]
-            stacked = np.concatenate(
-                [np.column_stack([deviation[j] for j in member]) for member in members]
-            )
-            factors[b.shared] = _whitener(stacked, b)
-        L = factors[b.shared]
+            factors[key] = _whitener(np.concatenate(stacked), b)
+        L = factors[key]
         for row, target in enumerate(pair):
             X = sum(L[row, c] * blocks[j].X for c, j in enumerate(pair))
             y = sum(L[row, c] * blocks[j].y for c, j in enumerate(pair))

@@ -32,6 +32,7 @@ from analysis.simulation.simulate import (
 from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
 from rig.model.parse import InputError
+from rig.model.parts import converter_step
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -133,7 +134,7 @@ class Windows:
             kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
             self.sources.append(WindowSource(signals, drive.inputs, drive.locked, kelvin))
             free = ~drive.locked
-            every = self.every
+            every = _steps_between_points(record.sample_rate)
             points = round(IDENTIFY.window * record.sample_rate) // (SAMPLES_PER_STEP * every)
             length = points * SAMPLES_PER_STEP * every
             # No sample of any joint may be lost: the locked ones drive the others.
@@ -170,21 +171,17 @@ class Windows:
             first = max(first, stop + 1)
         return firsts
 
-    @property
-    def every(self) -> int:
-        """Steps between two points compared."""
-        return max(1, round(self.rig.sample_rate / IDENTIFY.point_rate / SAMPLES_PER_STEP))
-
     def sigma(self) -> dict[int, Array]:
         """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
         sensors = self.rig.sensors
         outputs = (sensors.piston, sensors.chamber_pressure, sensors.chamber_pressure)
-        gain = float(np.linalg.norm(channel_filter(self.rig.sample_rate).taps[0]))
-        steps = np.array([(s.range[1] - s.range[0]) / (1 << s.bits) for s in outputs])
-        noise = np.maximum(np.array([s.noise for s in outputs]) * gain, steps / np.sqrt(12))
+        steps = np.array([converter_step(s) for s in outputs])
         out = {}
         for window in self.placed:
-            free = int((~self.sources[window.record].locked).sum())
+            source = self.sources[window.record]
+            gain = float(np.linalg.norm(channel_filter(source.signals.rate).taps[0]))
+            noise = np.maximum(np.array([s.noise for s in outputs]) * gain, steps / np.sqrt(12))
+            free = int((~source.locked).sum())
             out[window.stratum] = np.repeat(noise, free)
         return out
 
@@ -274,8 +271,8 @@ class Windows:
             y0[:, len(start) :] = [perturbed.hidden[k][window.first] for k in chosen]
         states = shoot(
             ready, np.ascontiguousarray(perturbed.pars[chosen]), y0, source.inputs,
-            source.signals.rate, source.locked, window.first, len(window.measured), self.every,
-            parts_of(self.terms, self.rig.sample_rate),
+            source.signals.rate, source.locked, window.first, len(window.measured),
+            _steps_between_points(source.signals.rate), parts_of(self.terms, source.signals.rate),
         )  # fmt: skip
         if states is None:
             return None
@@ -319,3 +316,8 @@ class Windows:
             (np.stack(piston, axis=-1), states[..., 2 * N + free], states[..., 3 * N + free]),
             axis=-1,
         )
+
+
+def _steps_between_points(rate: float) -> int:
+    """Return the integrator's steps between two points compared, at a sample rate [Hz]."""
+    return max(1, round(rate / IDENTIFY.point_rate / SAMPLES_PER_STEP))

@@ -23,6 +23,7 @@ from rig.bench.checks.pressure_sensors import PressureFinding, SlowRows
 from rig.bench.checks.single_sensor import SWING
 from rig.bench.settings import GuardSettings
 from rig.model import channels as ch
+from rig.model.parts import converter_step
 from rig.model.rig import Rig
 from rig.model.trips import (
     ABOVE_SUPPLY,
@@ -97,7 +98,7 @@ class Plausibility:
         self._command = columns(ch.COMMAND)
         self._supply = rig.recorded.index(ch.SUPPLY) if ch.SUPPLY in rig.recorded else None
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
-        codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for s in sensors])
+        codes = np.array([converter_step(s) for s in sensors])
         self._noise = np.maximum([s.noise for s in sensors], codes)
         self._spool_floor = [
             max(settings.spool_floor * joint.valve.spool_stroke, 5.0 * float(self._noise[column]))

@@ -20,6 +20,7 @@ from drivers.base import SampleBlock
 from rig.bench.checks.bands import Counts, first_of, run_lengths
 from rig.bench.settings import GuardSettings
 from rig.model import channels as ch
+from rig.model.parts import converter_step
 from rig.model.rig import Rig
 from rig.model.trips import SATURATED, Violation
 
@@ -39,7 +40,7 @@ class Frozen:
         own = [(c, *ch.kind_of(name)) for c, name in enumerate(rig.channels)]
         parts = [(c, rig.sensors.of(kind)) for c, kind, which in own if which == joint + 1]
         self._columns = np.array([column for column, _ in parts])
-        codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for _, s in parts])
+        codes = np.array([converter_step(s) for _, s in parts])
         noise = np.array([s.noise for _, s in parts])
         self._judged = noise >= codes
         self.judged = np.zeros(len(rig.recorded), dtype=bool)  # of all that is recorded
