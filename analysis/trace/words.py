@@ -65,7 +65,10 @@ def sentence(result: Trace) -> str:
         return f"{text} {errors}"
     prefix = f"Effects found: {named}. " if named else "No effect of the catalogue is named. "
     if not named and result.unexplained_fraction == 0.0:
-        return f"{prefix}{_held_out_only(result)}"
+        return (
+            f"{prefix}The training records are met to within the noise, the held-out ones are not. "
+            f"{_largest_errors(result)}"
+        )
     clue = ", ".join(d.text for d in result.depends_on[:2])
     share = f"{plain(100 * result.unexplained_fraction, 2)} % of the repeatable residual energy"
     remains = f"{share} remains unexplained"
@@ -76,19 +79,16 @@ def sentence(result: Trace) -> str:
         + (f"; it depends on {clue}" if clue else "")
         + _symmetry(result)
         + _formula(result)
-        + (f". {errors}" if named else ".")
+        + (f". {errors}" if named else f". {_largest_errors(result)}")
     )
 
 
-def _held_out_only(result: Trace) -> str:
-    """Say that only held-out records keep more than noise, and in which equations most."""
+def _largest_errors(result: Trace) -> str:
+    """State the held-out errors of the two equations that keep most, over their noise floors."""
     ratios = {e: result.after[e] / floor for e, floor in result.noise_floor.items() if floor > 0}
     largest = sorted(ratios, key=lambda e: -ratios[e])[:2]
-    errors = " and ".join(f"{ratios[e]:.2g} in {e}" for e in largest)
-    return (
-        "The training records are met to within the noise, the held-out ones are not: errors over "
-        f"the noise floor of {errors}."
-    )
+    errors = " and ".join(f"{plain(ratios[e], 3)} in {e}" for e in largest)
+    return f"Held-out errors over the noise floor: {errors}."
 
 
 def _formula(result: Trace) -> str:

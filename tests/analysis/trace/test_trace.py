@@ -200,7 +200,7 @@ def test_a_leak_that_began_between_the_runs_gets_no_clue_from_the_noise_before_i
     assert result.verdict == "unexplained"
     assert (result.effects, result.refused, result.depends_on, result.formulas) == ((), (), (), ())
     assert result.unexplained_fraction == 0.0
-    assert "the held-out ones are not: errors over the noise floor of" in result.sentence
+    assert "the held-out ones are not. Held-out errors over the noise floor: " in result.sentence
     assert "flow_cap_2" in result.sentence
     assert any("the machine has changed between the runs" in note for note in result.notes)
 

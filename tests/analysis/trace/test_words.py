@@ -124,6 +124,9 @@ def test_what_only_held_out_records_keep_is_not_said_to_be_nothing(rig: Rig) -> 
     ) in sentence(result)
     most = replace(result, unexplained_fraction=1.0)
     assert "100 % of the repeatable residual energy remains unexplained" in sentence(most)
+    quiet = {e: 1.15 * floor for e, floor in most.noise_floor.items()}
+    unnamed = replace(most, effects=(), after=quiet)
+    assert "Held-out errors over the noise floor: 1.15 in " in sentence(unnamed)
 
 
 def test_an_error_that_no_effect_lowers_is_no_error_of_a_form(rig: Rig) -> None:
