@@ -121,6 +121,11 @@ class Term:
     rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that simulation needs because of this term
     where: str = "bench"
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and place."""
+        return self.name, self.where
+
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the linear unknowns, in the order of `pack`."""
         raise NotImplementedError

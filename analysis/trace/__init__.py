@@ -14,7 +14,7 @@ Terms:
  row: one instant of one equation (`torque_1`, `flow_cap_1`, `flow_rod_1`); M rows in all
  group: the repeats of one step of one run; a segment holds one equation's rows of one group
  energy above noise: sum of squared whitened residuals minus what noise alone gives
- effect: an entry of the catalogue at one place; a variant is an effect at given shapes
+ effect: an entry of the catalogue at one place; `Used` is one at given shapes
  hypothesis: a fitted set of effects; the winner is the one that the search prefers
  mechanism, reading: the law behind several names; one of these names
  form error: what the catalogue's formula of an effect misses of the real effect

@@ -431,6 +431,6 @@ def _not_in_model(
     candidates: Sequence[Effect], known: Sequence[Used], moving: int = 1
 ) -> list[Effect]:
     """Return the candidates that the model lacks and that can act where `moving` joints move."""
-    in_model = {(u.term.name, u.term.where) for u in known}
-    fresh = [c for c in candidates if (c.name, c.where) not in in_model]
+    in_model = {u.term.key for u in known}
+    fresh = [c for c in candidates if c.key not in in_model]
     return [c for c in fresh if c.least_joints <= moving]

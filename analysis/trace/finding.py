@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
@@ -118,7 +119,7 @@ def _with_tied_effects(finding: Finding) -> Hypothesis:
     if len(passing) == len(finding.winner.effects):
         return finding.winner
     rig = finding.rows.train.rig
-    return finding.hypotheses.refined([Used(e, e.shape_of(rig, ())) for e in passing])
+    return finding.hypotheses.refined([at_start(rig, effect) for effect in passing])
 
 
 def search_and_judge(
@@ -183,10 +184,10 @@ def without_unnamed_effects(finding: Finding) -> Finding:
     """Return a finding whose set (`winner`) holds only the effects that are named."""
     named = {(f.name, f.at) for f in finding.named}
     hypotheses, winner = finding.hypotheses, finding.winner
-    kept = [u for u in winner.effects if (u.term.name, u.term.where) in named]
+    kept = [u for u in winner.effects if u.term.key in named]
     if len(kept) == len(winner.effects):
         return finding
-    winner = hypotheses.refined(kept) if kept else hypotheses.empty
+    winner = hypotheses.refined(kept)
     left = remainders(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
     notes = remainder_notes(finding.verdict, left, in_noise=False, named=bool(kept))
     return replace(finding, winner=winner, remainders=tuple(left), notes=tuple(notes))
@@ -348,7 +349,7 @@ def _passing_set(
         dropped = _least_needed(hypotheses, winner, failed)
         refused += tuple(judged[used] for used in dropped)
         kept = [used for used in winner.effects if used not in dropped]
-        winner = hypotheses.refined(kept) if kept else hypotheses.empty
+        winner = hypotheses.refined(kept)
     return (), refused, winner
 
 
@@ -362,12 +363,11 @@ def _least_needed(
     """
 
     def left_without(used: Used) -> float:
-        return hypotheses.refined([u for u in winner.effects if u is not used]).total
+        return hypotheses.refined(winner.without(used)).total
 
     least: dict[tuple[str, str], Used] = {}
     for used in sorted(failed, key=left_without, reverse=True):
-        assert isinstance(used.term, Effect)
-        least[used.term.family, used.term.where] = used
+        least[effect_in(used).family, used.term.where] = used
     return [used for used in failed if used in least.values()]
 
 

@@ -31,7 +31,7 @@ from analysis.trace.notes import shared_parameters
 from analysis.trace.result import UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_fit import contribution, design_matrix, fit_coefficients
 from analysis.trace.search.geometry import shape_errors
-from analysis.trace.search.hypothesis import Hypothesis, parameter_values
+from analysis.trace.search.hypothesis import Hypothesis
 from rig.model.records import Record, Run
 
 # Other estimators replace columns where noise in them matters; the trace compares residuals of
@@ -114,7 +114,7 @@ def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
     """
     rows = finding.rows.unseen.choosing
     fit = fit_coefficients(rows, winner.fit.terms)
-    values = parameter_values(rows.rig, fit.terms, dict(fit.beta))
+    values = fit.parameters(rows.rig)
     relative = {n: d / abs(fit.beta[n]) for n, d in deviations(rows, fit).items() if fit.beta[n]}
     families = set(map(family_of, equations_above_noise(finding.rows, winner)))
     moved = {n for family in families for n in parameters_of(model.rig, model.terms, family)}

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.effects.base import Effect
+from analysis.trace.data.candidates import effect_in, effects_among
 from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import gates
@@ -155,8 +156,7 @@ def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothe
 
 def _curves_share_a_balance(wide: HypothesisSet, hypothesis: Hypothesis) -> bool:
     """Return whether two free forms of a set act in the same family of rows of one joint."""
-    terms = [u.term for u in hypothesis.effects]
-    curves = [t for t in terms if isinstance(t, Effect) and t.free]
+    curves = [e for e in effects_among(hypothesis.effects) if e.free]
     rig = wide.train_data.rig
     return any(
         act_at_one_joint(a, b) and bool(families_of(rig, a) & families_of(rig, b))
@@ -171,7 +171,7 @@ def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, explained: bool) ->
     explain the records.
     """
     out = [wide.empty] if explained else [wide.empty, winner]
-    for law in dict.fromkeys(map(law_of, winner.effects)):
-        kept = [u for u in winner.effects if law_of(u) != law]
-        out.append(wide.refined(kept) if kept else wide.empty)
+    for law in dict.fromkeys(map(law_of, effects_among(winner.effects))):
+        kept = [u for u in winner.effects if law_of(effect_in(u)) != law]
+        out.append(wide.refined(kept))
     return list({o.keys: o for o in out}.values())

@@ -11,6 +11,7 @@ from analysis.effects.base import Effect
 from analysis.effects.friction import force_unit
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.terms.base import Used, equation
+from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
@@ -173,7 +174,7 @@ def _hides_breakaway(found: Finding, finding: Finding, joint: int) -> bool:
     in motion are a breakaway above it, whatever law it follows. `joint` is 0-based.
     """
     lost = {(e.name, e.at) for e in finding.named} - found.winner.keys
-    if not any((e.name, e.where) in lost for e in _friction_of(finding.winner, joint)):
+    if not any(e.key in lost for e in _friction_of(finding.winner, joint)):
         return False
     return force_at_standstill(finding.rows.train, found.winner, joint) > TRACE.breakaway_ratio
 
@@ -225,8 +226,7 @@ def force_at_standstill(data: RegressionData, winner: Hypothesis, joint: int) ->
 
 def _friction_in(winner: Hypothesis) -> list[Effect]:
     """Return the friction effects of a set."""
-    effects = [used.term for used in winner.effects if isinstance(used.term, Effect)]
-    return [e for e in effects if e.family == "friction"]
+    return [e for e in effects_among(winner.effects) if e.family == "friction"]
 
 
 def _friction_of(winner: Hypothesis, joint: int) -> list[Effect]:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.effects.base import Effect
 from analysis.terms import known
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.temperature_nuisance import base_terms
@@ -114,10 +114,8 @@ def _question_separation(
 
 def _visibility_question(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
     (used,) = effects_of(effects)
-    assert isinstance(used.term, Effect)
-    return OpenQuestion(
-        smallest_effect(used.term, rig) or Explanation((used,)), Explanation(), False
-    )
+    shown = smallest_effect(effect_in(used), rig) or Explanation((used,))
+    return OpenQuestion(shown, Explanation(), False)
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:

@@ -13,6 +13,7 @@ import numpy as np
 from analysis.trace.clues import dependence
 from analysis.trace.clues.formula import formula, surest_formula
 from analysis.trace.clues.frequency import frequency_clue
+from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.judge import gates, held_out
@@ -50,12 +51,11 @@ def remainders(
     ]
     listed = {r.equation for r in out}
     counts = hypotheses.train_data.row_counts
-    terms = [used.term for used in winner.effects]
     for e, energy in winner.excess_energy.items():
         share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
         if winner.effects and e not in listed and visible and share > TRACE.visible_share:
-            allowed = gates.form_share(holdout_data.rig, terms, e)
+            allowed = gates.form_share(holdout_data.rig, effects_among(winner.effects), e)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             out.append(Remainder(e, words + tolerance_words(share, allowed), False))
     return out

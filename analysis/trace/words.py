@@ -13,6 +13,7 @@ from analysis.trace.clues.formula import surest_formula
 from analysis.trace.judge.gates import form_share
 from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Curve, JudgedEffect, Trace
+from analysis.trace.search.hypothesis import effect_of
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
@@ -184,8 +185,8 @@ def _tolerated(result: Trace) -> list[str]:
 
 
 def _form_share(result: Trace, equation: str) -> float:
-    terms = [make(effect.name, effect.at or effect.where) for effect in result.effects]
-    return form_share(result.model_before.rig, terms, equation)
+    effects = [effect_of(effect.name, effect.at or effect.where) for effect in result.effects]
+    return form_share(result.model_before.rig, effects, equation)
 
 
 def tolerated_error_notes(result: Trace) -> list[str]:

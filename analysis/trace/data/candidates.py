@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -15,22 +14,20 @@ from analysis.trace.settings import DATA
 from rig.model.rig import Rig
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A candidate at one point of its shape grid."""
+def effect_in(used: Used) -> Effect:
+    """Return the effect of a used term that is one."""
+    assert isinstance(used.term, Effect)
+    return used.term
 
-    effect: Effect
-    shape: tuple[float, ...]
 
-    @property
-    def key(self) -> tuple[str, str]:
-        """Name and place, whatever the shape."""
-        return self.effect.name, self.effect.where
+def effects_among(terms: Iterable[Used]) -> list[Effect]:
+    """Return the effects of those of a model's terms that are effects."""
+    return [used.term for used in terms if isinstance(used.term, Effect)]
 
-    @property
-    def used(self) -> Used:
-        """The term as a model takes it."""
-        return Used(self.effect, self.shape)
+
+def at_start(rig: Rig, effect: Effect) -> Used:
+    """Return an effect at the shape from which a search begins."""
+    return Used(effect, effect.shape_of(rig, ()))
 
 
 def catalogue(rig: Rig, names: Sequence[str] | None = None) -> list[Effect]:
@@ -72,12 +69,10 @@ def shape_grid(
     return [*grid, *effect.further_points(rig)]
 
 
-def variants(
-    rig: Rig, effects: Sequence[Effect], evidence: Evidence | None = None
-) -> list[Variant]:
+def variants(rig: Rig, effects: Sequence[Effect], evidence: Evidence | None = None) -> list[Used]:
     """Return every candidate at every point of its grid."""
     return [
-        Variant(effect, shape) for effect in effects for shape in shape_grid(effect, rig, evidence)
+        Used(effect, shape) for effect in effects for shape in shape_grid(effect, rig, evidence)
     ]
 
 

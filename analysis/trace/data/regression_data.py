@@ -25,7 +25,6 @@ from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.cache import RowCache
-from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
     is_hidden_by_lock,
@@ -241,9 +240,9 @@ def _rows_at(rows: Rows, time: Array) -> Rows:
 
 @dataclass(frozen=True)
 class VariantColumns:
-    """A variant's whitened columns (M, c) with their names, and the equations that they act in."""
+    """Whitened columns (M, c) of a candidate at a shape: names, and equations they act in."""
 
-    variant: Variant
+    used: Used
     names: tuple[str, ...]
     columns: Array
     touched: frozenset[str]
@@ -273,12 +272,12 @@ def signals_of(data: RegressionData) -> list[Signals]:
 
 
 def variant_columns(
-    data: RegressionData, chosen: Sequence[Variant],
+    data: RegressionData, chosen: Sequence[Used],
     progress: Callable[[float], None] | None = None, equations: Collection[str] = (),
 ) -> list[VariantColumns]:  # fmt: skip
-    """Return the columns of every variant that acts in the data, in the variants' order.
+    """Return the columns of every candidate `chosen` that acts in the data, in their order.
 
-    `progress` is called after each with the share of the variants done. With `equations`, columns
+    `progress` is called after each with the share of them done. With `equations`, columns
     are computed in their rows only and are zero elsewhere.
     """
     asked = equations or {s.equation for s in data.segments}
@@ -289,27 +288,27 @@ def variant_columns(
     segments = [s for s in data.segments if s.equation in asked]
     seen = signals_of(data)
     columns = []
-    for variant in chosen:
-        columns.append(_columns_of_variant(data, records, segments, variant, seen))
+    for used in chosen:
+        columns.append(_columns_of(data, records, segments, used, seen))
         if progress is not None:
             progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]
 
 
-def _columns_of_variant(
+def _columns_of(
     data: RegressionData, records: Sequence[ConditionedRecord], segments: Sequence[Segment],
-    variant: Variant, seen: Sequence[Signals],
+    used: Used, seen: Sequence[Signals],
 ) -> VariantColumns | None:  # fmt: skip
-    """Return a variant's columns in some segments of the rows, None where it does not act there."""
+    """Return a candidate's columns in some segments' rows, None where it does not act there."""
     columns: dict[str, Array] = {}
     touched = set()
     M = data.base.shape[0]
     for index, conditioned in enumerate(records):
-        if is_hidden_by_lock(variant.effect, conditioned):
+        if is_hidden_by_lock(used.term, conditioned):
             continue
         candidate = candidate_columns(
             data.rig, data.terms, conditioned, seen[index], data.rows[index], data.beta,
-            variant.used, data.cache,
+            used, data.cache,
         )  # fmt: skip
         for segment in segments:
             if segment.group == conditioned.group and segment.equation in candidate:
@@ -320,5 +319,5 @@ def _columns_of_variant(
     if not columns or not all(np.isfinite(c).all() for c in columns.values()):
         return None
     return VariantColumns(
-        variant, tuple(columns), np.column_stack(list(columns.values())), frozenset(touched)
+        used, tuple(columns), np.column_stack(list(columns.values())), frozenset(touched)
     )

@@ -13,6 +13,7 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Curve
 from analysis.trace.search.exact_fit import ExactFit, tangent
@@ -136,8 +137,7 @@ def _between_knots(
     rig: Rig, used: Used, conditioned: ConditionedRecord, rows: Rows
 ) -> NDArray[np.bool_]:
     """Return in which rows (m,) the variable of a curve lies between its outermost knots."""
-    assert isinstance(used.term, Effect)
-    values = used.term.abscissa(rig, conditioned.signals).get(rows.equation)
+    values = effect_in(used).abscissa(rig, conditioned.signals).get(rows.equation)
     if values is None:
         return np.ones(len(rows.time), dtype=bool)
     named = zip(shapes_of(rig, used), used.shape, strict=True)

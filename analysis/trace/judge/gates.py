@@ -8,13 +8,14 @@ other effect.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
-from analysis.terms.base import Term, Used, family_of
+from analysis.terms.base import Used, family_of
+from analysis.trace.data.candidates import effect_in, effects_among
 from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference, removal, rivals
@@ -30,7 +31,6 @@ from analysis.trace.search.hypothesis import (
     effect_of,
     energy_above_noise,
     of_one_law,
-    parameter_values,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
@@ -78,7 +78,7 @@ def judge_effects(
     `holdout_data` are the choosing rows; `rng` draws the sign flips.
     """
     train_data = hypotheses.train_data
-    values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
+    values = winner.fit.parameters(train_data.rig)
     null = inference.null_maximum(
         hypotheses.candidates, train_data, _noise_samples(train_data, winner.fit.residual), rng
     )
@@ -86,7 +86,7 @@ def judge_effects(
     shift = form_shift(train_data, winner.fit)
     out = []
     for used in winner.effects:
-        assert isinstance(used.term, Effect)
+        effect = effect_in(used)
         alternative = _set_without(hypotheses, winner, used)
         without = held_out_residual(holdout_data, alternative.fit)
         changes = removal.removed_energy(winner, alternative)
@@ -101,12 +101,12 @@ def judge_effects(
         errors = inference.effect_errors(train_data, winner.fit, used, values)
         estimates = inference.estimates(train_data, used, errors, shift)
         unknown = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
-        differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
+        differing = invariance(train_data, winner.fit, used, errors, _joint_index(effect))
         unphysical = hypotheses.physical_problem(winner, used)
         tied = [r for r in others if r.tied]
         inseparable = [
             Rival(name, rivals.place_of(effect_of(name, at)), 1.0, 1.0, True, at)
-            for name, at in used.term.inseparable()
+            for name, at in effect.inseparable()
         ]
         gates = (
             Gate(
@@ -130,20 +130,20 @@ def judge_effects(
         )
         out.append(
             JudgedEffect(
-                used.term.name,
-                rivals.place_of(used.term),
+                effect.name,
+                rivals.place_of(effect),
                 {n: e for n, e in estimates.items() if n not in train_data.beta},
                 p,
                 removed.share,
                 (*inseparable, *others),
                 gates,
-                used.term.variable_on(train_data.rig),
-                mechanism=used.term.mechanism,
-                free=used.term.free,
+                effect.variable_on(train_data.rig),
+                mechanism=effect.mechanism,
+                free=effect.free,
                 curves=curves_of(train_data, winner.fit, used),
                 left_without=removal.rms_in(holdout_data, without, changes),
                 left_with=removal.rms_in(holdout_data, after, changes),
-                at=used.term.where,
+                at=effect.where,
             )
         )
     return tuple(out)
@@ -156,20 +156,21 @@ def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> H
     offset): then the best physical set of the other effects or readings of them is returned. Two
     readings of one law are removed together, since `readings` decides whether both are needed.
     """
-    kept = [u for u in winner.effects if u is not used and not of_one_law(u.term, used.term)]  # type: ignore[arg-type]
+    law = effect_in(used)
+    kept = [u for u in winner.without(used) if not of_one_law(effect_in(u), law)]
     without = hypotheses.refined(kept)
     rig = hypotheses.train_data.rig
     # A shape at its bound is an error of the form, not of physics.
-    at_bound = any(u.term.outside(rig, u.shape) for u in without.effects)  # type: ignore[attr-defined]
+    at_bound = any(effect_in(u).outside(rig, u.shape) for u in without.effects)
     if at_bound or not hypotheses.physical_problem(without):
         return without
 
-    def is_kept(other: Used) -> bool:
+    def is_kept(other: Effect) -> bool:
         """Return whether a kept effect, or one of its readings, is another set's effect."""
-        return any(other.term == k.term or of_one_law(other.term, k.term) for k in kept)  # type: ignore[arg-type]
+        return any(other == k or of_one_law(other, k) for k in effects_among(kept))
 
     physical = [o for o in hypotheses.fitted.values() if not hypotheses.physical_problem(o)]
-    simpler = [o for o in physical if all(map(is_kept, o.effects))]
+    simpler = [o for o in physical if all(map(is_kept, effects_among(o.effects)))]
     return min([hypotheses.empty, *simpler], key=lambda o: o.total)
 
 
@@ -200,23 +201,22 @@ def held_out_above_band(
     miss (`Effect.exact`), `TRACE.held_out_share` of the energy above noise that the model `before`
     leaves, whichever is larger.
     """
-    terms = [used.term for used in after.terms]
     left = held_out_residual(holdout_data, after)
     start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
     now = energy_above_noise(holdout_data, left)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in removal.error_over_floor(holdout_data, left).items()
-        if r > TRACE.held_out_band and now[e] > form_share(holdout_data.rig, terms, e) * start[e]
+        if r > TRACE.held_out_band
+        and now[e] > form_share(holdout_data.rig, effects_among(after.terms), e) * start[e]
     ]
 
 
-def form_share(rig: Rig, terms: Iterable[Term], equation: str) -> float:
+def form_share(rig: Rig, effects: Sequence[Effect], equation: str) -> float:
     """Return the share of an equation's energy above noise that the forms of effects may miss.
 
     It is 0 where all effects that act in its family of equations are exact.
     """
-    effects = [term for term in terms if isinstance(term, Effect)]
     inexact = [e for e in effects if not e.exact and family_of(equation) in families_of(rig, e)]
     return TRACE.held_out_share if inexact or not effects else 0.0
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from analysis.effects.base import Effect
 from analysis.identify.estimators.nuisance import KAPPA
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.data.regression_data import RegressionData
@@ -72,8 +72,7 @@ def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
 def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     """Return the model with directions of coefficients fitted to rows with more information."""
     of_effects = {
-        c.parameter for u in model.terms if isinstance(u.term, Effect)
-        for c in u.term.coefficients(rig)
+        c.parameter for effect in effects_among(model.terms) for c in effect.coefficients(rig)
     }  # fmt: skip
     # A coefficient that no row contains would be moved by rounding alone.
     shown = np.sum(rows.matrix**2, axis=0) + np.diag(model.information) > 0.0

@@ -21,10 +21,11 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.scatter import form_shift, parameter_covariance, with_form_errors
 from analysis.trace.search.exact_fit import ExactFit, jacobian, tangent
-from analysis.trace.search.hypothesis import of_one_law, parameter_values
+from analysis.trace.search.hypothesis import of_one_law
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.shapes import ShapeFit
 from analysis.trace.settings import TRACE
@@ -149,9 +150,8 @@ def estimates(
         )
         for name, v, s, h in zip(errors.names, errors.value, errors.std, half, strict=True)
     }
-    assert isinstance(used.term, Effect)
     seen = [conditioned.signals for conditioned in train_data.records]
-    for name, beyond in used.term.extrapolated(rig, seen, used.shape).items():
+    for name, beyond in effect_in(used).extrapolated(rig, seen, used.shape).items():
         if name in out:
             low, high = out[name].ci95
             out[name] = replace(out[name], ci95=(min(low, *beyond), max(high, *beyond)))
@@ -193,11 +193,10 @@ def is_of_unknown_size(
     the other `effects` of its family, but of another law, acts at its place: two frictions of one
     joint.
     """
-    own = used.term
-    assert isinstance(own, Effect)
+    own = effect_in(used)
     if own.free or not all_include({c.parameter: 0.0 for c in own.coefficients(rig)}, parameters):
         return False
-    others = [o.term for o in effects if o is not used and isinstance(o.term, Effect)]
+    others = effects_among(o for o in effects if o is not used)
     return any(
         (o.family, o.where) == (own.family, own.where) and not of_one_law(o, own) for o in others
     )
@@ -210,7 +209,7 @@ def with_shape_errors(found: ShapeFit, model: Model) -> tuple[Model, dict[str, E
     uncertainty of the shapes, and errors of the effects' forms (`scatter.with_form_errors`).
     """
     data, fit = found.data, found.fit
-    values = parameter_values(data.rig, fit.terms, dict(fit.beta))
+    values = fit.parameters(data.rig)
     shift = form_shift(data, fit)
     shapes: dict[str, Estimate] = {}
     for used in fit.terms:

@@ -114,8 +114,8 @@ def _energy_of_larger_effect(
             own = [rows.names.index(c.parameter) for c in u.term.coefficients(train_data.rig)]
             values = np.array([model.beta.get(rows.names[k], 0.0) for k in own])
             part = rows.matrix[mask][:, own] @ values
-            energy[u.term.name, u.term.where] = float(part @ part)
-    mine = energy.pop((used.term.name, used.term.where), 0.0)
+            energy[u.term.key] = float(part @ part)
+    mine = energy.pop(used.term.key, 0.0)
     most = max(energy.values(), default=0.0)
     return most if most > mine else 0.0
 

@@ -13,9 +13,10 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import shapes_of
 from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start, effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.inference import effect_errors, estimates
@@ -27,7 +28,6 @@ from analysis.trace.search.hypothesis import (
     keys_of,
     may_grow,
     of_one_law,
-    parameter_values,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
@@ -66,17 +66,16 @@ def _simplified(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
     """Return the winner with effects replaced by simpler ones they include, if nothing is lost."""
-    known = {(u.term.name, u.term.where) for u in hypotheses.base if isinstance(u.term, Effect)}
+    known = {effect.key for effect in effects_among(hypotheses.base)}
     for used in winner.effects:
-        assert isinstance(used.term, Effect)
-        for name in used.term.includes:
-            if (name, used.term.where) in known:  # the model has this effect already
+        effect = effect_in(used)
+        for name in effect.includes:
+            if (name, effect.where) in known:  # the model has this effect already
                 continue
-            effects = [u for u in winner.effects if u is not used]
-            if (name, used.term.where) not in winner.keys:
-                simple = effect_of(name, used.term.where)
-                shape = simple.shape_of(hypotheses.train_data.rig, ())
-                effects.append(Used(simple, shape))
+            effects = winner.without(used)
+            if (name, effect.where) not in winner.keys:
+                simple = effect_of(name, effect.where)
+                effects = (*effects, at_start(hypotheses.train_data.rig, simple))
             other = hypotheses.refined(effects)
             held = held_out_residual(holdout_data, other.fit)
             if not hypotheses.physical_problem(other) and not _needs_richer(
@@ -135,7 +134,7 @@ def _needs_richer(
         return False
     if not loses_by_restriction(held, held_out_residual(holdout_data, other.fit)):
         return False
-    fresh = [u for u in other.effects if (u.term.name, u.term.where) not in hypothesis.keys]
+    fresh = [u for u in other.effects if u.term.key not in hypothesis.keys]
     if added:
         return all(_is_determined(hypotheses, other, u) for u in fresh)
     # A law leaves form error beside noise: a number that removes little may only adapt the form.
@@ -159,15 +158,14 @@ def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used
 
 def _is_distinct(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> bool:
     """Return whether an effect's 95 % intervals exclude those that it includes."""
-    assert isinstance(used.term, Effect)
     numbers = _numbers(hypotheses, hypothesis, used)
-    return used.term.distinct({name: e.ci95 for name, e in numbers.items()})
+    return effect_in(used).distinct({name: e.ci95 for name, e in numbers.items()})
 
 
 def _numbers(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> dict[str, Estimate]:
     """Return an effect's numbers with 95 % intervals, errors of the forms included."""
     data, fit = hypotheses.train_data, hypothesis.fit
-    values = parameter_values(data.rig, fit.terms, dict(fit.beta))
+    values = fit.parameters(data.rig)
     errors = effect_errors(data, fit, used, values)
     return estimates(data, used, errors, form_shift(data, fit))
 
@@ -180,12 +178,11 @@ def _form_error_energy(
     Where the numbers of the richer reading differ little, its further number may only adapt to an
     error of its form, which is as large as this energy.
     """
-    values = parameter_values(hypotheses.train_data.rig, other.fit.terms, dict(other.fit.beta))
+    rig = hypotheses.train_data.rig
+    values = other.fit.parameters(rig)
     near = any(
-        (u.term.simpler(hypotheses.train_data.rig, values, TRACE.near_tolerance), u.term.where)
-        in hypothesis.keys
-        for u in other.effects
-        if isinstance(u.term, Effect)
+        (effect.simpler(rig, values, TRACE.near_tolerance), effect.where) in hypothesis.keys
+        for effect in effects_among(other.effects)
     )
     left = sum(
         max(0.0, v - hypotheses.noise_band.by_equation[e]) for e, v in other.excess_energy.items()
@@ -200,17 +197,17 @@ def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypo
     """
     rig, sets = hypotheses.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
     for used in hypothesis.effects:
-        assert isinstance(used.term, Effect)
+        own = effect_in(used)
         for effect in hypotheses.effects:
-            if not of_one_law(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
+            if not of_one_law(effect, own) or effect.key in hypothesis.keys:
                 continue
-            kept = [u for u in hypothesis.effects if u is not used]
-            if effect.beside or used.term.beside:
-                kept.append(used)
-            elif used.term.name not in effect.includes:
+            kept = hypothesis.without(used)
+            if effect.beside or own.beside:
+                kept = (*kept, used)
+            elif own.name not in effect.includes:
                 continue
             if not may_grow(kept):
                 continue
-            effects = (*kept, Used(effect, effect.shape_of(rig, ())))
+            effects = (*kept, at_start(rig, effect))
             sets[keys_of(effects)] = effects
     return [hypotheses.refined(effects) for effects in sets.values()]

@@ -13,7 +13,8 @@ from analysis.effects.base import Effect
 from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
-from analysis.terms.base import Term, Used
+from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start, effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import removal
 from analysis.trace.judge.curves import noise_covariance
@@ -44,8 +45,8 @@ def rivals_of(
     held-out records have shown that it is too simple; a richer one is a rival where it changes a
     parameter of another law, or where the effect cannot be separated from others anyway.
     """
-    judged_effect, train_data = used.term, hypotheses.train_data
-    others = winner.keys - {(judged_effect.name, judged_effect.where)}
+    judged_effect, train_data = effect_in(used), hypotheses.train_data
+    others = winner.keys - {judged_effect.key}
     training_test = TieTest(
         train_data,
         removal.removed_energy(winner, alternative),
@@ -54,10 +55,8 @@ def rivals_of(
     )
     out: list[Rival] = []
     richer: list[Rival] = []
-    assert isinstance(judged_effect, Effect)
     for hypothesis, fresh in hypotheses.replacements(winner, used):
-        other = fresh.term
-        assert isinstance(other, Effect)
+        other = effect_in(fresh)
         same_law = of_one_law(judged_effect, other)
         justified = _numbers_justified(winner, hypothesis)
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
@@ -79,7 +78,7 @@ def rivals_of(
         own = judged_effect.family if same_law else ""
         moved = moved_parameter(train_data, winner, hypothesis, own) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
-        free = any(u.term.free for u in hypothesis.effects)  # type: ignore[attr-defined]
+        free = any(effect.free for effect in effects_among(hypothesis.effects))
         if not same_law and not justified and (moved is None or free):
             continue
         rival = _rival(other, ratio, training_test.ratio(hypothesis.fit.residual), tied, moved)
@@ -92,7 +91,7 @@ def rivals_of(
         # One effect is the simpler explanation, unless the records prefer two.
         if moved and _cost(composite, holdout_data) < _cost(winner, holdout_data):
             ratios = ratio, training_test.ratio(composite.fit.residual)
-            one, two = (_rival(u.term, *ratios, True) for u in composite.effects[-2:])
+            one, two = (_rival(effect_in(u), *ratios, True) for u in composite.effects[-2:])
             out.append(replace(one, moved=moved, beside=two))
     if any(rival.tied for rival in out):
         out += richer
@@ -101,10 +100,9 @@ def rivals_of(
 
 
 def _rival(
-    effect: Term, ratio: float, training_ratio: float, tied: bool,
+    effect: Effect, ratio: float, training_ratio: float, tied: bool,
     moved: tuple[str, float] | None = None,
 ) -> Rival:  # fmt: skip
-    assert isinstance(effect, Effect)
     return Rival(effect.name, place_of(effect), ratio, training_ratio, tied, effect.where, moved)
 
 
@@ -186,9 +184,7 @@ def best_tied_set(
 
 def _is_richer(hypothesis: Hypothesis, winner: Hypothesis) -> bool:
     """Return whether a set has a richer name of one of the winner's laws."""
-    named, others = (
-        [u.term for u in one.effects if isinstance(u.term, Effect)] for one in (winner, hypothesis)
-    )
+    named, others = (effects_among(one.effects) for one in (winner, hypothesis))
     return any(is_special_case(effect, other) for effect in named for other in others)
 
 
@@ -224,17 +220,14 @@ def alternatives_of(
     out = [(hypothesis, "") for hypothesis in tied]
     named = {(effect.name, effect.at) for effect in effects}
     for used in winner.effects:
-        effect = used.term
-        assert isinstance(effect, Effect)
-        if (effect.name, effect.where) not in named:
+        effect = effect_in(used)
+        if effect.key not in named:
             continue
-        others = [u for u in winner.effects if u is not used]
         for form in hypotheses.effects:
-            if not is_special_case(effect, form) or (form.name, form.where) in winner.keys:
+            if not is_special_case(effect, form) or form.key in winner.keys:
                 continue
-            start = Used(form, form.shape_of(hypotheses.train_data.rig, ()))
-            richer = hypotheses.refined([*others, start])
             rows, law = hypotheses.train_data, effect.family
+            richer = hypotheses.refined([*winner.without(used), at_start(rows.rig, form)])
             if richer not in tied and moved_parameter(rows, winner, richer, law) is None:
                 possible = not hypotheses.physical_problem(richer)
                 out.append((richer, "" if possible else law))

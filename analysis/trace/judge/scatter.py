@@ -23,7 +23,6 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.search.exact_fit import ExactFit, contribution, design_matrix, tangent
-from analysis.trace.search.hypothesis import parameter_values
 from analysis.trace.search.refinement import fits_in_other_forms
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
@@ -133,7 +132,7 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
 
 def _is_possible(rig: Rig, fit: ExactFit) -> bool:
     """Return whether the numbers of all effects of a fit are physically possible."""
-    values = parameter_values(rig, fit.terms, dict(fit.beta))
+    values = fit.parameters(rig)
     effects = [(u.term, u.shape) for u in fit.terms if isinstance(u.term, Effect)]
     return not any(e.problem(rig, values, s) or e.outside(rig, s) for e, s in effects)
 

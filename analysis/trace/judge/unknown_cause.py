@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import shapes_of
 from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.gates import NO_RIVAL, REMOVES
 from analysis.trace.judge.inference import all_include
@@ -68,7 +69,7 @@ def judged_beside_unknown_cause(
 
     # Of two effects that make up for one bent parameter, each seems needed beside the other.
     together = problem(winner.effects) if len(winner.effects) > 1 else ""
-    used = {(u.term.name, u.term.where): u for u in winner.effects}
+    used = {u.term.key: u for u in winner.effects}
 
     def refused(effect: JudgedEffect) -> JudgedEffect:
         own = used[effect.name, effect.at]
@@ -84,10 +85,9 @@ def _size_includes_zero(rig: Rig, used: Used, effect: JudgedEffect) -> str:
     A size is a coefficient, or a shape with a value at which the effect vanishes. What an unknown
     cause leaves widens the intervals.
     """
-    assert isinstance(used.term, Effect)
     sizes = {c.parameter: 0.0 for c in used.term.coefficients(rig)}
     sizes |= {s.parameter: s.neutral for s in shapes_of(rig, used) if s.neutral is not None}
-    if used.term.free or not all_include(sizes, effect.parameters):
+    if effect_in(used).free or not all_include(sizes, effect.parameters):
         return ""
     names = ", ".join(name for name in sizes if name in effect.parameters)
     return f"{names} may be nothing within the interval beside a cause that is not known"

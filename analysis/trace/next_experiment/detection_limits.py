@@ -24,6 +24,7 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
@@ -31,12 +32,11 @@ from analysis.trace.next_experiment.discrimination import (
     smallest_effect,
 )
 from analysis.trace.result import DetectionLimit
-from analysis.trace.search.exact_fit import rebased, tangent
+from analysis.trace.search.exact_fit import parameter_values, rebased, tangent
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     is_special_case,
     law_of,
-    parameter_values,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
@@ -74,13 +74,13 @@ def absorbed_effects(
     """
     train_data = hypotheses.train_data
     in_motion = train_data.records[0].filtering.in_motion
-    named = [u.term for u in winner.effects if isinstance(u.term, Effect)]
+    named = effects_among(winner.effects)
     if any(effect.free for effect in named):
         return None
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
     asked = [
         effect for effect in effects
-        if (effect.name, effect.where) not in winner.keys
+        if effect.key not in winner.keys
         and not (effect.beside and effect.joint in in_motion)
         and not any(is_special_case(effect, other) for other in named)
     ]  # fmt: skip
@@ -172,9 +172,9 @@ def _fitted_instead(
     out: dict[Effect, tuple[float, ...]] = {}
     for own in winner.effects:
         for _, other in hypotheses.replacements(winner, own):
-            if law_of(other) == law_of(own):
-                assert isinstance(other.term, Effect)
-                out[other.term] = other.shape
+            effect = effect_in(other)
+            if law_of(effect) == law_of(effect_in(own)):
+                out[effect] = other.shape
     return out
 
 
@@ -234,8 +234,7 @@ def is_possible(rig: Rig, model: Model, explanation: Explanation, times: float) 
     known = {name: e.value for name, e in model.parameters.items() if e.identified}
 
     def problem(used: Used, times: float) -> str:
-        effect, shape = used.term, list(used.shape)
-        assert isinstance(effect, Effect)
+        effect, shape = effect_in(used), list(used.shape)
         for k, s in enumerate(shapes_of(rig, used)[: len(effect.least_shapes())]):
             neutral = s.neutral or 0.0
             shape[k] = neutral + times * (shape[k] - neutral)

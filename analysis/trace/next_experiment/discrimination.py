@@ -28,7 +28,6 @@ from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.cache import RowCache
-from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
     is_hidden_by_lock,
@@ -207,8 +206,7 @@ class ComparisonRows:
         return self._known[used]
 
     def _training_columns(self, used: Used) -> dict[str, Array]:
-        assert isinstance(used.term, Effect)
-        columns = variant_columns(self.train_data, [Variant(used.term, used.shape)])
+        columns = variant_columns(self.train_data, [used])
         return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
     def _with_view_columns(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:

@@ -37,7 +37,8 @@ from analysis.trace.next_experiment.discrimination import (
 )
 from analysis.trace.next_experiment.range_extension import LINES, more_lines, wider_range
 from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, JudgedEffect
-from analysis.trace.search.hypothesis import Hypothesis, parameter_values
+from analysis.trace.search.exact_fit import parameter_values
+from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import EXPERIMENT, SEARCH
 from rig.model.rig import Rig
@@ -97,7 +98,7 @@ def propose(
 def rig_with_estimates(train_data: RegressionData) -> Rig:
     """Return the rig with nominal values from the records, so that its twin is more accurate."""
     plain = tuple(map(Used, baseline_of(train_data.rig)))
-    parameters = parameter_values(train_data.rig, plain, dict(train_data.beta))
+    parameters = parameter_values(train_data.rig, plain, train_data.beta)
     before = train_data.rig.nominal
     likely = {
         name: value

@@ -78,7 +78,7 @@ def small_effect_notes(winner: Hypothesis, larger: Sequence[tuple[Hypothesis, Mo
     noted = [(o, moved) for o, moved in larger if abs(moved[1]) >= TRACE.noted_shift]
     for hypothesis, (parameter, change) in noted or larger[:1]:
         terms = (u.term for u in hypothesis.effects)
-        fresh = [term for term in terms if (term.name, term.where) not in winner.keys]
+        fresh = [term for term in terms if term.key not in winner.keys]
         places = " and ".join(place_in_words(term.where) for term in fresh)
         out.append(
             f"{fresh[0].name} at {places} leaves too little to be named, but "

@@ -7,6 +7,7 @@ from typing import Final
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.hypothesis import Hypothesis, effect_of, is_special_case, may_grow
 from analysis.trace.search.starts import at_best_point
@@ -20,8 +21,7 @@ def is_confusable(effect: Effect, used: Used) -> bool:
     It is another name of its mechanism at the same place, or, at its joint or of the bench, the
     same effect on another channel or chamber or one of its confounders.
     """
-    own = used.term
-    assert isinstance(own, Effect)
+    own = effect_in(used)
     same = effect.mechanism == own.mechanism and effect.where == own.where
     alike = effect.name in (own.name, *own.confounders) and act_at_one_joint(effect, own)
     return (same or alike) and not effect.free
@@ -49,14 +49,13 @@ def confusable_sets(
     """Return the sets with one effect exchanged for another candidate or for two."""
     sets = [effects for used in now.effects for effects in composites(data, candidates, now, used)]
     for used in now.effects if len(now.effects) > 1 else ():
-        others = tuple(u for u in now.effects if u is not used)
+        others = now.without(used)
         for effect in candidates:
-            if (effect.name, effect.where) in now.keys or not is_confusable(effect, used):
+            if effect.key in now.keys or not is_confusable(effect, used):
                 continue
             fresh = at_best_point(data, effect, others)
             sets.append((*others, fresh))
-            assert isinstance(used.term, Effect)
-            if is_special_case(used.term, effect):
+            if is_special_case(effect_in(used), effect):
                 # Another effect may only have made up for what the simpler law lacks.
                 sets += [(*(u for u in others if u is not one), fresh) for one in others]
     return sets
@@ -70,18 +69,17 @@ def composites(
     The confounder has another mechanism and is at the effect's joint. Friction of one level with
     the offset of a pressure is nearly friction of two levels, but for the flows.
     """
-    own = used.term
-    assert isinstance(own, Effect)
-    known = now.keys | {(u.term.name, u.term.where) for u in data.terms}
-    others = tuple(u for u in now.effects if u is not used)
+    own = effect_in(used)
+    known = now.keys | {u.term.key for u in data.terms}
+    others = now.without(used)
     if not may_grow(others, by=2):
         return []
     simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
     confounders = [
         e for e in candidates
-        if is_confounder(e, own) and e.mechanism != own.mechanism and (e.name, e.where) not in known
+        if is_confounder(e, own) and e.mechanism != own.mechanism and e.key not in known
     ]  # fmt: skip
     return [
-        (*others, *(Used(e, e.shape_of(data.rig, ())) for e in (simple, other)))
+        (*others, *(at_start(data.rig, e) for e in (simple, other)))
         for simple in simpler for other in confounders
     ]  # fmt: skip

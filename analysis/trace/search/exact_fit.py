@@ -70,6 +70,22 @@ class ExactFit:
         """Energy of the whitened residual."""
         return float(self.residual @ self.residual)
 
+    def parameters(self, rig: Rig) -> dict[str, float]:
+        """Return the parameters by name."""
+        return parameter_values(rig, self.terms, self.beta)
+
+
+def parameter_values(
+    rig: Rig, terms: Sequence[Used], beta: Mapping[str, float]
+) -> dict[str, float]:
+    """Return parameters from the rows' coefficients (b from 1/b), NaN without a coefficient."""
+    out = {}
+    for used in terms:
+        for c in used.term.coefficients(rig):
+            value = float(beta.get(c.parameter, np.nan))
+            out[c.parameter] = 1.0 / value if c.reciprocal and value else value
+    return out
+
 
 def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     """Return the whitened rows of a model at the instants of the averaged records.

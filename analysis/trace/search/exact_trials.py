@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.hypothesis import (
     Hypothesis,
@@ -58,9 +59,7 @@ def _best_trials(
 
     A candidate must act in one of the `equations`.
     """
-    starts: list[tuple[Used, ...]] = [
-        tuple(u for u in now.effects if u is not used) for used in now.effects
-    ]
+    starts = [now.without(used) for used in now.effects]
     if may_grow(now.effects):
         starts.append(now.effects)
     for start in starts:
@@ -76,13 +75,14 @@ def _best_additions(
     """
     data = hypotheses.train_data
     least: dict[Key, _Trial] = {}
-    for variant in hypotheses.variants_of(data, now.fit.residual):
-        fresh = variant.key not in now.keys and not variant.effect.free
-        if fresh and hypotheses.may_act(variant, now, equations):
-            effects = (*start, variant.used)
+    for used in hypotheses.variants_of(data, now.fit.residual):
+        effect = effect_in(used)
+        fresh = effect.key not in now.keys and not effect.free
+        if fresh and hypotheses.may_act(effect, now, equations):
+            effects = (*start, used)
             energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
-            if energy < least.get(variant.key, (float("inf"), ()))[0]:
-                least[variant.key] = energy, effects
+            if energy < least.get(effect.key, (float("inf"), ()))[0]:
+                least[effect.key] = energy, effects
     ordered = sorted(least.values(), key=lambda trial: trial[0])
     possible = (
         trial for trial in ordered

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms import make
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
@@ -37,10 +38,14 @@ class Hypothesis:
         """Names and places of its effects."""
         return keys_of(self.effects)
 
+    def without(self, used: Used) -> tuple[Used, ...]:
+        """Return its effects but one."""
+        return tuple(u for u in self.effects if u is not used)
+
     @property
     def laws(self) -> frozenset[Key]:
         """Mechanisms and places of its effects; names of one mechanism at one place are one law."""
-        return frozenset(map(law_of, self.effects))
+        return frozenset(map(law_of, effects_among(self.effects)))
 
     @property
     def total(self) -> float:
@@ -50,7 +55,7 @@ class Hypothesis:
 
 def keys_of(effects: Iterable[Used]) -> frozenset[Key]:
     """Return the names and places of effects."""
-    return frozenset((u.term.name, u.term.where) for u in effects)
+    return frozenset(u.term.key for u in effects)
 
 
 def may_grow(effects: Sequence[Used], by: int = 1) -> bool:
@@ -58,10 +63,9 @@ def may_grow(effects: Sequence[Used], by: int = 1) -> bool:
     return len({used.term.name for used in effects}) + by <= SEARCH.most_names
 
 
-def law_of(used: Used) -> Key:
+def law_of(effect: Effect) -> Key:
     """Return the mechanism and the place of an effect."""
-    assert isinstance(used.term, Effect)
-    return used.term.mechanism, used.term.where
+    return effect.mechanism, effect.where
 
 
 def is_special_case(effect: Effect, other: Effect) -> bool:
@@ -84,16 +88,6 @@ class NoiseBand:
     def total(self) -> float:
         """The sum over equations."""
         return sum(self.by_equation.values())
-
-
-def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) -> dict[str, float]:
-    """Return parameters from the rows' coefficients (b from 1/b)."""
-    out = {}
-    for used in terms:
-        for c in used.term.coefficients(rig):
-            value = float(beta.get(c.parameter, np.nan))
-            out[c.parameter] = 1.0 / value if c.reciprocal and value else value
-    return out
 
 
 def negative_body(rig: Rig, fit: ExactFit, baseline: ExactFit) -> str:

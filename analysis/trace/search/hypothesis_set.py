@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import Variant, complexity, variants
+from analysis.trace.data.candidates import at_start, complexity, effect_in, effects_among, variants
 from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
@@ -29,7 +29,13 @@ from analysis.trace.data.regression_data import (
 )
 from analysis.trace.search import linear_fit
 from analysis.trace.search.confounders import BENCH, confusable_sets
-from analysis.trace.search.exact_fit import ExactFit, fit_coefficients, jacobian, rebased
+from analysis.trace.search.exact_fit import (
+    ExactFit,
+    fit_coefficients,
+    jacobian,
+    parameter_values,
+    rebased,
+)
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -43,7 +49,6 @@ from analysis.trace.search.hypothesis import (
     negative_body,
     noise_band,
     of_one_law,
-    parameter_values,
     removes_too_little,
     spoils_equation,
     within_band,
@@ -98,7 +103,7 @@ class HypothesisSet:
         wide.effects = (*self.effects, *effects)
         return wide
 
-    def variants_of(self, data: RegressionData, residual: Array) -> list[Variant]:
+    def variants_of(self, data: RegressionData, residual: Array) -> list[Used]:
         """Return the candidates at every point of their shape grids.
 
         `residual` (M,) of the data places the points of effects whose grid depends on the data.
@@ -118,19 +123,18 @@ class HypothesisSet:
         effects `may_be_at_bounds` (name, where) may lie at their bounds.
         """
         rig = self.train_data.rig
-        values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
+        values = hypothesis.fit.parameters(rig)
         for used in sorted(hypothesis.effects, key=lambda used: used is not first):
-            assert isinstance(used.term, Effect)
-            for name in used.term.excludes:
-                if (name, used.term.where) in hypothesis.keys:
-                    return f"{used.term.name} and {name} exclude each other at one place"
-            terms, signals = hypothesis.fit.terms, self._signals
-            problem = used.term.problem(rig, values, used.shape)
-            problem = problem or used.term.not_shown(rig, values, used.shape, terms, signals)
-            if (used.term.name, used.term.where) not in may_be_at_bounds:
-                problem = problem or used.term.outside(rig, used.shape)
+            effect, terms = effect_in(used), hypothesis.fit.terms
+            for name in effect.excludes:
+                if (name, effect.where) in hypothesis.keys:
+                    return f"{effect.name} and {name} exclude each other at one place"
+            problem = effect.problem(rig, values, used.shape)
+            problem = problem or effect.not_shown(rig, values, used.shape, terms, self._signals)
+            if effect.key not in may_be_at_bounds:
+                problem = problem or effect.outside(rig, used.shape)
             if problem:
-                whose = f"of {used.term.name} at {place_in_words(used.term.where)}: "
+                whose = f"of {effect.name} at {place_in_words(effect.where)}: "
                 return problem if used is first else whose + problem
         return negative_body(rig, hypothesis.fit, self.empty.fit)
 
@@ -139,6 +143,8 @@ class HypothesisSet:
 
         The search of its shapes ends early where it is no better than the set `instead_of`.
         """
+        if not effects:
+            return self.empty
         key = keys_of(effects)
         if key not in self.fitted:
             rival = None if instead_of is None else instead_of.fit
@@ -169,12 +175,10 @@ class HypothesisSet:
 
     def replacements(self, winner: Hypothesis, used: Used) -> Iterator[tuple[Hypothesis, Used]]:
         """Yield the fitted sets with one other effect in the place of `used`, and that effect."""
-        key = used.term.name, used.term.where
+        key = used.term.key
         others = winner.keys - {key}
         for hypothesis in self.fitted.values():
-            fresh = [
-                u for u in hypothesis.effects if (u.term.name, u.term.where) not in winner.keys
-            ]
+            fresh = [u for u in hypothesis.effects if u.term.key not in winner.keys]
             if key not in hypothesis.keys and others <= hypothesis.keys and len(fresh) == 1:
                 yield hypothesis, fresh[0]
 
@@ -201,17 +205,14 @@ class HypothesisSet:
     def _simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return sets with an effect replaced by a simpler one that it equals."""
         rig, out = self.train_data.rig, []
-        known = {(u.term.name, u.term.where) for u in self.base}
+        known = {u.term.key for u in self.base}
         for hypothesis in among:
-            values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
+            values = hypothesis.fit.parameters(rig)
             for used in hypothesis.effects:
-                assert isinstance(used.term, Effect)
-                name, where = used.term.simpler(rig, values), used.term.where
-                if not name or (name, where) in known | hypothesis.keys:
-                    continue
-                simple = effect_of(name, where)
-                others = [u for u in hypothesis.effects if u is not used]
-                out.append(self.refined([*others, Used(simple, simple.shape_of(rig, ()))]))
+                name, where = effect_in(used).simpler(rig, values), used.term.where
+                if name and (name, where) not in known | hypothesis.keys:
+                    simple = at_start(rig, effect_of(name, where))
+                    out.append(self.refined([*hypothesis.without(used), simple]))
         return out
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
@@ -234,7 +235,7 @@ class HypothesisSet:
         if within_band(now.excess_energy, band):
             return now
         pairs = [
-            self.refined([candidates.entries[m].variant.used for m in pair.members])
+            self.refined([candidates.entries[m].used for m in pair.members])
             for pair in linear_fit.best_pairs(candidates, r, SEARCH.refined_pairs)
         ]
         if self.within_form_tolerance(now):
@@ -287,22 +288,22 @@ class HypothesisSet:
         self, data: RegressionData, columns: Sequence[VariantColumns], mask: Array | None = None
     ) -> linear_fit.CandidateColumns:
         rig = data.rig
-        values = parameter_values(rig, data.terms, dict(data.beta))
+        values = parameter_values(rig, data.terms, data.beta)
 
         def allowed(entry: VariantColumns, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
             # No lower bound: a size below that of the grid's first point is fitted exactly later.
             if not 0.0 <= own.get("", 0.0) <= SEARCH.size_ratio:
                 return False
-            effect = entry.variant.effect
+            effect = effect_in(entry.used)
             if effect.free:  # its curve may be physical only with the details of its form
                 return True
             for c in effect.coefficients(rig):
                 own.setdefault(c.parameter, 0.0)
-            return not effect.problem(rig, {**values, **own}, entry.variant.shape)
+            return not effect.problem(rig, {**values, **own}, entry.used.shape)
 
         def size(entry: VariantColumns) -> int:
-            return complexity(rig, [entry.variant.used])[1]
+            return complexity(rig, [entry.used])[1]
 
         return linear_fit.project(data, columns, size, allowed, mask)
 
@@ -313,13 +314,13 @@ class HypothesisSet:
         out: dict[Key, tuple[Used, ...]] = {}
         least = SEARCH.near_gain * float(np.max(g, initial=0.0))
         for i in map(int, np.argsort(-g)):
-            variant = candidates.entries[i].variant
+            used = candidates.entries[i].used
             if (
                 (g[i] > least or (g[i] > 0 and len(out) < 3))
-                and variant.key not in out
+                and used.term.key not in out
                 and len(out) < SEARCH.refined_singles
             ):
-                out[variant.key] = (variant.used,)
+                out[used.term.key] = (used,)
         return list(out.values())
 
     def extensions(
@@ -331,13 +332,14 @@ class HypothesisSet:
         and a name of it are not combined at one place: one would be the other's form error.
         """
         data, taken, laws = rebased(self.train_data, now.fit), now.keys, now.laws
-        curves = {law_of(u) for u in now.effects if isinstance(u.term, Effect) and u.term.free}
+        curves = {law_of(e) for e in effects_among(now.effects) if e.free}
         tried = [
-            v
-            for v in self.variants_of(data, now.fit.residual)
-            if v.key not in taken and (not free or v.effect.free)
-            and law_of(v.used) not in (laws if v.effect.free else curves)
-            and self.may_act(v, now, equations)
+            used
+            for used in self.variants_of(data, now.fit.residual)
+            for effect in (effect_in(used),)
+            if effect.key not in taken and (not free or effect.free)
+            and law_of(effect) not in (laws if effect.free else curves)
+            and self.may_act(effect, now, equations)
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
         mask = np.ones(len(now.fit.residual))
@@ -353,9 +355,9 @@ class HypothesisSet:
         r = r - candidates.basis @ (candidates.basis.T @ r)
         out: dict[Key, tuple[Used, ...]] = {}
         for trial in linear_fit.sets_with_one_more(candidates, (), r):
-            variant = candidates.entries[trial.members[0]].variant
+            used = candidates.entries[trial.members[0]].used
             if len(out) < SEARCH.refined_extensions:
-                out.setdefault(variant.key, (*now.effects, variant.used))
+                out.setdefault(used.term.key, (*now.effects, used))
         larger = [self._extended(now, effects) for effects in out.values()]
         if free:
             return larger
@@ -377,14 +379,14 @@ class HypothesisSet:
         if not may_grow(hypothesis.effects):
             return
         for used in hypothesis.effects:
-            own, others = used.term, [u for u in hypothesis.effects if u is not used]
-            assert isinstance(own, Effect)
+            own = effect_in(used)
             for effect in self.effects:
-                key = effect.name, effect.where
                 part = of_one_law(effect, own) and (effect.beside or own.beside)
-                acts = not equations or not self._acting.get(key, set()).isdisjoint(equations)
-                if part and acts and key not in hypothesis.keys:
-                    yield (*others, *(Used(e, e.shape_of(rig, ())) for e in (own, effect)))
+                acts = not equations or not self._acting.get(effect.key, set()).isdisjoint(
+                    equations
+                )
+                if part and acts and effect.key not in hypothesis.keys:
+                    yield (*hypothesis.without(used), at_start(rig, own), at_start(rig, effect))
 
     def _extended(self, now: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
         """Return the exact fit of a set that extends `now`, with its shapes as starting points.
@@ -392,7 +394,7 @@ class HypothesisSet:
         A new effect begins at the size that leaves least. Where an equation keeps more than under
         `now`, an earlier search of the shapes, which had begun elsewhere, ended in a local minimum.
         """
-        fresh = [u for u in effects if (u.term.name, u.term.where) not in now.keys]
+        fresh = [u for u in effects if u.term.key not in now.keys]
         others = [u for u in effects if u not in fresh]
         effects = [*others, *(at_best_size(self.train_data, u, others) for u in fresh)]
         known = self.refined(effects)
@@ -400,16 +402,16 @@ class HypothesisSet:
             self._refined_anew(effects) if spoils_equation(known, now, self.noise_band) else known
         )
 
-    def may_act(self, variant: Variant, now: Hypothesis, equations: Collection[str]) -> bool:
+    def may_act(self, effect: Effect, now: Hypothesis, equations: Collection[str]) -> bool:
         """Return whether a candidate may have columns in some of the equations (any if none).
 
         It has them where it has under the baseline. Only an effect of the bench couples the joints'
         flows, so that a candidate may act in further ones.
         """
         coupled = any(u.term.where.startswith(BENCH) for u in now.effects)
-        if not equations or coupled or variant.key not in self._acting:
+        if not equations or coupled or effect.key not in self._acting:
             return True
-        return not self._acting[variant.key].isdisjoint(equations)
+        return not self._acting[effect.key].isdisjoint(equations)
 
     @functools.cached_property
     def _signals(self) -> list[Signals]:
@@ -420,7 +422,7 @@ class HypothesisSet:
         """Equations in which each candidate has columns under the baseline."""
         out: dict[Key, set[str]] = {}
         for entry in self.columns:
-            out.setdefault(entry.variant.key, set()).update(entry.touched)
+            out.setdefault(entry.used.term.key, set()).update(entry.touched)
         return out
 
     def exchanged(self, now: Hypothesis) -> Hypothesis:
@@ -484,10 +486,7 @@ class HypothesisSet:
         """Return the set without effects that are not needed or remove too little."""
         band = self.noise_band
         while len(hypothesis.effects) > 1:
-            smaller = [
-                self._refined_anew([u for u in hypothesis.effects if u is not used])
-                for used in hypothesis.effects
-            ]
+            smaller = [self._refined_anew(hypothesis.without(used)) for used in hypothesis.effects]
             smaller = [o for o in smaller if not self.physical_problem(o)]
             simpler = [
                 o

@@ -172,10 +172,10 @@ def sets_with_one_more(
     for m in members:
         K, c = schur_complement(K, c, candidates.groups[m])
     g = gains(K, c, candidates.groups, candidates.least)
-    taken = {candidates.entries[m].variant.key for m in members}
+    taken = {candidates.entries[m].used.term.key for m in members}
     trials: list[LinearFit] = []
     for i in _best_of_each(candidates, g):
-        if g[i] <= 0 or candidates.entries[i].variant.key in taken:
+        if g[i] <= 0 or candidates.entries[i].used.term.key in taken:
             continue
         if g[i] < SEARCH.add_share * energy_touched(candidates, i, now):
             continue
@@ -200,7 +200,7 @@ def _best_of_each(candidates: CandidateColumns, g: Array) -> list[int]:
     fitted: Counter[Key] = Counter()
     best: list[int] = []
     for i in map(int, np.argsort(-g)):
-        key = candidates.entries[i].variant.key
+        key = candidates.entries[i].used.term.key
         fitted[key] += 1
         if fitted[key] <= SEARCH.shapes_fitted:
             best.append(i)
@@ -228,11 +228,11 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
     starts: dict[Key, int] = {}
     for i in map(int, np.argsort(-g)[: 6 * SEARCH.pair_starts]):
         if g[i] > 0:
-            starts.setdefault(candidates.entries[i].variant.key, i)
+            starts.setdefault(candidates.entries[i].used.term.key, i)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[: SEARCH.pair_starts]:
         for pair in sets_with_one_more(candidates, (first,), r)[:3]:
-            keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
+            keys = frozenset(candidates.entries[m].used.term.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
     return sorted(pairs.values(), key=lambda p: p.total)[:count]

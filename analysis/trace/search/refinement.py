@@ -19,6 +19,7 @@ from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shape_values, shapes_of
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.exact_fit import (
     ExactFit,
@@ -93,8 +94,7 @@ def _refined(
 def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
     """Return the fit with details of the form of term number `place`, where they remove enough."""
     used = fit.terms[place]
-    assert isinstance(used.term, Effect)
-    starts = used.term.in_detail(data.rig, used.shape)
+    starts = effect_in(used).in_detail(data.rig, used.shape)
     opened = [Used(used.term, start) for start in starts if start != used.shape]
     asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
     # Half, since the linear prediction is less than what a detail removes.
@@ -122,9 +122,8 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, before: 
     the detail fits something else: noise that reverses a contact at rest looks like a long
     presliding distance that shrinks with speed.
     """
-    assert isinstance(used.term, Effect)
     shapes = shapes_of(data.rig, used)
-    if any(map(_at_end, shapes, used.shape)) or used.term.outside(data.rig, used.shape):
+    if any(map(_at_end, shapes, used.shape)) or effect_in(used).outside(data.rig, used.shape):
         return False
     names, columns = tangent(data, fit)
     misfit = math.sqrt(max(1.0, fit.energy / len(fit.residual)))
@@ -159,16 +158,14 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
 
     def priced(model: ExactFit) -> tuple[bool, float]:
         used = model.terms[place]
-        assert isinstance(used.term, Effect)
-        outside = bool(used.term.outside(data.rig, used.shape))
+        outside = bool(effect_in(used).outside(data.rig, used.shape))
         return outside, model.energy + price * len(_free_shapes(data, model.terms))
 
     while True:
         used = fit.terms[place]
-        assert isinstance(used.term, Effect)
         others = [
             _with_searched_shapes(data, with_term(fit.terms, used, Used(used.term, shape)), steps)
-            for shape in used.term.other_forms(data.rig, used.shape)
+            for shape in effect_in(used).other_forms(data.rig, used.shape)
         ]
         best = min(others, key=priced, default=fit)
         if priced(best) >= priced(fit):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import shape_grid
+from analysis.trace.data.candidates import at_start, shape_grid
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.settings import SEARCH
@@ -40,7 +40,7 @@ def at_best_point(data: RegressionData, effect: Effect, others: Sequence[Used]) 
     """
     shapes = effect.shapes(data.rig)
     if not any(s.neutral is not None and s.low < s.neutral for s in shapes):
-        return Used(effect, effect.shape_of(data.rig, ()))
+        return at_start(data.rig, effect)
     return _least(data, [Used(effect, point) for point in shape_grid(effect, data.rig)], others)
 
 

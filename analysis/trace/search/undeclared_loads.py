@@ -22,6 +22,7 @@ from analysis.effects.base import Effect
 from analysis.effects.mechanics import Payload, growth, heaviest_payload
 from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import in_judging_block
@@ -102,7 +103,7 @@ def undeclared_load(
         return None
     load = fitted_load(rig, terms, train)
     if load is None and beside:
-        terms = (*terms, *(Used(effect, effect.shape_of(rig, ())) for effect in beside))
+        terms = (*terms, *(at_start(rig, effect) for effect in beside))
         load = fitted_load(rig, terms, train)
     if load is None:
         return None

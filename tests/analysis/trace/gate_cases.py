@@ -49,9 +49,9 @@ class Searched:
 
     def set_of(self, *names: str) -> Hypothesis:
         """Return the fitted set of the named candidates, each at its first look."""
-        entries = [v.variant for v in self.hypotheses.columns]
+        entries = [entry.used for entry in self.hypotheses.columns]
         return self.hypotheses.refined(
-            [next(v.used for v in entries if v.effect.name == name) for name in names]
+            [next(u for u in entries if u.term.name == name) for name in names]
         )
 
     def named(self) -> set[str]:

@@ -60,7 +60,7 @@ def test_an_offset_of_a_pressure_is_tried_for_a_spring(rig: Rig) -> None:
     names = ("joint_spring", "sensor_offset", "internal_leakage")
     s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, offset_rod_pressure=6e4), *names)
     again = s.hypotheses.exchanged(s.set_of("joint_spring", "internal_leakage"))
-    found = {(u.term.name, u.term.where): u.shape for u in again.effects}
+    found = {u.term.key: u.shape for u in again.effects}
     assert set(found) == {("sensor_offset", "joint 2 rod"), ("internal_leakage", "joint 2")}
     assert found["sensor_offset", "joint 2 rod"][0] == pytest.approx(6e4, rel=0.05)
 

@@ -10,7 +10,6 @@ from analysis.effects.friction import CoulombFriction
 from analysis.effects.mechanics import TorqueOffset
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import VariantColumns, regression_data
 from analysis.trace.search.linear_fit import gains, project, sets_with_one_more
@@ -35,7 +34,7 @@ def test_how_much_of_a_column_must_be_its_own(
     own -= data.base @ np.linalg.lstsq(data.base, own, rcond=None)[0]
     column = x / np.linalg.norm(x) + length * own / np.linalg.norm(own)
     entry = VariantColumns(
-        Variant(TorqueOffset("joint 2"), ()), (name,), column[:, None], frozenset({"torque_2"})
+        Used(TorqueOffset("joint 2"), ()), (name,), column[:, None], frozenset({"torque_2"})
     )
     candidates = project(data, [entry], lambda _: 1, lambda *_: True)
     gained = gains(candidates.K, candidates.columns.T @ own, candidates.groups, candidates.least)
@@ -58,11 +57,11 @@ def test_an_effect_that_fits_with_an_impossible_number_leaves_room_for_others(ri
         other = rng.normal(size=len(r)) * (torque != 0.0)
         column = share * r + (1.0 - share) * other
         where = frozenset({"torque_2"})
-        return VariantColumns(Variant(effect, shape), ("size",), column[:, None], where)
+        return VariantColumns(Used(effect, shape), ("size",), column[:, None], where)
 
     friction, offset = CoulombFriction("joint 2"), TorqueOffset("joint 2")
     entries = [entry(friction, (1e-5 * k,), 0.99) for k in range(1, 51)]
     entries.append(entry(offset, (), 0.7))
-    candidates = project(data, entries, lambda _: 1, lambda e, _: e.variant.effect is offset)
+    candidates = project(data, entries, lambda _: 1, lambda e, _: e.used.term is offset)
     found = sets_with_one_more(candidates, (), r)
-    assert [candidates.entries[m].variant.effect for m in found[0].members] == [offset]
+    assert [candidates.entries[m].used.term for m in found[0].members] == [offset]

@@ -29,7 +29,7 @@ def test_a_gain_wrong_by_parts_in_a_thousand_is_not_called_crosstalk_of_the_othe
     """With one joint the same chamber's cross-talk cannot be told from it, the other's can."""
     runs = pair_of_runs(rig, c_internal=LEAK, gain_cap_pressure=gain)
     s = searched(rig, *runs, "internal_leakage", "sensor_gain", "sensor_crosstalk")
-    sizes = {(u.term.name, u.term.where): u.shape for u in s.winner.effects}
+    sizes = {u.term.key: u.shape for u in s.winner.effects}
     assert set(sizes) == {("internal_leakage", "joint 2"), ("sensor_gain", "joint 2 cap")}
     assert sizes["sensor_gain", "joint 2 cap"][0] == pytest.approx(gain, abs=3e-4)
     assert s.vetoes(s.winner) == ""

@@ -100,7 +100,7 @@ def answers(case: Case, train: Run, held_out: Sequence[Run]) -> list[MethodAnswe
         )
 
     chosen = stepwise(fitted)
-    keys = tuple(entry.variant.key for entry in chosen)
+    keys = tuple(entry.used.term.key for entry in chosen)
     verdict = EXPLAINED if chosen else CLEAN
     products, count = _sparse(fitted, judging)
     return [
@@ -121,10 +121,10 @@ def stepwise(data: RegressionData) -> list[VariantColumns]:
     chosen: list[VariantColumns] = []
     now = _criterion(data, chosen, r)
     while len(chosen) < MOST:
-        taken = {entry.variant.key for entry in chosen}
+        taken = {entry.used.term.key for entry in chosen}
         basis = _basis(data, chosen)
         left = r - basis @ (basis.T @ r)
-        free = [entry for entry in entries if entry.variant.key not in taken]
+        free = [entry for entry in entries if entry.used.term.key not in taken]
         if not free:
             break
         best = min(free, key=lambda entry: _joined(data, entry, basis, left))
@@ -158,7 +158,7 @@ def _criterion(data: RegressionData, chosen: Sequence[VariantColumns], r: Array)
     """Return n ln(RSS / n) + k ln(n) of a set fitted together with the baseline."""
     basis = _basis(data, chosen)
     left = r - basis @ (basis.T @ r)
-    k = complexity(data.rig, [entry.variant.used for entry in chosen])[1]
+    k = complexity(data.rig, [entry.used for entry in chosen])[1]
     return float(len(r) * np.log(left @ left / len(r)) + k * np.log(len(r)))
 
 
@@ -167,7 +167,7 @@ def _joined(data: RegressionData, entry: VariantColumns, basis: Array, left: Arr
     own = entry.columns - basis @ (basis.T @ entry.columns)
     fit = np.linalg.lstsq(own, left, rcond=1e-6)[0]
     rest = left - own @ fit
-    k = complexity(data.rig, [entry.variant.used])[1]
+    k = complexity(data.rig, [entry.used])[1]
     return float(len(left) * np.log((rest @ rest) / (left @ left)) + k * np.log(len(left)))
 
 
@@ -177,9 +177,11 @@ def _taken_by_entries(
     """Return the share that chosen entries, fitted with the baseline, take on held-out records."""
     if not chosen:
         return 0.0
-    seen = variant_columns(judging, [entry.variant for entry in chosen])
-    by_key = {entry.variant.key: entry for entry in seen}
-    pairs = [(entry, by_key[entry.variant.key]) for entry in chosen if entry.variant.key in by_key]
+    seen = variant_columns(judging, [entry.used for entry in chosen])
+    by_key = {entry.used.term.key: entry for entry in seen}
+    pairs = [
+        (entry, by_key[entry.used.term.key]) for entry in chosen if entry.used.term.key in by_key
+    ]
     there = np.column_stack([entry.columns for entry, _ in pairs])
     here = np.column_stack([_as_named(other, entry.names) for entry, other in pairs])
     basis = _basis(fitted, ())

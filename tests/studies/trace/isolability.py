@@ -22,7 +22,7 @@ from analysis.effects.base import Effect
 from analysis.report.plots.style import INK, figure, style, svg
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import Variant, catalogue, variants
+from analysis.trace.data.candidates import catalogue, variants
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import (
     RegressionData,
@@ -82,8 +82,8 @@ def isolability(run: Run, joint: int = 2) -> Isolability:
     for entry in variant_columns(
         data, variants(rig, list(changes), evidence(data, data.mean_residual))
     ):
-        if entry.variant.effect in grids:
-            grids[entry.variant.effect].append(entry.columns)
+        if entry.used.term in grids:
+            grids[entry.used.term].append(entry.columns)
     base = orthonormal(data.base)
     own = [_off(base, change) for change in changes.values()]
     distance = np.zeros((len(own), len(own)))
@@ -116,7 +116,7 @@ def _least(data: RegressionData, effect: Effect) -> tuple[Array, Array] | None:
     if explanation is None:
         return None
     (used,) = explanation.effects
-    entries: list[VariantColumns] = variant_columns(data, [Variant(effect, used.shape)])
+    entries: list[VariantColumns] = variant_columns(data, [Used(effect, used.shape)])
     if not entries:
         return None
     (entry,) = entries
