@@ -5,8 +5,8 @@ Order of work, with the module of each step (`engine.trace` calls them):
  `search`: linear search for a set of effects, exact fits of the best sets
  `judge`: readings of one law, gates, errors on held-out records, intervals
  `free_forms`: mechanisms without a named form, where no name explains
- `remaining`, `clues`: equations that keep too much, and what their residual depends on
- `finding`: all of these on given rows, with the verdict (`Judgement`, `Finding`)
+ `judging`: all of these on given rows, with their answer and verdict (`finding`)
+ `clues`: what the residual depends on in equations that keep too much
  `next_experiment`: the experiment that answers the open question, detection limits
  `result`, `words`: the result as data, JSON and text
 

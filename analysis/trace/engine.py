@@ -17,6 +17,7 @@ from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
+from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.repeats import with_other_motions_apart
@@ -25,7 +26,7 @@ from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
 from analysis.trace.data.unrepeated import unrepeated_notes
-from analysis.trace.finding import Finding, unstated_noise
+from analysis.trace.finding import Finding
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
     find,
@@ -42,6 +43,7 @@ from analysis.trace.judge.curves import (
     rows_within_curves,
 )
 from analysis.trace.judge.unlocked import phase_notes, unlocked_lines
+from analysis.trace.judging import Candidates, unstated_noise
 from analysis.trace.next_experiment.detection_limits import (
     absorbed_effects,
     detection_limit_notes,
@@ -59,7 +61,6 @@ from analysis.trace.notes import (
     undetermined_notes,
     unseen_load_notes,
 )
-from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -125,9 +126,8 @@ def trace(
     rig = ck.common_rig([*runs, *holdout, *judge])
     refuse_repeated_records(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
-    options = _Options(
-        catalogue(rig) if effects is None else effects, known, seed, look_ahead, free_forms
-    )
+    effects = catalogue(rig) if effects is None else effects
+    options = _Options(effects, seed, look_ahead, free_forms)
     apart, notes = with_other_motions_apart(
         with_common_bandwidth(with_loads_stated([*runs, *holdout, *judge]))
     )
@@ -135,17 +135,18 @@ def trace(
     train, unseen, judging = (tuple(next(stated) for _ in x) for x in (runs, holdout, judge))
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
-    records = TraceRuns(train, unseen, judging, tuple(families))
-    result = _of_rig(rig, _traced(with_b, records, options, progress or _no_progress))
+    records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
+    result = _of_rig(rig, _traced(records, options, progress or _no_progress))
     result = replace(result, notes=(*notes, *result.notes))
+    may_be_load = any(effect.name == Payload.name for effect in effects)
+    may_be_load &= all(used.term.name != Payload.name for used in known)
     load = None
-    if result.verdict == UNEXPLAINED and MECHANICAL in families and options.may_be_load:
+    if result.verdict == UNEXPLAINED and MECHANICAL in families and may_be_load:
         beside = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
-        load = undeclared_load(with_b, known, train, unseen, judging, beside)
+        load = undeclared_load(records, beside)
     if load is None:
         return result
-    records = TraceRuns(load.train, load.holdout, load.judge, records.families)
-    again = _of_rig(rig, _traced(with_b, records, options, _no_progress))
+    again = _of_rig(rig, _traced(load.records, options, _no_progress))
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
         seconds = time.perf_counter() - started
         return replace(again, notes=(*notes, load.words, *again.notes), seconds=seconds)
@@ -160,23 +161,16 @@ def _of_rig(rig: Rig, result: Trace) -> Trace:
 
 @dataclass(frozen=True)
 class _Options:
-    """Candidates, the terms `known` to act, and further options of `trace`.
+    """Candidates and further options of `trace`.
 
     `geometry_exact`: the rig's areas, volumes and pin distances are taken as they are.
     """
 
     effects: Sequence[Effect]
-    known: tuple[Used, ...]
     seed: int
     look_ahead: bool
     free_forms: bool
     geometry_exact: bool = False
-
-    @property
-    def may_be_load(self) -> bool:
-        """Whether a load is a candidate and not part of the model already."""
-        tried = any(effect.name == Payload.name for effect in self.effects)
-        return tried and all(used.term.name != Payload.name for used in self.known)
 
 
 @dataclass(frozen=True)
@@ -189,31 +183,33 @@ class _Prepared:
     records: TraceRuns
     rows: TraceRows
     as_recorded: RegressionData
-    terms: tuple[Used, ...]
-    candidates: Sequence[Effect]
-    free: Sequence[Effect]
+    candidates: Candidates
     baseline: Model
     notes: tuple[str, ...]
 
 
-def _prepared(rig: Rig, records: TraceRuns, options: _Options) -> _Prepared:
+def _prepared(records: TraceRuns, options: _Options) -> _Prepared:
     """Build the rows and candidates, and identify the baseline."""
-    known, unseen = options.known, (*records.holdout, *records.judge)
-    terms = ordered((*known, *temperature_terms(known, records.train, unseen)))
-    as_recorded = trace_rows(rig, terms, records)
-    records, rows = _without_unlocked_lines(rig, terms, records, as_recorded)
+    rig, known = records.rig, records.terms
+    temperature = temperature_terms(known, records.train, records.unseen)
+    records = replace(records, terms=ordered((*known, *temperature)))
+    as_recorded = rows = trace_rows(records)
+    # Sines whose phase differs between repeats are taken out.
+    if lines := unlocked_lines(rows.train):
+        records = replace(records, lines=lines)
+        rows = trace_rows(records)
     moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
     baseline = identified(records.train, rows.train.terms)
     notes = (
         *undetermined_notes(baseline.model),
         *(c.detail for c in baseline.checks if c.name == GEOMETRY and rig.uncertain_numbers),
     )
-    return _Prepared(
-        records, rows, as_recorded.train, terms,
+    candidates = Candidates(
         _not_in_model(options.effects, known, moving),
         _not_in_model(free_mechanisms(rig), known) if options.free_forms else [],
-        baseline.model, notes,
-    )  # fmt: skip
+        options.seed,
+    )
+    return _Prepared(records, rows, as_recorded.train, candidates, baseline.model, notes)
 
 
 def _with_free_runs(
@@ -224,37 +220,35 @@ def _with_free_runs(
     Effects with which the free run fails or is far worse than without them are not named. A free
     run with parameters of the model without them (`held_out.completed`) is no evidence against it.
     """
-    unseen, before = [*records.holdout, *records.judge], prepared.baseline
+    before = prepared.baseline
 
     def fit(finding: Finding) -> FittedModel:
-        choosing = prepared.rows.unseen.choosing_runs
-        return model_with_effects(prepared.records, choosing, before, prepared.candidates, finding)
+        choosing, named = prepared.rows.unseen.choosing_runs, prepared.candidates.named
+        return model_with_effects(prepared.records, choosing, before, named, finding)
 
     fitted = fit(finding)
     simulated = held_out.completed(fitted.model, before)
-    first, last = held_out.free_runs(unseen, before, simulated)
+    first, last = held_out.free_runs(records.unseen, before, simulated)
     if simulated is fitted.model and (worse := held_out.worse_free_run(first, last)):
         finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
         fitted, last = fit(finding), first
     return finding, fitted, (first, last)
 
 
-def _traced(
-    rig: Rig, records: TraceRuns, options: _Options, done: Callable[[float], None]
-) -> Trace:
+def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]) -> Trace:
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
     started = time.perf_counter()
-    prepared = _prepared(rig, records, options)
-    before, terms = prepared.baseline, prepared.terms
+    prepared = _prepared(records, options)
+    before = prepared.baseline
 
     def columns(share: float) -> None:
         done(PREPARED + (COLUMNS - PREPARED) * share)
 
     def searched(p: _Prepared) -> Finding:
-        return find(rig, terms, p.records, p.rows, p.candidates, p.free, options.seed, columns)
+        return find(p.records, p.rows, p.candidates, columns)
 
     finding = searched(prepared)
-    if known := unstated_noise(rig, terms, prepared.records, finding):
+    if known := unstated_noise(prepared.records, finding):
         prepared = replace(prepared, records=known[0], rows=known[1])
         finding = searched(prepared)
     if by_geometry := _traced_within_tolerances(records, options, finding, done):
@@ -284,18 +278,18 @@ def _traced(
     )
     curves = curves_that_limit(unseen.judging, winner.fit)
     error = held_out.errors(
-        rig, unseen.members, first, last, unseen.divided, curves, train_data.floors,
+        records.rig, unseen.members, first, last, unseen.divided, curves, train_data.floors,
         records.noise_ratio,
     )  # fmt: skip
-    verdict, kept = _final_verdict(rig, terms, records, finding, winner)
+    verdict, kept = _final_verdict(records, finding, winner)
     hidden = []
     if verdict != UNEXPLAINED:
         absorbed = fitted.absorbed
         if winner is not finding.winner:
-            absorbed = absorbed_effects(hypotheses, prepared.candidates, winner)
+            absorbed = absorbed_effects(hypotheses, prepared.candidates.named, winner)
         hidden = detection_limits(absorbed, winner, after)
     notes = [
-        *unseen_load_notes(records.train, [*records.holdout, *records.judge]),
+        *unseen_load_notes(records.train, records.unseen),
         *prepared.rows.unseen.notes,
         *evidence_notes(prepared.rows.train, prepared.rows.unseen.choosing),
         *prepared.notes,
@@ -346,9 +340,7 @@ def _traced_within_tolerances(
     geometry = geometry_for_smaller_set(finding.hypotheses, finding.winner, explained)
     if geometry is None:
         return None
-    again = _traced(
-        geometry.rig, records.of_rig(geometry.rig), replace(options, geometry_exact=True), done
-    )
+    again = _traced(records.of_rig(geometry.rig), replace(options, geometry_exact=True), done)
     sizes = [
         (len(effects), sum(len(e.parameters) for e in effects))
         for effects in (again.effects, finding.named)
@@ -363,23 +355,12 @@ def _traced_within_tolerances(
     return replace(again, notes=(note, *again.notes))
 
 
-def _without_unlocked_lines(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, rows: TraceRows
-) -> tuple[TraceRuns, TraceRows]:
-    """Return runs and rows without the torques whose phase differs between repeats."""
-    lines = unlocked_lines(rows.train)
-    if not lines:
-        return records, rows
-    records = replace(records, lines=lines)
-    return records, trace_rows(rig, terms, records)
-
-
 def _no_progress(_: float) -> None:
     """Ignore progress."""
 
 
 def _final_verdict(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, finding: Finding, winner: Hypothesis
+    records: TraceRuns, finding: Finding, winner: Hypothesis
 ) -> tuple[str, list[str]]:
     """Return the verdict after the judging rows, and notes on what they keep or cannot show.
 
@@ -393,7 +374,7 @@ def _final_verdict(
     )
     joints = joints_with_friction(winner, kept)
     if joints and not finding.rows.in_motion:
-        rows, hypotheses, moving = fitted_in_motion(rig, terms, records, winner, joints)
+        rows, hypotheses, moving = fitted_in_motion(records, winner, joints)
         if not judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
             kept, words = set(), rest_phase_notes(joints, included=True)
     return (UNEXPLAINED if kept else finding.verdict), words

@@ -12,12 +12,10 @@ import numpy as np
 from analysis.effects.base import Effect
 from analysis.trace.data.candidates import effect_in, effects_among
 from analysis.trace.data.conditioned_record import families_of
-from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.finding import Finding, has_tied_rival, remainders
 from analysis.trace.judge import gates
 from analysis.trace.judge.curves import rows_within_curves
-from analysis.trace.judgement import Judgement, has_tied_rival
-from analysis.trace.remaining import remainders
-from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
+from analysis.trace.result import CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.confounders import act_at_one_joint
 from analysis.trace.search.hypothesis import (
     Hypothesis,
@@ -33,24 +31,26 @@ log = logging.getLogger(__name__)
 
 
 def explained_by_free_form(
-    hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis,
-    holdout_data: RegressionData, rng: np.random.Generator, explained: bool,
-) -> Judgement | None:  # fmt: skip
-    """Return the first set with a free form that explains the records, None where none does.
+    found: Finding, free: Sequence[Effect], rng: np.random.Generator
+) -> Finding | None:
+    """Return an explanation by the first set with a free form that gives one.
 
-    `free` are the free mechanisms, `winner` the named effects that passed the gates. A free form
-    joins these effects, or replaces those of one mechanism; it never joins a name of its own
-    mechanism at the same place. Every gate of every effect must hold
-    with it, no remainder may speak against the set, and no named effect may fit as well as the
-    free form. Where the named effects have `explained` the records, `_is_better` must hold too.
+    None where none does, and where none is needed: named effects explain to within the tolerance
+    for their forms, with one mechanism or only noise left. A free form of the mechanisms `free`
+    joins the named effects that passed, or replaces those of one mechanism; it never joins a name
+    of its own mechanism at the same place. Every gate of every effect must hold with it, no
+    remainder may speak against the set, and no named effect may fit as well as the free form. Where
+    the named effects explain, `_is_better` must hold too. `rng` draws the sign flips.
     """
-    if not free:
+    hypotheses, winner = found.hypotheses, found.winner
+    explained = found.verdict != UNEXPLAINED
+    if not free or (explained and not (winner.effects and _may_be_replaced(hypotheses, winner))):
         return None
     extended = hypotheses.with_candidates(free)
     named = {kind.name for kind in extended.effects if not kind.free}
     sets = _sets_with_free_form(extended, winner, explained)
     for hypothesis in _simplest_first(extended, sets):
-        compared = rows_within_curves(holdout_data, hypothesis.fit)
+        compared = rows_within_curves(found.rows.unseen.choosing, hypothesis.fit)
         effects = gates.judge_effects(extended, hypothesis, compared, rng)
         left = remainders(extended, hypothesis, compared)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
@@ -58,8 +58,15 @@ def explained_by_free_form(
         passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in left)
         if passed and not _ties_with_name(effects, named):
             verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
-            return Judgement(extended, effects, hypothesis, verdict, tuple(left))
+            return Finding(found.rows, extended, hypothesis, verdict, effects, left)
     return None
+
+
+def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
+    """Return whether a set that explains leaves enough for a free form in its place."""
+    to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
+    several = len(winner.laws) > 1
+    return not to_noise and (several or not hypotheses.within_form_tolerance(winner))
 
 
 def _ties_with_name(effects: Sequence[JudgedEffect], named: set[str]) -> bool:

@@ -10,78 +10,68 @@ import numpy as np
 from analysis.effects.base import Effect
 from analysis.effects.friction import force_unit
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.terms.base import Used, equation
+from analysis.terms.base import equation
 from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
-from analysis.trace.finding import (
-    Finding,
-    search_and_judge,
-    with_free_form,
-    without_unnamed_effects,
-)
+from analysis.trace.finding import Finding, without_unnamed_effects
 from analysis.trace.judge import gates, removal
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.unlocked import judged_line
+from analysis.trace.judging import Candidates, search_and_judge, with_free_form
 from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_fit import design_matrix
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
-from rig.model.rig import Rig
 
 
 def find(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, rows: TraceRows,
-    candidates: Sequence[Effect], free: Sequence[Effect], seed: int, done: Callable[[float], None],
-) -> Finding:  # fmt: skip
+    records: TraceRuns, rows: TraceRows, candidates: Candidates, done: Callable[[float], None]
+) -> Finding:
     """Return what the model lacks: `search_and_judge`, in motion only where that is needed.
 
     No curve of the speed meets the rows of a joint that rests: there free forms are tried in motion
     first. Torques at `records.lines` are judged beside the effects found. Where one is refused,
     nothing is taken out of the rows, and all is searched again.
     """
-    joints = {e.joint for e in candidates if e.family == "friction"}
+    joints = {e.joint for e in candidates.named if e.family == "friction"}
     rest = any(_rests(rows.train.records, joint) for joint in joints)
-    on_all_rows = search_and_judge(rows, candidates, () if rest else free, seed, done)
-    found = searched_in_motion(rig, terms, records, candidates, free, seed, on_all_rows)
+    on_all_rows = search_and_judge(rows, replace(candidates, free=()) if rest else candidates, done)
+    found = searched_in_motion(records, candidates, on_all_rows)
     if rest and found is on_all_rows:
-        found = with_free_form(found, free, seed)
+        found = with_free_form(found, candidates)
     found = without_unnamed_effects(found)
     if not records.lines:
         return found
-    judged = _judged_lines(rig, records, found)
+    judged = _judged_lines(records, found)
     refused = gates.refused_effects(judged)
     if refused:
         whole = replace(records, lines=())
-        rows = trace_rows(rig, terms, whole)
-        found = find(rig, terms, whole, rows, candidates, free, seed, done)
+        found = find(whole, trace_rows(whole), candidates, done)
         return replace(found, effects=(*found.effects, *refused))
     verdict = EXPLAINED if found.verdict == CLEAN else found.verdict
     return replace(found, effects=(*found.effects, *judged), verdict=verdict)
 
 
-def _judged_lines(rig: Rig, records: TraceRuns, found: Finding) -> tuple[JudgedEffect, ...]:
+def _judged_lines(records: TraceRuns, found: Finding) -> tuple[JudgedEffect, ...]:
     """Return the torques at `records.lines` with their gates, beside the effects found."""
     unseen, fit = found.rows.unseen, found.winner.fit
     train, holdout = (
-        conditioned_records(rig, runs, families=records.families)
+        conditioned_records(records.rig, runs, families=records.families)
         for runs in (records.train, records.holdout)
     )
     judged = []
     for line in records.lines:
         own = [s for s in unseen.choosing.segments if s.equation == equation("torque", line[0])]
         noise = float(np.sqrt(np.mean([s.noise**2 for s in own]))) if own else np.inf
-        judged.append(judged_line(rig, line, fit, train, holdout, unseen.divided, noise))
+        judged.append(judged_line(records.rig, line, fit, train, holdout, unseen.divided, noise))
     return tuple(judged)
 
 
-def searched_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
-    free: Sequence[Effect], seed: int, finding: Finding,
-) -> Finding:  # fmt: skip
+def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Finding) -> Finding:
     """Search again in rows weighted by speed, where a joint's torque balance keeps too much.
 
     While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
@@ -91,7 +81,7 @@ def searched_in_motion(
     show, slow samples get more weight.
     """
     above_noise, joints = _joints_to_weight(
-        finding, [e for e in candidates if e.family == "friction"]
+        finding, [e for e in candidates.named if e.family == "friction"]
     )
     weighted = set(finding.rows.in_motion)
     if joints <= weighted:
@@ -100,8 +90,8 @@ def searched_in_motion(
     def searched(joints: Collection[int], full_weight: float) -> Finding:
         unweighted = finding.rows.train.cache.without_family("mechanical")
         moving = moving_filtering({*weighted, *joints}, full_weight)
-        rows = trace_rows(rig, terms, records, moving, unweighted)
-        found = search_and_judge(rows, candidates, free, seed, lambda _: None)
+        rows = trace_rows(records, moving, unweighted)
+        found = search_and_judge(rows, candidates, lambda _: None)
         resting = rest_phase_notes(rows.in_motion, included=False)
         return replace(found, notes=(*resting, *found.notes))
 
@@ -120,7 +110,7 @@ def searched_in_motion(
     found = replace(found, notes=(*_breakaway_notes(found, finding, acting), *found.notes))
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
     found = replace(found, effects=(*found.effects, *failed))
-    return searched_in_motion(rig, terms, records, candidates, free, seed, found)
+    return searched_in_motion(records, candidates, found)
 
 
 def _joints_to_weight(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:
@@ -258,13 +248,13 @@ def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[
 
 
 def fitted_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
+    records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
 ) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
     """Return rows that are weighted by the speed of `joints` (0-based), and the set fitted to them.
 
     The middle element is the collection of sets that the fitted set belongs to.
     """
-    rows = trace_rows(rig, terms, records, moving_filtering(joints))
+    rows = trace_rows(records, moving_filtering(joints))
     hypotheses = HypothesisSet(rows.train, [])
     return rows, hypotheses, hypotheses.refined(winner.effects)
 

@@ -21,8 +21,8 @@ from analysis.trace.data.noise_floor import (
 )
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.data.trace_rows import WHY_MASKED
+from analysis.trace.finding import Remainder
 from analysis.trace.judge.held_out import refitted_names
-from analysis.trace.remaining import Remainder
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.search.geometry import Geometry

@@ -22,11 +22,16 @@ from analysis.trace.clues.equation_rows import (
     explained_share,
     whitened_columns,
 )
+from analysis.trace.clues.formula import formula, surest_formula
+from analysis.trace.clues.frequency import frequency_clue
 from analysis.trace.clues.variables import factor_of, factors, variables
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.result import Dependence
-from analysis.trace.search.hypothesis import energy_above_noise
-from analysis.trace.settings import CLUES
+from analysis.trace.data.spectral_lines import SpectralLines
+from analysis.trace.judge.held_out import held_out_residual
+from analysis.trace.result import Dependence, Formula
+from analysis.trace.search.exact_fit import rebased
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
+from analysis.trace.settings import CLUES, TRACE
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -35,6 +40,41 @@ Array = NDArray[np.float64]
 # An equation's own balance makes these variables follow whatever the equation lacks, so that they
 # are no sign of a cause.
 FOLLOW_BY_BALANCE = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
+
+
+def clues_to(
+    train_data: RegressionData,
+    holdout_data: RegressionData,
+    winner: Hypothesis,
+    split: Sequence[SpectralLines],
+) -> tuple[tuple[Dependence, ...], tuple[Formula, ...]]:
+    """Return the variables that the remaining residual follows, strongest first, and formulas.
+
+    `split` are the spectral lines of the training residual.
+    """
+    residual, held_residual = winner.fit.residual, held_out_residual(holdout_data, winner.fit)
+    train_rows, holdout_rows = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
+    equations = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
+    total = sum(winner.excess_energy[e] for e in equations)
+    equations = [e for e in equations if winner.excess_energy[e] > TRACE.clue_share * total]
+    moves = dependences(train_rows, residual, holdout_rows, held_residual, equations)
+    hum = frequency_clue(split, train_data, residual, holdout_data, held_residual)
+    candidates = [formula(train_rows, residual, holdout_rows, held_residual, e) for e in equations]
+    formulas = tuple(expression for expression in candidates if expression is not None)
+    first = _formula_clue(formulas) if hum is None else [hum]
+    listed = {d.variable for d in first}
+    return (*first, *(d for d in moves if d.variable not in listed)), formulas
+
+
+def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
+    """Return the variable of the best formula as a clue, none where no formula is sure."""
+    best = surest_formula(formulas)
+    if best is None:
+        return []
+    variable, by = (*best.variables, "")[:2]
+    monomial = next(name for name in best.terms if variable in name)
+    words = "" if monomial == variable else monomial
+    return [Dependence(variable, best.share, best.equation, by, words)]
 
 
 def hat_functions(v: Array, knots: Array) -> Array:

@@ -26,12 +26,14 @@ WHY_MASKED: Final = "a pressure lies outside 0 to the supply's, or samples were 
 
 @dataclass(frozen=True)
 class TraceRuns:
-    """Runs by their task, and the families of equations that are traced.
+    """Runs of a rig by their task, the model's terms, and the families of equations to trace.
 
     Sines at `lines` (joint, 0-based, and frequency [Hz]) are taken out of the torque balances;
     `noise_ratio` is by equation that of the noise to the stated noise where nothing repeats.
     """
 
+    rig: Rig
+    terms: tuple[Used, ...]
     train: tuple[Run, ...]
     holdout: tuple[Run, ...]
     judge: tuple[Run, ...]
@@ -39,13 +41,18 @@ class TraceRuns:
     lines: tuple[Line, ...] = ()
     noise_ratio: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def unseen(self) -> tuple[Run, ...]:
+        """The runs that no parameter is fitted to."""
+        return (*self.holdout, *self.judge)
+
     def of_rig(self, rig: Rig) -> TraceRuns:
         """Return the runs as records of another rig."""
         train, holdout, judge = (
             tuple(replace(run, rig=rig) for run in runs)
             for runs in (self.train, self.holdout, self.judge)
         )
-        return replace(self, train=train, holdout=holdout, judge=judge)
+        return replace(self, rig=rig, train=train, holdout=holdout, judge=judge)
 
 
 @dataclass(frozen=True)
@@ -74,10 +81,10 @@ class TraceRows:
 
 
 def trace_rows(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns,
-    filtering: Callable[[Record], Filtering] = trace_filtering, cache: RowCache | None = None,
+    records: TraceRuns, filtering: Callable[[Record], Filtering] = trace_filtering,
+    cache: RowCache | None = None,
 ) -> TraceRows:  # fmt: skip
-    """Return the whitened rows of all runs under a model of `terms`.
+    """Return the whitened rows of all runs under their model.
 
     `filtering` gives the row filter of each record; `cache` may hold training rows under the same
     filters. Coefficients are fitted to the training rows.
@@ -88,15 +95,15 @@ def trace_rows(
         return replace(filtering(record), lines=records.lines)
 
     def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
-        return conditioned_records(rig, runs, filters, records.families)
+        return conditioned_records(records.rig, runs, filters, records.families)
 
-    train_data = _training_rows(rig, terms, conditioned(records.train), cache, records.noise_ratio)
+    train_data = _training_rows(records, conditioned(records.train), cache)
 
     def unseen(members: Sequence[ConditionedRecord]) -> RegressionData:
-        beta, floors = train_data.beta, train_data.floors
         return regression_data(
-            rig, train_data.terms, members, beta, others=floors, noise_ratio=records.noise_ratio
-        )
+            records.rig, train_data.terms, members, train_data.beta,
+            others=train_data.floors, noise_ratio=records.noise_ratio,
+        )  # fmt: skip
 
     members = conditioned(records.holdout)
     data = unseen(members)
@@ -108,18 +115,18 @@ def trace_rows(
 
 
 def _training_rows(
-    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord], cache: RowCache | None,
-    noise_ratio: Mapping[str, float],
-) -> RegressionData:  # fmt: skip
+    records: TraceRuns, train: Sequence[ConditionedRecord], cache: RowCache | None
+) -> RegressionData:
     """Return the training rows, with the columns of the spools' paths between samples."""
 
     def rows(terms: tuple[Used, ...]) -> RegressionData:
-        data = regression_data(rig, terms, train, cache=cache, noise_ratio=noise_ratio)
+        ratio = records.noise_ratio
+        data = regression_data(records.rig, terms, train, cache=cache, noise_ratio=ratio)
         return _without_masked_steps(data)
 
-    data = rows(terms)
+    data = rows(records.terms)
     paths = path_terms(data)
-    return rows((*terms, *paths)) if paths else data
+    return rows((*records.terms, *paths)) if paths else data
 
 
 def _without_masked_steps(train_data: RegressionData) -> RegressionData:

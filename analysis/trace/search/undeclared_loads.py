@@ -26,6 +26,7 @@ from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import in_judging_block
+from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import DATA, TRACE
 from rig.model.records import LOADED, Run
@@ -40,14 +41,12 @@ Key = tuple[int, str]  # number of the run, name of the record
 
 @dataclass(frozen=True)
 class UndeclaredLoad:
-    """The runs with every record's load stated as its torque rows show it, and a note on that.
+    """Runs with every record's load stated as its torque rows show it, and a note on that.
 
     `shows_inertia` as in `LoadFit`.
     """
 
-    train: tuple[Run, ...]
-    holdout: tuple[Run, ...]
-    judge: tuple[Run, ...]
+    records: TraceRuns
     words: str
     shows_inertia: bool
 
@@ -89,17 +88,15 @@ class _LoadRows:
         return np.where(loaded[self.unit], self.column, 0.0)
 
 
-def undeclared_load(
-    rig: Rig, terms: Sequence[Used], train: Sequence[Run], holdout: Sequence[Run],
-    judge: Sequence[Run], beside: Sequence[Effect] = (),
-) -> UndeclaredLoad | None:  # fmt: skip
+def undeclared_load(records: TraceRuns, beside: Sequence[Effect] = ()) -> UndeclaredLoad | None:
     """Return the runs with the load that the torque rows show in some records, None if in none.
 
     The load alone is tried, then with the effects `beside` it. In a record that nothing is fitted
     to, its rows alone decide; in a held-out record whose rows are divided, the rows that choose.
     """
-    unseen = (*holdout, *judge)
-    if any(record.loaded is not None for run in (*train, *unseen) for record in run.records):
+    rig, terms = records.rig, records.terms
+    train, holdout, judge = records.train, records.holdout, records.judge
+    if any(r.loaded is not None for run in (*train, *records.unseen) for r in run.records):
         return None
     load = fitted_load(rig, terms, train)
     if load is None and beside:
@@ -119,8 +116,9 @@ def undeclared_load(
         f"about {plain(load.mass, 2)} kg more at the tip than the other records{weighed}; state "
         "`loaded` of the records where it is known (import manifest)"
     )
-    stated = [with_loads(runs, loaded) for runs, loaded in found]
-    return UndeclaredLoad(stated[0], stated[1], stated[2], words, load.shows_inertia)
+    train, holdout, judge = (with_loads(runs, loaded) for runs, loaded in found)
+    stated = replace(records, train=train, holdout=holdout, judge=judge)
+    return UndeclaredLoad(stated, words, load.shows_inertia)
 
 
 def _in_words(runs: Sequence[Run], loaded: frozenset[Key]) -> list[str]:

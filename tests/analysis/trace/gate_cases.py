@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace import engine, finding, remaining
+from analysis.trace import engine, finding
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.data.set_aside import UnseenRows
+from analysis.trace.data.trace_rows import TraceRows
 from analysis.trace.judge import gates
+from analysis.trace.judging import Judge
 from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -57,12 +60,17 @@ class Searched:
     def named(self) -> set[str]:
         """Return the names that pass the gates, quiet equations searched again."""
         rng = np.random.default_rng(0)
-        found = finding._apply_gates(self.hypotheses, self.winner, self.holdout_data, rng)
+        found = self.judge(rng).apply_gates(self.winner)
         return {f.name for f in found.effects if gates.passes_gates(f)}
+
+    def judge(self, rng: np.random.Generator) -> Judge:
+        """Return who judges the bench's sets, without free forms."""
+        unseen = UnseenRows(self.holdout_data, self.holdout_data, (), ())
+        return Judge(TraceRows(self.hypotheses.train_data, unseen), self.hypotheses, (), rng)
 
     def vetoes(self, one: Hypothesis) -> str:
         """Return what is left and speaks against a set, in words; '' for nothing."""
-        rest = remaining.remainders(self.hypotheses, one, self.holdout_data)
+        rest = finding.remainders(self.hypotheses, one, self.holdout_data)
         return "; ".join(r.words for r in rest if r.veto)
 
     def left_in(self, one: Hypothesis) -> dict[str, str]:

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.trace import finding
+from analysis.trace import judging
+from analysis.trace.finding import Finding, remainders
 from analysis.trace.judge import removal
 from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
-from analysis.trace.remaining import remainders
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
@@ -115,19 +115,17 @@ def test_a_further_effect_that_takes_all_that_is_left_is_named_although_it_ties(
     runs = pair_of_runs(rig, c_internal=LEAK, V_cap=3e-5)
     s = gate_cases.searched(rig, *runs, "internal_leakage", "dead_volume")
     leak = s.set_of("internal_leakage")
-    left = [r._replace(veto=False) for r in remainders(s.hypotheses, leak, s.holdout_data)]
+    left = tuple(r._replace(veto=False) for r in remainders(s.hypotheses, leak, s.holdout_data))
     assert left
-    monkeypatch.setattr(finding, "has_tied_rival", lambda effects: len(effects) > 1)
+    monkeypatch.setattr(judging, "has_tied_rival", lambda effects: len(effects) > 1)
     for share, names in (
         (SEARCH.further_share, {"internal_leakage", "dead_volume"}),
         (-1.0, {"internal_leakage"}),
     ):
-        monkeypatch.setattr(finding, "SEARCH", replace(SEARCH, further_share=share))
-        effects = finding._extended_set(
-            s.hypotheses, tuple(s.judged("internal_leakage")), leak, left, s.holdout_data,
-            np.random.default_rng(0),
-        )[0]  # fmt: skip
-        assert {e.name for e in effects} == names
+        monkeypatch.setattr(judging, "SEARCH", replace(SEARCH, further_share=share))
+        judge, effects = s.judge(np.random.default_rng(0)), tuple(s.judged("internal_leakage"))
+        found = Finding(judge.rows, s.hypotheses, leak, "", effects, left)
+        assert {e.name for e in judge._extended(found).effects} == names
 
 
 def test_both_parts_of_a_law_are_judged_where_one_does_not_explain(
@@ -138,15 +136,14 @@ def test_both_parts_of_a_law_are_judged_where_one_does_not_explain(
     names = ("coulomb_friction", "stribeck_friction")
     s = gate_cases.searched(rig, *runs, *names)
     level, both = s.set_of("coulomb_friction"), s.set_of(*names)
-    monkeypatch.setattr(finding.readings, "best_readings", lambda *_: level)
+    monkeypatch.setattr(judging.readings, "best_readings", lambda *_: level)
 
-    def judged(found: Hypothesis) -> finding.Judgement:
-        rng = np.random.default_rng(0)
-        return finding.judge_winner(s.hypotheses, found, (), s.holdout_data, rng)
+    def judged(found: Hypothesis) -> Finding:
+        return s.judge(np.random.default_rng(0)).best_finding(found)
 
     for found in (level, both):
         assert {e.name for e in judged(found).effects} == set(names)
-    monkeypatch.setattr(finding, "_under_other_names", lambda *_: None)
+    monkeypatch.setattr(judging.Judge, "_under_other_names", lambda *_: None)
     assert judged(level).verdict == "unexplained"
 
 

@@ -6,22 +6,24 @@ the tip is added to its parameters by hand.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from analysis.effects.base import Effect
 from analysis.effects.friction import CoulombFriction
 from analysis.effects.mechanics import Payload
 from analysis.identify.identify import identify
 from analysis.simulation.validate import validate
 from analysis.terms import baseline_of
-from analysis.terms.base import Used
+from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue
+from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.engine import trace
 from analysis.trace.notes import unseen_load_notes
-from analysis.trace.search.undeclared_loads import undeclared_load
+from analysis.trace.search.undeclared_loads import UndeclaredLoad, undeclared_load
 from rig.model.records import LOADED, Record, Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH, default_excitations, experiment
@@ -80,6 +82,13 @@ def test_a_stated_load_is_identified_with_the_bare_arm_beside_it(
         assert min(x for name, x in fit.items() if name.startswith("piston")) > 90.0
 
 
+def load_in(train: Run, held_out: Run, beside: Sequence[Effect] = ()) -> UndeclaredLoad | None:
+    """Return the load that the torque rows of the runs show in some of their records."""
+    terms = tuple(map(Used, baseline_of(train.rig)))
+    records = TraceRuns(train.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
+    return undeclared_load(records, beside)
+
+
 @pytest.mark.slow
 def test_an_undeclared_load_is_named_with_the_steps_that_carry_it(
     rig: Rig, runs: tuple[Run, Run]
@@ -95,10 +104,10 @@ def test_an_undeclared_load_is_named_with_the_steps_that_carry_it(
 
 def test_held_out_records_may_all_be_without_the_load(rig: Rig, runs: tuple[Run, Run]) -> None:
     bare = chosen(runs[1], lambda r: not heavy(r))
-    load = undeclared_load(rig, tuple(map(Used, baseline_of(rig))), [runs[0]], [bare], [])
+    load = load_in(runs[0], bare)
     assert load is not None
-    assert [r.loaded for r in load.train[0].records] == list(map(heavy, runs[0].records))
-    assert not any(r.loaded for r in load.holdout[0].records)
+    assert [r.loaded for r in load.records.train[0].records] == list(map(heavy, runs[0].records))
+    assert not any(r.loaded for r in load.records.holdout[0].records)
 
 
 def test_a_load_in_one_repeat_of_a_step_makes_it_a_step_of_its_own(
@@ -109,9 +118,9 @@ def test_a_load_in_one_repeat_of_a_step_makes_it_a_step_of_its_own(
     mixed = replace(
         runs[0], records=tuple(replace(r, step=r.step.removesuffix("_heavy")) for r in kept)
     )
-    load = undeclared_load(rig, tuple(map(Used, baseline_of(rig))), [mixed], [runs[1]], [])
+    load = load_in(mixed, runs[1])
     assert load is not None
-    assert {(r.step, r.loaded) for r in load.train[0].records} == {
+    assert {(r.step, r.loaded) for r in load.records.train[0].records} == {
         (f"step{k}{word}", bool(word)) for k in (1, 2, 3) for word in ("", ", loaded")
     }
     assert "step1_heavy_r2" in load.words
@@ -125,12 +134,11 @@ def rubbing(run: Run, level: float) -> Run:
 @pytest.mark.slow
 def test_a_load_is_found_beside_louder_friction(rig: Rig, runs: tuple[Run, Run]) -> None:
     train, held_out = (rubbing(run, 400.0) for run in runs)
-    terms = tuple(map(Used, baseline_of(rig)))
-    assert undeclared_load(rig, terms, [train], [held_out], []) is None
+    assert load_in(train, held_out) is None
     friction = [CoulombFriction("joint 2")]
-    load = undeclared_load(rig, terms, [train], [held_out], [], friction)
+    load = load_in(train, held_out, friction)
     assert load is not None
-    assert [r.loaded for r in load.train[0].records] == list(map(heavy, train.records))
+    assert [r.loaded for r in load.records.train[0].records] == list(map(heavy, train.records))
     assert "carry about 1.5 kg more" in load.words
 
 
@@ -138,11 +146,10 @@ def test_a_load_is_found_beside_louder_friction(rig: Rig, runs: tuple[Run, Run])
 def test_no_load_is_looked_for_where_one_is_stated_or_all_records_are_alike(
     rig: Rig, runs: tuple[Run, Run], word: int
 ) -> None:
-    terms = tuple(map(Used, baseline_of(rig)))
     known = stated(runs[0], lambda _: bool(word))
     alike = [chosen(run, lambda r: heavy(r) == bool(word)) for run in runs]
-    assert undeclared_load(rig, terms, [known], [runs[1]], []) is None
-    assert undeclared_load(rig, terms, alike[:1], alike[1:], []) is None
+    assert load_in(known, runs[1]) is None
+    assert load_in(*alike) is None
 
 
 def test_an_offset_of_a_pressure_in_one_step_is_not_taken_for_a_mass(
@@ -155,7 +162,7 @@ def test_an_offset_of_a_pressure_in_one_step_is_not_taken_for_a_mass(
         cap = np.asarray(record.channels["cap_pressure_1"]) + extra
         pushed.append(replace(record, channels={**record.channels, "cap_pressure_1": cap}))
     run = replace(runs[0], records=tuple(pushed))
-    load = undeclared_load(rig, tuple(map(Used, baseline_of(rig))), [run], [runs[1]], [])
+    load = load_in(run, runs[1])
     assert load is None or not load.shows_inertia
 
 
@@ -178,10 +185,10 @@ def test_a_load_in_some_repeats_of_the_only_step_is_found(
     """Step 2 alone, two repeats of it with the load or none."""
     kept = [r for r in runs[0].records if r.step.startswith("step2") and (mixed or not heavy(r))]
     run = replace(runs[0], records=tuple(replace(r, step="step2") for r in kept))
-    load = undeclared_load(rig, tuple(map(Used, baseline_of(rig))), [run], [runs[1]], [])
+    load = load_in(run, runs[1])
     if mixed:
         assert load is not None
-        assert [r.loaded for r in load.train[0].records] == list(map(heavy, kept))
+        assert [r.loaded for r in load.records.train[0].records] == list(map(heavy, kept))
     else:
         assert load is None
 

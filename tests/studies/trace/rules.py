@@ -19,7 +19,7 @@ from analysis.effects.friction import Friction
 from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
-from analysis.trace import engine, finding, fitted_model, in_motion, remaining
+from analysis.trace import engine, finding, fitted_model, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import gates, held_out, inference, removal, rivals
 from analysis.trace.search import confounders, hypothesis_set, linear_fit
@@ -209,7 +209,7 @@ RULES: Final = (
     Rule("pairs", "no pair of effects is tried at once",
          ((linear_fit, "best_pairs", lambda *_: []),)),
     Rule("tied sets", "of sets that cannot be separated, the one found first is named",
-         ((finding, "_with_best_tied_set", lambda found, *_: found),)),
+         ((judging.Judge, "_best_tied_set", lambda _, found: found),)),
     Rule("exact forms", "the form of a gain, an offset or a mass may miss as much as any other",
          ((gates, "form_share", lambda *_: TRACE.held_out_share),)),
     Rule("tolerances", "areas, volumes and pin distances are taken as the rig file states them",
@@ -230,9 +230,9 @@ RULES: Final = (
     Rule("nearer start", "a further effect begins at its size by first-order columns",
          ((hypothesis_set, "at_best_size", lambda _, used, _others: used),)),
     Rule("exact columns", "first-order columns alone find the effects",
-         ((finding, "improved_by_exact_trials", lambda _sets, now: now),)),
+         ((judging, "improved_by_exact_trials", lambda _sets, now: now),)),
     Rule("unknown cause", "names beside an unknown cause need no more than other names do",
-         ((finding, "judged_beside_unknown_cause", lambda _sets, _set, effects, _left: effects),)),
+         ((judging, "judged_beside_unknown_cause", lambda _sets, _set, effects, _left: effects),)),
     Rule("simpler name", "an effect that equals a simpler one is refused, and that one not tried",
          ((HypothesisSet, "_simpler_sets", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form only",
@@ -243,7 +243,7 @@ RULES: Final = (
     Rule("force at standstill", "rows in motion alone decide whether a breakaway acts",
          ((in_motion, "_hides_breakaway", lambda *_: False),)),
     Rule("free forms", "no mechanism without a named form",
-         ((finding, "_try_free_forms", lambda *_: None),)),
+         ((judging, "explained_by_free_form", lambda *_: None),)),
 )  # fmt: skip
 
 FAULTS: Final = (
@@ -279,7 +279,7 @@ FAULTS: Final = (
     Rule("tolerance x 10", "a size may differ twofold between parts",
          (setting("invariance_tolerance", 2.0),)),
     Rule("nothing is left", "whatever stays counts as nothing",
-         ((remaining, "remainders", lambda *_: []), (finding, "remainders", lambda *_: []),
+         ((finding, "remainders", lambda *_: ()), (judging, "remainders", lambda *_: ()),
           (gates, "held_out_above_band", lambda *_: []))),
     Rule("judging rows unread", "nobody asks what the judging rows keep",
          ((engine, "judging_rows_above_band", lambda *_: (set(), [])),)),

@@ -1,0 +1,307 @@
+"""Judging the sets that a search finds: gates, further effects, other names, free forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect
+from analysis.terms.base import Used
+from analysis.trace.clues.dependence import clues_to
+from analysis.trace.data.candidates import at_start, effect_in
+from analysis.trace.data.noise_floor import STATED
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
+from analysis.trace.data.unrepeated import unrepeated_floors
+from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
+from analysis.trace.free_forms import explained_by_free_form
+from analysis.trace.judge import gates, readings
+from analysis.trace.judge.rivals import best_tied_set
+from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
+from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
+from analysis.trace.search.exact_trials import improved_by_exact_trials
+from analysis.trace.search.hypothesis import Hypothesis, effect_of, within_band
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import DATA, SEARCH
+
+ONLY_HELD_OUT_MISSED = (
+    "the training records are met to within the noise, the held-out ones are not: train on "
+    "records with as much excitation as the held-out ones; if these have it, the machine has "
+    "changed between the runs: train on records taken after the change to trace it"
+)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What is searched: `named` effects, and `free` mechanisms tried where none of them explains.
+
+    `seed` draws the sign flips.
+    """
+
+    named: Sequence[Effect]
+    free: Sequence[Effect]
+    seed: int
+
+
+def search_and_judge(
+    rows: TraceRows, candidates: Candidates, done: Callable[[float], None]
+) -> Finding:
+    """Search the candidates for what the model lacks and judge it on the choosing rows.
+
+    `done` receives the share of the candidates' columns that is computed.
+    """
+    hypotheses, choosing = HypothesisSet(rows.train, candidates.named), rows.unseen.choosing
+    in_noise = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
+    if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
+        return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
+    winner = improved_by_exact_trials(hypotheses, hypotheses.run(done))
+    rng = np.random.default_rng(candidates.seed)
+    found = Judge(rows, hypotheses, candidates.free, rng).best_finding(winner)
+    named = any(map(gates.passes_gates, found.effects))
+    notes = remainder_notes(found.verdict, found.remainders, in_noise, named)
+    if not in_noise or found.verdict != UNEXPLAINED:
+        return replace(found, notes=notes)
+    notes = (*_held_out_only_notes(rows.train, found.remainders), *notes)
+    if found.winner.effects:
+        return replace(found, notes=notes)
+    return replace(found, effects=(), notes=notes, held_out_only=True)  # refused: fitted to noise
+
+
+def with_free_form(finding: Finding, candidates: Candidates) -> Finding:
+    """Return the finding, or an explanation by a free form where one is needed and explains."""
+    rng = np.random.default_rng(candidates.seed)
+    found = explained_by_free_form(finding, candidates.free, rng)
+    if found is None:
+        return finding
+    return replace(found, notes=remainder_notes(found.verdict, found.remainders, False, True))
+
+
+def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) -> list[str]:
+    """Say why only held-out records keep too much: what does not repeat, or little excitation."""
+    above = sorted({r.equation for r in left if r.veto})
+    unrepeated = [e for e in above if e in unrepeated_floors(train_data)]
+    out = [
+        f"{e}: the training repeats differ from each other too: the cause changes with time or "
+        "does not follow the excitation, and more excitation would not show it"
+        for e in unrepeated
+    ]
+    return out if unrepeated == above else [*out, ONLY_HELD_OUT_MISSED]
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Judges fitted sets of effects by the choosing rows.
+
+    `free` are mechanisms without a named form; `rng` draws the sign flips.
+    """
+
+    rows: TraceRows
+    hypotheses: HypothesisSet
+    free: Sequence[Effect]
+    rng: np.random.Generator
+
+    @property
+    def choosing(self) -> RegressionData:
+        """The rows that choose between effects."""
+        return self.rows.unseen.choosing
+
+    def best_finding(self, winner: Hypothesis) -> Finding:
+        """Judge the set that the search has found, and try free forms where it does not explain.
+
+        Its effects are judged under the simplest names that fit, and where these do not explain,
+        under other names of their laws (`_under_other_names`).
+        """
+        simplest = readings.best_readings(self.hypotheses, winner, self.choosing)
+        found = self.apply_gates(simplest)
+        if found.verdict == UNEXPLAINED:
+            found = self._under_other_names(winner, simplest) or found
+        if found.verdict == CONFOUNDED:
+            found = self._best_tied_set(found)
+        by_free_form = explained_by_free_form(found, self.free, self.rng)
+        if by_free_form is None and found.verdict == UNEXPLAINED:
+            return replace(found, effects=(*found.effects, *self._refused_as_unphysical()))
+        return by_free_form or found
+
+    def _under_other_names(self, winner: Hypothesis, simplest: Hypothesis) -> Finding | None:
+        """Return an explanation by other names of the laws of a set, None if there is none.
+
+        They are those that the search found, then both parts of a law of which one was refused: of
+        a breakaway the level alone is not the same at all speeds, nor is a breakaway that stands
+        for a level too.
+        """
+        parts = map(self.hypotheses.refined, self.hypotheses.with_parts_beside(simplest))
+        for other in (winner, *sorted(parts, key=lambda o: o.total)):
+            if other.keys != simplest.keys:
+                found = self.apply_gates(other)
+                if found.verdict != UNEXPLAINED:
+                    return found
+        return None
+
+    def _best_tied_set(self, found: Finding) -> Finding:
+        """Return the finding with the best of the sets that the records cannot separate."""
+        best = best_tied_set(self.hypotheses, found.winner, found.effects, self.choosing)
+        if best is found.winner:
+            return found
+        other = self.apply_gates(best)
+        all_pass = best.keys <= other.winner.keys
+        return other if all_pass and other.verdict == CONFOUNDED else found
+
+    def _refused_as_unphysical(self) -> tuple[JudgedEffect, ...]:
+        """Return the refused effects of the simplest set that explains with an unphysical number.
+
+        Only the gates of what an effect removes and of physics are asked; rivals are left out,
+        since they do not matter for an effect that physics refuses.
+        """
+        near = [
+            o for o in self.hypotheses.fitted.values()
+            if o.effects and self.hypotheses.within_form_tolerance(o)
+            and self.hypotheses.physical_problem(o)
+        ]  # fmt: skip
+        if not near:
+            return ()
+        best = min(near, key=lambda o: (o.size[1], o.total))
+        effects = gates.judge_effects(self.hypotheses, best, self.choosing, self.rng)
+        asked = (gates.REMOVES, gates.PHYSICAL)
+        judged = [
+            replace(f, rivals=(), gates=tuple(g for g in f.gates if g.name in asked))
+            for f in effects
+        ]
+        return tuple(f for f in judged if not gates.passes_gates(f))
+
+    def apply_gates(self, winner: Hypothesis) -> Finding:
+        """Put a set through the gates, extend it in single equations, and give the verdict.
+
+        Refused effects are among the judged ones only if the verdict is `unexplained`.
+        """
+        effects, refused, winner = self._passing_set(winner)
+        left = remainders(self.hypotheses, winner, self.choosing)
+        found = Finding(self.rows, self.hypotheses, winner, CLEAN, effects, left)
+        all_refused = bool(refused) and not winner.effects
+        if not all_refused:
+            found = self._extended(found)
+        above = {r.equation for r in found.remainders if r.veto}
+        if all_refused or above:
+            effects = judged_beside_unknown_cause(
+                self.hypotheses, found.winner, found.effects, above
+            )
+            return replace(found, verdict=UNEXPLAINED, effects=(*effects, *refused))
+        if not found.winner.effects:  # too little remains for any effect to be needed
+            return found
+        return replace(found, verdict=CONFOUNDED if has_tied_rival(found.effects) else EXPLAINED)
+
+    def _passing_set(
+        self, winner: Hypothesis
+    ) -> tuple[tuple[JudgedEffect, ...], tuple[JudgedEffect, ...], Hypothesis]:
+        """Return the effects that pass every gate together, the refused ones, the set of the first.
+
+        An effect may pass beside others and fail without them: a reduced set is judged again.
+        """
+        refused: tuple[JudgedEffect, ...] = ()
+        while winner.effects:
+            effects = gates.judge_effects(self.hypotheses, winner, self.choosing, self.rng)
+            judged = dict(zip(winner.effects, effects, strict=True))
+            failed = [used for used, f in judged.items() if not gates.passes_gates(f)]
+            if not failed:
+                return effects, refused, winner
+            dropped = self._least_needed(winner, failed)
+            refused += tuple(judged[used] for used in dropped)
+            winner = self.hypotheses.refined([u for u in winner.effects if u not in dropped])
+        return (), refused, winner
+
+    def _least_needed(self, winner: Hypothesis, failed: Sequence[Used]) -> list[Used]:
+        """Return the failed effects to leave out: of those of one family at one place, one.
+
+        Each of two frictions of a joint removes little beside the other, and one of them is needed.
+        The one without which least is left goes first.
+        """
+
+        def left_without(used: Used) -> float:
+            return self.hypotheses.refined(winner.without(used)).total
+
+        least: dict[tuple[str, str], Used] = {}
+        for used in sorted(failed, key=left_without, reverse=True):
+            least[effect_in(used).family, used.term.where] = used
+        return [used for used in failed if used in least.values()]
+
+    def _extended(self, found: Finding) -> Finding:
+        """Add effects for equations that keep too much, while all pass and fewer equations do.
+
+        Where no remainder speaks against the set, a further effect must not change whether the
+        answer has a tied rival, unless it completes the explanation or simpler names beside it make
+        the whole set no larger.
+        """
+        while found.remainders:
+            winner, left = found.winner, found.remainders
+            equations = {r.equation for r in left}
+            larger = self.hypotheses.extended_in(winner, equations)
+            if larger is None:
+                break
+            judged = gates.judge_effects(self.hypotheses, larger, self.choosing, self.rng)
+            less = remainders(self.hypotheses, larger, self.choosing)
+            replaces = not winner.keys <= larger.keys and sum(larger.size) <= sum(winner.size)
+            completes = self._completes(winner, larger, equations)
+            needed = replaces or completes or any(r.veto for r in left)
+            if not needed and has_tied_rival(judged) != has_tied_rival(found.effects):
+                break
+            if len(less) >= len(left) or not all(map(gates.passes_gates, judged)):
+                break
+            found = replace(found, effects=judged, winner=larger, remainders=less)
+        return found
+
+    def _completes(
+        self, winner: Hypothesis, larger: Hypothesis, equations: Collection[str]
+    ) -> bool:
+        """Return whether an effect removes all but `SEARCH.further_share` of what `winner` left.
+
+        Only in equations in which the winner's effects act: what they leave there is missing from
+        the explanation, while in others it is a small effect beside it.
+        """
+        start = self.hypotheses.empty.excess_energy
+        removed = {e: v - winner.excess_energy[e] for e, v in start.items()}
+        acting = SEARCH.acting_share * max(removed.values())
+        before, after = (
+            sum(max(0.0, h.excess_energy[e]) for e in equations) for h in (winner, larger)
+        )
+        within = all(removed[e] >= acting for e in equations)
+        return after <= SEARCH.further_share * before and within
+
+
+def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, TraceRows] | None:
+    """Return runs and rows whose noise floors are what `finding` leaves, where nothing repeats.
+
+    The stated noise may lack what a sensor has at low frequencies. Equations whose noise a step
+    shows keep their floors. None where each has one, where more than `DATA.unstated_ratio` times
+    the stated noise is left, where a variable of the records removes a part of that from held-out
+    records, or an effect that the gates refuse.
+    """
+    data = finding.rows.train
+    measured = {f.equation for f in data.floors if f.source != STATED}
+    refused = any(map(gates.removes, gates.refused_effects(finding.effects)))
+    if finding.verdict != UNEXPLAINED or refused:
+        return None
+    winner = _with_tied_effects(finding)
+    power: dict[str, list[NDArray[np.float64]]] = {}
+    for s in data.segments:  # whitened by the stated noise
+        if s.equation not in measured:
+            power.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
+    ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in power.items()}
+    if not ratio or max(ratio.values()) > DATA.unstated_ratio:
+        return None
+    moves, formulas = clues_to(data, finding.rows.unseen.choosing, winner, ())
+    if formulas or any(m.share > DATA.unstated_clue for m in moves):
+        return None
+    above = {name: max(1.0, value) for name, value in ratio.items()}
+    records = replace(records, noise_ratio=above)
+    return records, trace_rows(records)
+
+
+def _with_tied_effects(finding: Finding) -> Hypothesis:
+    """Return the set of a finding with effects that only a tied rival keeps from being named."""
+    passing = [effect_of(f.name, f.at) for f in finding.effects if gates.passes_gates(f)]
+    if len(passing) == len(finding.winner.effects):
+        return finding.winner
+    rig = finding.rows.train.rig
+    return finding.hypotheses.refined([at_start(rig, effect) for effect in passing])
