@@ -12,7 +12,7 @@ from analysis.report.identification.report import Provenance
 from analysis.report.page import page
 from analysis.report.plots import place_plot, trace_plots
 from analysis.simulation.model import Estimate
-from analysis.trace.clues.frequency import FREQUENCY
+from analysis.trace.clues.dependence import FREQUENCY
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
 from analysis.trace.words import free_run_row, quantity, shot_in_words, unit_of_equation

@@ -19,13 +19,12 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import catalogue, free_mechanisms
+from analysis.trace.data.nuisance_terms import temperature_terms
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.set_aside import refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
-from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
-from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import Finding
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
@@ -42,7 +41,7 @@ from analysis.trace.judge.curves import (
     equations_beyond_curves,
     rows_within_curves,
 )
-from analysis.trace.judge.unlocked import phase_notes, unlocked_lines
+from analysis.trace.judge.unrepeated import phase_notes, unlocked_lines, unrepeated_notes
 from analysis.trace.judging import Candidates, unstated_noise
 from analysis.trace.next_experiment.detection_limits import (
     absorbed_effects,

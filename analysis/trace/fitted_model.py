@@ -16,8 +16,8 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used, family_of
+from analysis.trace.data.nuisance_terms import at_nominal_temperature
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.temperature_nuisance import at_nominal_temperature
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns
 from analysis.trace.finding import Finding
 from analysis.trace.in_motion import equations_above_noise
@@ -25,8 +25,12 @@ from analysis.trace.judge.inference import with_form_error
 from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives
 from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
 from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
-from analysis.trace.next_experiment.detection_limits import AbsorbedEffects, absorbed_effects
-from analysis.trace.next_experiment.small_effects import sets_with_small_effect, small_effect_notes
+from analysis.trace.next_experiment.detection_limits import (
+    AbsorbedEffects,
+    absorbed_effects,
+    sets_with_small_effect,
+    small_effect_notes,
+)
 from analysis.trace.notes import shared_parameters
 from analysis.trace.result import UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_fit import contribution, design_matrix, fit_coefficients

@@ -16,9 +16,9 @@ from analysis.trace.data.conditioned_record import conditioned_records, moving_f
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
 from analysis.trace.finding import Finding, without_unnamed_effects
-from analysis.trace.judge import gates, removal
+from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.held_out import held_out_residual
-from analysis.trace.judge.unlocked import judged_line
+from analysis.trace.judge.unrepeated import judged_line
 from analysis.trace.judging import Candidates, search_and_judge, with_free_form
 from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
@@ -239,7 +239,7 @@ def equations_above_noise(rows: TraceRows, winner: Hypothesis) -> set[str]:
 def held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     """Return the error of a set in the choosing rows over the noise floor, by equation."""
     choosing = rows.unseen.choosing
-    return removal.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
+    return held_out.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
 
 
 def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:

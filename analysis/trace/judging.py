@@ -15,12 +15,12 @@ from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
-from analysis.trace.data.unrepeated import unrepeated_floors
 from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
+from analysis.trace.judge.gates import judged_beside_unknown_cause
 from analysis.trace.judge.rivals import best_tied_set
-from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
+from analysis.trace.judge.unrepeated import unrepeated_floors
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.hypothesis import Hypothesis, effect_of, within_band

@@ -17,8 +17,8 @@ from analysis.terms import known
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.nuisance_terms import base_terms
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.temperature_nuisance import base_terms
 from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
     Explanation,

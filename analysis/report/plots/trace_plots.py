@@ -35,7 +35,7 @@ from analysis.report.plots.style import (
 from analysis.report.settings import REPORT
 from analysis.simulation.model import Model
 from analysis.terms.base import family_of
-from analysis.trace.clues.variables import variables
+from analysis.trace.clues.equation_rows import variables
 from analysis.trace.data.conditioned_record import (
     conditioned_records,
     filtered,

@@ -20,10 +20,10 @@ from analysis.trace.clues.equation_rows import (
     EquationRows,
     equation_rows,
     explained_share,
+    factor_of,
     fitted_coefficients,
     whitened_columns,
 )
-from analysis.trace.clues.variables import factor_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Formula
 from analysis.trace.settings import CLUES

@@ -13,8 +13,8 @@ from analysis.regression.rows import Filtering, Line
 from analysis.terms.base import Used
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import conditioned_records, trace_filtering
+from analysis.trace.data.nuisance_terms import path_terms
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.sample_paths import path_terms
 from analysis.trace.data.set_aside import UnseenRows, set_aside
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError

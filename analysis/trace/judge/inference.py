@@ -27,7 +27,7 @@ from analysis.trace.judge.scatter import form_shift, parameter_covariance, with_
 from analysis.trace.search.exact_fit import ExactFit, jacobian, tangent
 from analysis.trace.search.hypothesis import of_one_law
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
-from analysis.trace.search.shapes import ShapeFit
+from analysis.trace.search.refinement import ShapeFit
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 

@@ -16,7 +16,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import at_start, effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge import removal
+from analysis.trace.judge import held_out
 from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
@@ -49,7 +49,7 @@ def rivals_of(
     others = winner.keys - {judged_effect.key}
     training_test = TieTest(
         train_data,
-        removal.removed_energy(winner, alternative),
+        held_out.removed_energy(winner, alternative),
         winner.fit.residual,
         alternative.fit.residual,
     )
@@ -64,7 +64,7 @@ def rivals_of(
             not (justified or alike)
             or (same_law and hypothesis.size <= winner.size)
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
-            or removal.disturbed_equations(hypotheses, hypothesis, alternative)
+            or held_out.disturbed_equations(hypotheses, hypothesis, alternative)
         ):
             continue
         rival_residual = held_out_residual(holdout_data, hypothesis.fit)

@@ -10,7 +10,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.hypothesis import Hypothesis, effect_of, is_special_case, may_grow
-from analysis.trace.search.starts import at_best_point
+from analysis.trace.search.refinement import at_best_point
 
 BENCH: Final = "bench"
 

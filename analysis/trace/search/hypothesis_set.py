@@ -53,8 +53,7 @@ from analysis.trace.search.hypothesis import (
     spoils_equation,
     within_band,
 )
-from analysis.trace.search.refinement import refine
-from analysis.trace.search.starts import at_best_size
+from analysis.trace.search.refinement import at_best_size, refine
 from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 

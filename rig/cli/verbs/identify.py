@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.regression.rows import Filtering
     from analysis.simulation.model import Estimate
     from analysis.terms.base import Used
-    from analysis.trace.search.shapes import ShapeFit
+    from analysis.trace.search.refinement import ShapeFit
     from rig.model.records import Record, Run
 
 
@@ -85,7 +85,7 @@ def _terms(
         return terms_like(like, {run.source: run.rig for run in runs}), None
     if not effects:
         return None, None
-    from analysis.trace.search.shapes import fit_shapes  # loads scipy.optimize, slowly
+    from analysis.trace.search.refinement import fit_shapes  # loads scipy.optimize, slowly
 
     terms = [Used(term) for term in with_effects(runs[0].rig, effects)]
     found = fit_shapes(runs, terms)
@@ -96,7 +96,7 @@ def _shapes_in(result: Identification) -> dict[str, Estimate]:
     """Return the shapes of the model's effects by name, without errors; most models have none."""
     if not any(used.shape for used in result.model.terms):
         return {}
-    from analysis.trace.search.shapes import shapes_in  # loads scipy.optimize, slowly
+    from analysis.trace.search.refinement import shapes_in  # loads scipy.optimize, slowly
 
     return shapes_in(result.model.rig, result.model.terms)
 

@@ -12,12 +12,12 @@ from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.regression_data import regression_data
-from analysis.trace.data.temperature_nuisance import (
+from analysis.trace.data.nuisance_terms import (
     at_nominal_temperature,
     temperature_terms,
     within_plausible_slope,
 )
+from analysis.trace.data.regression_data import regression_data
 from analysis.trace.judge import held_out
 from analysis.trace.search.exact_fit import fit_coefficients
 from rig.model.records import Run

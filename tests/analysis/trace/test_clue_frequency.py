@@ -9,7 +9,7 @@ import pytest
 
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.clues.frequency import FREQUENCY, frequency_clue
+from analysis.trace.clues.dependence import FREQUENCY, frequency_clue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import spectral_lines

@@ -12,7 +12,7 @@ from analysis.signals.conditioning import Signals
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.clues.dependence import dependences
-from analysis.trace.clues.variables import factor_of
+from analysis.trace.clues.equation_rows import factor_of
 from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared_signals
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.result import Dependence

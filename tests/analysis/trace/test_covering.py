@@ -16,7 +16,7 @@ from analysis.trace.next_experiment.excitations import (
     excitation,
     joint_settings,
 )
-from analysis.trace.next_experiment.range_extension import LINES, more_lines, wider_range
+from analysis.trace.next_experiment.proposal import LINES, more_lines, wider_range
 from analysis.trace.result import Dependence
 from tests.analysis.trace.test_next_experiment import sine
 

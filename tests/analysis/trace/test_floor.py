@@ -30,8 +30,8 @@ from analysis.trace.data.noise_floor import (
     stated_noise,
 )
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.data.unrepeated import dominant_frequency, unrepeated_notes
 from analysis.trace.judge import invariance
+from analysis.trace.judge.unrepeated import dominant_frequency, unrepeated_notes
 from analysis.trace.settings import DATA
 from rig.model import channels as ch
 from rig.model.records import Record, Run

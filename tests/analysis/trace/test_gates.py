@@ -13,8 +13,8 @@ import pytest
 
 from analysis.trace import judging
 from analysis.trace.finding import Finding, remainders
-from analysis.trace.judge import removal
-from analysis.trace.judge.unknown_cause import judged_beside_unknown_cause
+from analysis.trace.judge import held_out
+from analysis.trace.judge.gates import judged_beside_unknown_cause
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
@@ -74,10 +74,10 @@ def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect
     for segment in rows.segments:
         if segment.equation == "torque_2":
             bad[segment.where] *= 3.0
-    assert removal.disturbed_in_held_out(rows, good, good, bad) == ["torque_2"]
-    assert removal.disturbed_in_held_out(rows, bad, good, bad) == []
-    assert removal.disturbed_in_held_out(rows, good, bad, bad) == []
-    assert removal.disturbed_in_held_out(rows, good, good, good) == []
+    assert held_out.disturbed_in_held_out(rows, good, good, bad) == ["torque_2"]
+    assert held_out.disturbed_in_held_out(rows, bad, good, bad) == []
+    assert held_out.disturbed_in_held_out(rows, good, bad, bad) == []
+    assert held_out.disturbed_in_held_out(rows, good, good, good) == []
 
 
 @pytest.mark.parametrize(
@@ -101,10 +101,10 @@ def test_an_effect_that_held_out_rows_hardly_show_is_judged_by_its_change_of_the
         apart = noise[where] - sine * (noise[where] @ sine) / (sine @ sine)
         noise[where] = apart * np.sqrt(len(apart) / (apart @ apart))
     changes = {s.equation: 100.0 for s in rows.segments}
-    right = removal.removal_of(rows, changes, noise + cause, noise)
+    right = held_out.removal_of(rows, changes, noise + cause, noise)
     assert right.share == pytest.approx(removed)
     assert right.in_noise is in_noise
-    nothing = removal.removal_of(rows, changes, noise, noise - cause)
+    nothing = held_out.removal_of(rows, changes, noise, noise - cause)
     assert nothing.share == pytest.approx(0.0)
 
 

@@ -13,9 +13,9 @@ from analysis.terms import with_effects
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import with_shape_errors
-from analysis.trace.search import shapes
+from analysis.trace.search import refinement
 from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
-from analysis.trace.search.shapes import ShapeFit, fit_shapes, shapes_in
+from analysis.trace.search.refinement import ShapeFit, fit_shapes, shapes_in
 from analysis.trace.settings import SEARCH
 from rig.model.records import BANDWIDTH, Run
 from rig.model.rig import Rig
@@ -83,7 +83,7 @@ def test_a_search_that_ended_in_a_local_minimum_beside_another_effect_is_begun_a
     """From a dead band of half a volt no search leads on, with the right lag beside it neither."""
     run = experiment(rig, repeats=2, w_ahead=8e-3, w_astern=8e-3, tau_spool=3e-3)
     terms = used(rig, "valve_deadband@joint 2", "spool_lag@joint 2")
-    whole, calls = shapes.refine, []
+    whole, calls = refinement.refine, []
 
     def refined(data: RegressionData, trial: Sequence[Used]) -> ExactFit:
         calls.append(trial)
@@ -91,7 +91,7 @@ def test_a_search_that_ended_in_a_local_minimum_beside_another_effect_is_begun_a
             return whole(data, trial)
         return fit_coefficients(data, (*trial[:-1], Used(trial[-1].term, (0.5, 0.5, 0.0))))
 
-    monkeypatch.setattr(shapes, "refine", refined)
+    monkeypatch.setattr(refinement, "refine", refined)
     found = {n: e.value for n, e in shapes_in(rig, shaped(run, terms).terms).items()}
     assert found["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
     assert found["tau_spool_2"] == pytest.approx(3e-3, rel=0.05)

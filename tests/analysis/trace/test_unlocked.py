@@ -13,7 +13,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import trace
-from analysis.trace.judge.unlocked import unlocked_lines
+from analysis.trace.judge.unrepeated import unlocked_lines
 from analysis.trace.result import EXPLAINED, UNEXPLAINED
 from rig.model.records import Run
 from rig.model.rig import Rig

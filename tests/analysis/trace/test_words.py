@@ -12,9 +12,8 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.finding import Remainder, tolerance_words
 from analysis.trace.in_motion import rest_phase_notes
-from analysis.trace.judge.gates import NO_RIVAL, passes_gates
+from analysis.trace.judge.gates import NO_RIVAL, passes_gates, tied_in_held_out
 from analysis.trace.judge.held_out import completed
-from analysis.trace.judge.unknown_cause import tied_in_held_out
 from analysis.trace.notes import not_judged_notes, undetermined_notes
 from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.exact_fit import ExactFit

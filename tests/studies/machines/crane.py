@@ -28,7 +28,7 @@ from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.shapes import fit_shapes, shapes_in
+from analysis.trace.search.refinement import fit_shapes, shapes_in
 from rig.cli.text.output import table
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.clues.variables import variables
+from analysis.trace.clues.equation_rows import variables
 from analysis.trace.data.candidates import catalogue, complexity, variants
 from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared_signals
 from analysis.trace.data.regression_data import (

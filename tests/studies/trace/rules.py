@@ -21,7 +21,7 @@ from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, fitted_model, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
-from analysis.trace.judge import gates, held_out, inference, removal, rivals
+from analysis.trace.judge import gates, held_out, inference, rivals
 from analysis.trace.search import confounders, hypothesis_set, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
@@ -175,7 +175,7 @@ def _first_repeat(train_data: regression_data.RegressionData) -> Array:
 RULES: Final = (
     Rule("removes on held-out", "held-out errors say nothing for or against an effect",
          (setting("least_removed", -math.inf),
-          (removal, "disturbed_in_held_out", lambda *_: []))),
+          (held_out, "disturbed_in_held_out", lambda *_: []))),
     Rule("no harm elsewhere", "an effect may increase the residual of another equation",
          (setting("harm_ratio", math.inf),)),
     Rule("physics", "any sign, size and shape passes",
@@ -254,8 +254,8 @@ FAULTS: Final = (
     Rule("flips by sample", "noise with a memory counts as many independent samples",
          ((inference, "flip_blocks", _single_rows),)),
     Rule("harm never seen", "no equation is said to get worse",
-         ((removal, "disturbed_equations", lambda *_: []),
-          (removal, "disturbed_in_held_out", lambda *_: []))),
+         ((held_out, "disturbed_equations", lambda *_: []),
+          (held_out, "disturbed_in_held_out", lambda *_: []))),
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
          (setting("held_out_band", 3.0),)),
     Rule("form tolerance x 10", "half of what repeated may stay",
