@@ -35,12 +35,7 @@ from analysis.trace.in_motion import (
     rest_phase_notes,
 )
 from analysis.trace.judge import gates, held_out
-from analysis.trace.judge.curves import (
-    beyond_curve_notes,
-    curves_that_limit,
-    equations_beyond_curves,
-    rows_within_curves,
-)
+from analysis.trace.judge.curves import CurveRange
 from analysis.trace.judge.unrepeated import phase_notes, unlocked_lines, unrepeated_notes
 from analysis.trace.judging import Candidates, unstated_noise
 from analysis.trace.next_experiment.detection_limits import (
@@ -135,7 +130,7 @@ def trace(
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
-    result = _of_rig(rig, _traced(records, options, progress or _no_progress))
+    result = _of_rig(rig, _traced(records, options, progress or (lambda _: None)))
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
     may_be_load &= all(used.term.name != Payload.name for used in known)
@@ -145,7 +140,7 @@ def trace(
         load = undeclared_load(records, beside)
     if load is None:
         return result
-    again = _of_rig(rig, _traced(load.records, options, _no_progress))
+    again = _of_rig(rig, _traced(load.records, options, lambda _: None))
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
         seconds = time.perf_counter() - started
         return replace(again, notes=(*notes, load.words, *again.notes), seconds=seconds)
@@ -275,7 +270,7 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
         held_out.refitted_to_held_out(unseen.judging, fit)
         for fit in (hypotheses.empty.fit, winner.fit)
     )
-    curves = curves_that_limit(unseen.judging, winner.fit)
+    curves = CurveRange(unseen.judging, winner.fit).limits
     error = held_out.errors(
         records.rig, unseen.members, first, last, unseen.divided, curves, train_data.floors,
         records.noise_ratio,
@@ -354,10 +349,6 @@ def _traced_within_tolerances(
     return replace(again, notes=(note, *again.notes))
 
 
-def _no_progress(_: float) -> None:
-    """Ignore progress."""
-
-
 def _final_verdict(
     records: TraceRuns, finding: Finding, winner: Hypothesis
 ) -> tuple[str, list[str]]:
@@ -383,12 +374,11 @@ def judging_rows_above_band(
     judge_data: RegressionData, before: Hypothesis, after: Hypothesis
 ) -> tuple[set[str], list[str]]:
     """Return the equations whose judging rows keep more than the band, and notes on them."""
-    known = rows_within_curves(judge_data, after.fit)
-    beyond = equations_beyond_curves(judge_data, after.fit)
-    above = gates.held_out_above_band(known, before.fit, after.fit)
-    kept = [(e, figure) for e, figure in above if e not in beyond]
+    known = CurveRange(judge_data, after.fit)
+    above = gates.held_out_above_band(known.rows, before.fit, after.fit)
+    kept = [(e, figure) for e, figure in above if e not in known.beyond]
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
-    return {e for e, _ in kept}, [*words, *beyond_curve_notes(judge_data, after.fit)]
+    return {e for e, _ in kept}, [*words, *known.notes]
 
 
 def _remaining_fraction(
@@ -400,7 +390,7 @@ def _remaining_fraction(
     """
     noise = {(f.group, f.equation): f.noise for f in as_recorded.floors}
     taken = sum(
-        (s.where.stop - s.where.start) * max(0.0, (noise[s.group, s.equation] / s.noise) ** 2 - 1)
+        s.count * max(0.0, (noise[s.group, s.equation] / s.noise) ** 2 - 1)
         for s in hypotheses.train_data.segments
     )
     start = hypotheses.empty.total + taken

@@ -14,7 +14,7 @@ from analysis.trace.data.candidates import effect_in, effects_among
 from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.finding import Finding, has_tied_rival, remainders
 from analysis.trace.judge import gates
-from analysis.trace.judge.curves import rows_within_curves
+from analysis.trace.judge.curves import CurveRange
 from analysis.trace.result import CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.confounders import act_at_one_joint
 from analysis.trace.search.hypothesis import (
@@ -50,7 +50,7 @@ def explained_by_free_form(
     named = {kind.name for kind in extended.effects if not kind.free}
     sets = _sets_with_free_form(extended, winner, explained)
     for hypothesis in _simplest_first(extended, sets):
-        compared = rows_within_curves(found.rows.unseen.choosing, hypothesis.fit)
+        compared = CurveRange(found.rows.unseen.choosing, hypothesis.fit).rows
         effects = gates.judge_effects(extended, hypothesis, compared, rng)
         left = remainders(extended, hypothesis, compared)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]

@@ -101,7 +101,7 @@ def _question_separation(
     rows: dict[str, int] = {}
     for s in both.segments:
         if s.group[0] == index:
-            count = (s.where.stop - s.where.start) * s.repeats
+            count = s.count * s.repeats
             rows[s.equation] = rows.get(s.equation, 0) + count
     return max(
         (

@@ -55,6 +55,11 @@ class Segment:
     repeats: int
     locked: tuple[int, ...]
 
+    @property
+    def count(self) -> int:
+        """How many rows it has."""
+        return int(self.where.stop - self.where.start)
+
 
 @dataclass(frozen=True)
 class RegressionData:
@@ -102,8 +107,15 @@ class RegressionData:
         """How many rows each equation has."""
         rows: Counter[str] = Counter()
         for s in self.segments:
-            rows[s.equation] += s.where.stop - s.where.start
+            rows[s.equation] += s.count
         return rows
+
+    def in_equations(self, equations: Collection[str]) -> NDArray[np.bool_]:
+        """Return a mask (M,) of the rows of some equations."""
+        mask = np.zeros(self.base.shape[0], dtype=bool)
+        for s in self.segments:
+            mask[s.where] = s.equation in equations
+        return mask
 
     def source(self, segment: Segment) -> tuple[ConditionedRecord, Rows]:
         """Return the averaged record of a segment, and its rows of the segment's equation [SI]."""
@@ -128,15 +140,8 @@ class RegressionData:
         )  # fmt: skip
 
 
-def averaged_records(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
-    """Return one record per group: the average of the repeats' channels, filtered like them."""
-    groups: dict[Group, list[ConditionedRecord]] = {}
-    for conditioned in members:
-        groups.setdefault(conditioned.group, []).append(conditioned)
-    return [_average(rig, repeats) for repeats in groups.values()]
-
-
 def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecord:
+    """Return the average of the repeats' channels, filtered like them."""
     first = repeats[0]
     if len(repeats) == 1:
         return first
@@ -189,19 +194,20 @@ def regression_data(
     every = [model_rows(rig, terms, conditioned) for conditioned in members]
     beta = least_squares(rig, every) if beta is None else beta
     split = floors(rig, terms, members, every, beta, others, noise_ratio)
-    averages = averaged_records(rig, members)
+    groups: dict[Group, list[int]] = {}
+    for k, conditioned in enumerate(members):
+        groups.setdefault(conditioned.group, []).append(k)
+    averages = [_average(rig, [members[k] for k in repeats]) for repeats in groups.values()]
     mean_rows = [model_rows(rig, terms, conditioned) for conditioned in averages]
     names = tuple(
         dict.fromkeys(n for record in mean_rows for r in record.values() for n in r.names)
     )
     noise = {(f.group, f.equation): f.noise for f in split}
-    most = max(sum(s.group == conditioned.group for s in members) for conditioned in averages)
+    most = max(map(len, groups.values()))
     base, residual, segments, start = [], [], [], 0
     kept_rows: list[dict[str, Rows]] = []
     for conditioned, rows in zip(averages, mean_rows, strict=True):
-        own = [
-            record for s, record in zip(members, every, strict=True) if s.group == conditioned.group
-        ]
+        own = [every[k] for k in groups[conditioned.group]]
         kept_rows.append({})
         for equation, mean in rows.items():
             time = mean.time

@@ -136,11 +136,11 @@ def _without_masked_steps(train_data: RegressionData) -> RegressionData:
     too short, or is the only one with rows of that equation.
     """
     least = TRACE.least_rows
-    short = [s for s in train_data.segments if s.where.stop - s.where.start < least]
+    short = [s for s in train_data.segments if s.count < least]
     elsewhere = {s.equation for s in train_data.segments if s not in short}
     kept = np.ones(train_data.base.shape[0], dtype=bool)
     for s in short:
-        count = s.where.stop - s.where.start
+        count = s.count
         conditioned, rows = train_data.source(s)
         record, masked = conditioned.record, rows.masked
         if masked > count and s.equation in elsewhere:

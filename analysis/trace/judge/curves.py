@@ -47,106 +47,78 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     return tuple(out)
 
 
-def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
-    """Return the data with only the rows within the outermost knots of a model's free curves.
+class CurveRange:
+    """Rows of data within the outermost knots of all free curves of a model.
 
     Beyond them a curve is extrapolated by a straight line, which is no evidence on the mechanism.
-    Equations that would keep too few (`equations_beyond_curves`) keep all.
+    Of equations `beyond` the range fewer than `TRACE.least_rows` lie within it: these cannot judge,
+    and the others would judge an extrapolation.
     """
-    inside = _within_knots(data, model)
-    beyond = _equations_beyond(data, _rows_inside(data, inside))
-    for s in data.segments:
-        inside[s.where] |= s.equation in beyond
-    return data if inside.all() else data.at(inside)
 
+    def __init__(self, data: RegressionData, model: ExactFit) -> None:
+        self.data = data
+        self.curves = tuple(u for u in model.terms if isinstance(u.term, Effect) and u.term.free)
+        self._inside = np.ones(len(data.base), dtype=bool)
+        self._kept: Counter[str] = Counter()
+        for s in data.segments:
+            inside = _within_knots(data.rig, self.curves, *data.source(s))
+            self._inside[s.where] = inside
+            self._kept[s.equation] += int(np.count_nonzero(inside))
+        rows = data.row_counts
+        self.beyond = {e for e, n in rows.items() if self._kept[e] < min(n, TRACE.least_rows)}
 
-def equations_beyond_curves(data: RegressionData, model: ExactFit) -> set[str]:
-    """Return the equations of which too few rows lie within the knots of a model's free curves.
+    @property
+    def rows(self) -> RegressionData:
+        """The rows within the range, of equations `beyond` it all rows."""
+        inside = self._inside | self.data.in_equations(self.beyond)
+        return self.data if inside.all() else self.data.at(inside)
 
-    Fewer than `TRACE.least_rows` cannot judge, and the others would judge an extrapolation.
-    """
-    return _equations_beyond(data, _rows_inside(data, _within_knots(data, model)))
+    @property
+    def limits(self) -> Mapping[str, tuple[Used, ...]]:
+        """By equation the free curves beyond which rows are left out of its error.
 
+        An equation without any row within them has the error of the extrapolated curves.
+        """
+        return {e: self.curves for e in self.data.row_counts if self._kept[e]}
 
-def _equations_beyond(data: RegressionData, kept: Mapping[str, int]) -> set[str]:
-    return {e for e, n in data.row_counts.items() if kept[e] < min(n, TRACE.least_rows)}
-
-
-def curves_that_limit(data: RegressionData, model: ExactFit) -> Mapping[str, tuple[Used, ...]]:
-    """Return by equation the free curves beyond which rows are left out of its error.
-
-    An equation without any row within them has the error of the extrapolated curves.
-    """
-    curves, kept = _free_curves(model), _rows_inside(data, _within_knots(data, model))
-    return {e: curves for e in data.row_counts if kept[e]}
+    @property
+    def notes(self) -> list[str]:
+        """A note for every equation of which judging rows lie beyond the range."""
+        left_out = "they speak neither for nor against it, and are left out of the errors"
+        too_few = "too few remain within it to judge it, so that only the rows that choose do"
+        return [
+            f"{e}: {plain(100 * (rows - self._kept[e]) / rows, 2)} % of the judging rows lie "
+            f"beyond the range of the fitted curve: {too_few if e in self.beyond else left_out}; "
+            "train with motions at least as large"
+            for e, rows in self.data.row_counts.items()
+            if self._kept[e] < rows
+        ]
 
 
 def rows_within(
     rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, rows: Rows
 ) -> Rows:
     """Return a record's rows of an equation that lie between the outermost knots of all curves."""
-    return rows.at(_within_all(rig, curves, conditioned, rows))
+    return rows.at(_within_knots(rig, curves, conditioned, rows))
 
 
-def beyond_curve_notes(data: RegressionData, model: ExactFit) -> list[str]:
-    """Return a note for every equation of which judging rows lie beyond a model's free curves."""
-    kept = _rows_inside(data, _within_knots(data, model))
-    beyond = _equations_beyond(data, kept)
-    left_out = "they speak neither for nor against it, and are left out of the errors"
-    too_few = "too few remain within it to judge it, so that only the rows that choose do"
-    return [
-        f"{e}: {plain(100 * (rows - kept[e]) / rows, 2)} % of the judging rows lie beyond the "
-        f"range of the fitted curve: {too_few if e in beyond else left_out}; train with motions at "
-        "least as large"
-        for e, rows in data.row_counts.items()
-        if kept[e] < rows
-    ]
-
-
-def _free_curves(model: ExactFit) -> tuple[Used, ...]:
-    return tuple(u for u in model.terms if isinstance(u.term, Effect) and u.term.free)
-
-
-def _within_knots(data: RegressionData, model: ExactFit) -> NDArray[np.bool_]:
-    """Return which rows (M,) lie within the outermost knots of all free curves of a model."""
-    inside, curves = np.ones(len(data.base), dtype=bool), _free_curves(model)
-    for s in data.segments:
-        inside[s.where] = _within_all(data.rig, curves, *data.source(s))
-    return inside
-
-
-def _rows_inside(data: RegressionData, inside: NDArray[np.bool_]) -> Counter[str]:
-    """Return how many rows of each equation a mask (M,) keeps."""
-    kept: Counter[str] = Counter()
-    for s in data.segments:
-        kept[s.equation] += int(np.count_nonzero(inside[s.where]))
-    return kept
-
-
-def _within_all(
+def _within_knots(
     rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, rows: Rows
 ) -> NDArray[np.bool_]:
     """Return which rows (m,) lie between the outermost knots of every curve."""
     inside = np.ones(len(rows.time), dtype=bool)
     for used in curves:
-        inside &= _between_knots(rig, used, conditioned, rows)
+        values = effect_in(used).abscissa(rig, conditioned.signals).get(rows.equation)
+        if values is None:
+            continue
+        named = zip(shapes_of(rig, used), used.shape, strict=True)
+        knots = [value for shape, value in named if "_knot_" in shape.parameter]
+        margin = TRACE.knot_margin * (knots[-1] - knots[0])
+        x = values[conditioned.samples_at(rows.time)]
+        # A curve whose knots begin at zero is over the absolute value.
+        x = np.abs(x) if knots[0] == 0.0 else x
+        inside &= (x >= knots[0] - margin) & (x <= knots[-1] + margin)
     return inside
-
-
-def _between_knots(
-    rig: Rig, used: Used, conditioned: ConditionedRecord, rows: Rows
-) -> NDArray[np.bool_]:
-    """Return in which rows (m,) the variable of a curve lies between its outermost knots."""
-    values = effect_in(used).abscissa(rig, conditioned.signals).get(rows.equation)
-    if values is None:
-        return np.ones(len(rows.time), dtype=bool)
-    named = zip(shapes_of(rig, used), used.shape, strict=True)
-    knots = [value for shape, value in named if "_knot_" in shape.parameter]
-    margin = TRACE.knot_margin * (knots[-1] - knots[0])
-    x = values[conditioned.samples_at(rows.time)]
-    # A curve whose knots begin at zero is over the absolute value.
-    x = np.abs(x) if knots[0] == 0.0 else x
-    return np.asarray((x >= knots[0] - margin) & (x <= knots[-1] + margin))
 
 
 def noise_covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:

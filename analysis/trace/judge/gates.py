@@ -85,7 +85,6 @@ def judge_effects(
     `holdout_data` are the choosing rows; `rng` draws the sign flips.
     """
     train_data = hypotheses.train_data
-    values = winner.fit.parameters(train_data.rig)
     null = inference.null_maximum(
         hypotheses.candidates, train_data, _noise_samples(train_data, winner.fit.residual), rng
     )
@@ -105,7 +104,7 @@ def judge_effects(
             *held_out.disturbed_in_held_out(holdout_data, before, without, after),
         }
         p = inference.p_value(alternative.fit.energy - winner.fit.energy, null)
-        errors = inference.effect_errors(train_data, winner.fit, used, values)
+        errors = inference.effect_errors(train_data, winner.fit, used)
         estimates = inference.estimates(train_data, used, errors, shift)
         unknown = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
         differing = invariance(train_data, winner.fit, used, errors, _joint_index(effect))
@@ -271,7 +270,7 @@ def judged_beside_unknown_cause(
     from an effect are tied.
     """
     data = hypotheses.train_data
-    rows = _rows_outside(data, unexplained)
+    rows = ~data.in_equations(unexplained)
     left_outside = _energy(data, winner, rows)
 
     def problem(group: Sequence[Used]) -> str:
@@ -333,14 +332,6 @@ def _equations_of(data: RegressionData, winner: Hypothesis, used: Used) -> set[s
     """Return the equations in whose rows an effect acts."""
     J = jacobian(data, winner.fit, used)[1]
     return {s.equation for s in data.segments if np.any(J[s.where])}
-
-
-def _rows_outside(data: RegressionData, equations: Collection[str]) -> NDArray[np.bool_]:
-    """Return a mask (M,) of the rows of other equations."""
-    out = np.ones(data.base.shape[0], dtype=bool)
-    for s in data.segments:
-        out[s.where] = s.equation not in equations
-    return out
 
 
 def _energy(data: RegressionData, hypothesis: Hypothesis, rows: NDArray[np.bool_]) -> float:

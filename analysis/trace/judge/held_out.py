@@ -131,29 +131,23 @@ def errors(
     (`noise_floor.floors`).
     Sines that are taken out of the rows are part of what the model `before` leaves.
     """
-    bare = [replace(c, filtering=replace(c.filtering, lines=())) for c in members]
-    whole = [model_rows(rig, after.terms, conditioned) for conditioned in members]
-    first, other = (
-        [
-            {e: judging_rows(r) for e, r in rows.items()} if c.group in divided else rows
-            for c, rows in zip(members, built, strict=True)
-        ]
-        for built in ([model_rows(rig, before.terms, c) for c in bare], whole)
-    )
     repeats = Counter(c.group for c in members)
-    compared = [
-        rows if repeats[c.group] > 1 else every
-        for c, rows, every in zip(members, other, whole, strict=True)
-    ]
+    compared: list[dict[str, Rows]] = []
+    first: list[dict[str, Rows]] = []
+    other: list[dict[str, Rows]] = []
+    for c in members:
+        bare = replace(c, filtering=replace(c.filtering, lines=()))
+        whole = model_rows(rig, after.terms, c)
+        sides = [model_rows(rig, before.terms, bare), whole]
+        if c.group in divided:
+            sides = [{e: judging_rows(r) for e, r in rows.items()} for rows in sides]
+        compared.append(sides[1] if repeats[c.group] > 1 else whole)
+        for side, rows_of in zip((first, other), sides, strict=True):
+            side.append(
+                {e: rows_within(rig, (curves or {}).get(e, ()), c, r) for e, r in rows_of.items()}
+            )
     split = floors(rig, after.terms, members, compared, after.beta, others, noise_ratio)
     floor = {(f.group, f.equation): f.noise for f in split}
-    first, other = (
-        [
-            {e: rows_within(rig, (curves or {}).get(e, ()), c, rows) for e, rows in rows_of.items()}
-            for c, rows_of in zip(members, built, strict=True)
-        ]
-        for built in (first, other)
-    )
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
     for conditioned, rows_of in zip(members, other, strict=True):

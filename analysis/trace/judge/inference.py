@@ -113,20 +113,15 @@ class EffectErrors:
     dof: Array
 
 
-def effect_errors(
-    train_data: RegressionData, model: ExactFit, used: Used, values: Mapping[str, float]
-) -> EffectErrors:
-    """Return an effect's parameters with errors from repeats and lack of fit.
-
-    `values` are the values of the model's parameters by name (b itself, not 1/b).
-    """
+def effect_errors(train_data: RegressionData, model: ExactFit, used: Used) -> EffectErrors:
+    """Return an effect's parameters with errors from repeats and lack of fit."""
     names, J = jacobian(train_data, model, used)
     base = basis_of_others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
     scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
     scale[scale == 0] = 1.0
     error = parameter_covariance(train_data, J_p / scale, model.residual)
-    known = {**shape_values(train_data.rig, used), **values}
+    known = {**shape_values(train_data.rig, used), **model.parameters(train_data.rig)}
     value = np.array([known.get(n, np.nan) for n in names])
     return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
 
@@ -209,15 +204,13 @@ def with_shape_errors(found: ShapeFit, model: Model) -> tuple[Model, dict[str, E
     uncertainty of the shapes, and errors of the effects' forms (`scatter.with_form_errors`).
     """
     data, fit = found.data, found.fit
-    values = fit.parameters(data.rig)
     shift = form_shift(data, fit)
     shapes: dict[str, Estimate] = {}
     for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        errors = effect_errors(data, fit, used, values)
         own = {s.parameter for s in shapes_of(data.rig, used)}
-        every = estimates(data, used, errors, shift)
+        every = estimates(data, used, effect_errors(data, fit, used), shift)
         shapes |= {name: e for name, e in every.items() if name in own}
     return with_form_errors(data, fit, model, shift), shapes
 

@@ -165,9 +165,7 @@ def _is_distinct(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) 
 def _numbers(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> dict[str, Estimate]:
     """Return an effect's numbers with 95 % intervals, errors of the forms included."""
     data, fit = hypotheses.train_data, hypothesis.fit
-    values = fit.parameters(data.rig)
-    errors = effect_errors(data, fit, used, values)
-    return estimates(data, used, errors, form_shift(data, fit))
+    return estimates(data, used, effect_errors(data, fit, used), form_shift(data, fit))
 
 
 def _form_error_energy(

@@ -324,9 +324,7 @@ class TieTest:
     def __init__(
         self, data: RegressionData, equations: Collection[str], left: Array, without: Array
     ) -> None:
-        self.rows = np.zeros(len(left), dtype=bool)
-        for s in data.segments:
-            self.rows[s.where] = s.equation in equations
+        self.rows = data.in_equations(equations)
         self.left = left[self.rows]
         self.energy = float(self.left @ self.left)
         self.taken = float(without[self.rows] @ without[self.rows]) - self.energy

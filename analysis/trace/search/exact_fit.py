@@ -158,24 +158,15 @@ def _cavitating(
     return tuple(out)
 
 
-@dataclass(frozen=True)
-class _FamilyFit:
-    """Coefficients `values` (k,), residual (m,) and information (k, k) of one family's rows."""
-
-    names: tuple[str, ...]
-    values: Array
-    residual: Array
-    information: Array
-
-
-def _family_fit(data: RegressionData, family: str, terms: Sequence[Used]) -> _FamilyFit:
+def _family_fit(data: RegressionData, family: str, terms: tuple[Used, ...]) -> ExactFit:
+    """Return the fit of one family's rows."""
     rows = _family_design(data, family, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(rows.matrix / scale)
     values = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
-    residual = rows.residual(dict(zip(rows.names, values, strict=True)))
-    return _FamilyFit(rows.names, values, residual, (R * scale).T @ (R * scale))
+    beta = dict(zip(rows.names, values, strict=True))
+    return ExactFit(terms, beta, rows.residual(beta), (R * scale).T @ (R * scale))
 
 
 def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
@@ -185,17 +176,18 @@ def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     one in which no shape acts is not fitted again.
     """
     names = _coefficient_names(data.rig, terms)
-    values, information = np.zeros(len(names)), np.zeros((len(names), len(names)))
+    beta, information = dict.fromkeys(names, 0.0), np.zeros((len(names), len(names)))
     residual = np.zeros(data.base.shape[0])
     for family, rows in data.family_rows.items():
         acting = acting_on(data.rig, terms, family, data.cache)
-        own: _FamilyFit = data.cache.fits.get(
+        own: ExactFit = data.cache.fits.get(
             (family, data.terms, acting, data.relative), partial(_family_fit, data, family, acting)
         )
-        at = [names.index(n) for n in own.names]
-        values[at], residual[rows] = own.values, own.residual
+        at = [names.index(n) for n in own.beta]
+        beta |= own.beta
+        residual[rows] = own.residual
         information[np.ix_(at, at)] = own.information
-    return ExactFit(tuple(terms), dict(zip(names, values, strict=True)), residual, information)
+    return ExactFit(tuple(terms), beta, residual, information)
 
 
 def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[str, ...], Array]:

@@ -235,7 +235,7 @@ class HypothesisSet:
             return now
         pairs = [
             self.refined([candidates.entries[m].used for m in pair.members])
-            for pair in linear_fit.best_pairs(candidates, r, SEARCH.refined_pairs)
+            for pair in linear_fit.best_pairs(candidates, r)
         ]
         if self.within_form_tolerance(now):
             others = [o for o in pairs if not now.keys & o.keys]
@@ -341,9 +341,8 @@ class HypothesisSet:
             and self.may_act(effect, now, equations)
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
-        mask = np.ones(len(now.fit.residual))
-        for s in data.segments:
-            mask[s.where] = not equations or s.equation in equations
+        asked = equations or data.row_counts
+        mask = data.in_equations(asked).astype(np.float64)
         # The set's shapes are fitted again with another effect: energy that they can remove
         # themselves is no gain of that effect.
         moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]

@@ -152,13 +152,6 @@ def fit_members(candidates: CandidateColumns, members: Sequence[int], r: Array) 
     return LinearFit(tuple(members), tuple(parts), excess_energy)
 
 
-def energy_touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
-    """Return the energy above noise that a set leaves in the equations where an entry acts."""
-    return sum(
-        max(0.0, chosen.excess_energy.get(e, 0.0)) for e in candidates.entries[member].touched
-    )
-
-
 def sets_with_one_more(
     candidates: CandidateColumns, members: Sequence[int], r: Array
 ) -> list[LinearFit]:
@@ -175,20 +168,25 @@ def sets_with_one_more(
     taken = {candidates.entries[m].used.term.key for m in members}
     trials: list[LinearFit] = []
     for i in _best_of_each(candidates, g):
-        if g[i] <= 0 or candidates.entries[i].used.term.key in taken:
+        entry = candidates.entries[i]
+        if g[i] <= 0 or entry.used.term.key in taken:
             continue
-        if g[i] < SEARCH.add_share * energy_touched(candidates, i, now):
+        left = sum(max(0.0, now.excess_energy.get(e, 0.0)) for e in entry.touched)
+        if g[i] < SEARCH.add_share * left:
             continue
         trial = fit_members(candidates, (*members, i), r)
-        if admissible(candidates, trial):
+        sizes = zip(trial.members, trial.coefficients, strict=True)
+        if all(candidates.admissible(candidates.entries[m], k) for m, k in sizes):
             trials.append(trial)
     if not trials:
         return []
     best = min(t.total for t in trials)
     limit = max(SEARCH.simpler_ratio * best, best + 0.1 * sum(candidates.band.values()))
-    near = sorted(
-        (t for t in trials if t.total <= limit), key=lambda t: (_size(candidates, t), t.total)
-    )
+
+    def size(trial: LinearFit) -> int:
+        return sum(candidates.size[m] for m in trial.members)
+
+    near = sorted((t for t in trials if t.total <= limit), key=lambda t: (size(t), t.total))
     return near + sorted((t for t in trials if t.total > limit), key=lambda t: t.total)
 
 
@@ -209,20 +207,8 @@ def _best_of_each(candidates: CandidateColumns, g: Array) -> list[int]:
     return best
 
 
-def _size(candidates: CandidateColumns, choice: LinearFit) -> int:
-    return sum(candidates.size[m] for m in choice.members)
-
-
-def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
-    """Return whether physics allows every effect of a set at its fitted size."""
-    return all(
-        candidates.admissible(candidates.entries[m], k)
-        for m, k in zip(choice.members, choice.coefficients, strict=True)
-    )
-
-
-def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[LinearFit]:
-    """Return the `count` pairs of different candidates that leave least."""
+def best_pairs(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
+    """Return the pairs of different candidates that leave least."""
     # None of a pair need remove enough alone.
     g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least)
     starts: dict[Key, int] = {}
@@ -235,4 +221,4 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
             keys = frozenset(candidates.entries[m].used.term.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
-    return sorted(pairs.values(), key=lambda p: p.total)[:count]
+    return sorted(pairs.values(), key=lambda p: p.total)[: SEARCH.refined_pairs]

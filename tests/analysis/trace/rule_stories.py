@@ -351,7 +351,7 @@ def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
         left = mean - base @ (base.T @ mean) - own * values[-1]
         drawn = with_residual(data, noise)
         model = replace(fit, residual=left)
-        errors = inference.effect_errors(drawn, model, used, {name: values[-1]})
+        errors = inference.effect_errors(drawn, model, used)
         low, high = inference.estimates(drawn, used, errors, {})[name].ci95
         halves.append(0.5 * (high - low))
     assert 1.4 < np.mean(halves) / np.std(values) < 3.2

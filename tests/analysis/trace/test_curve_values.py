@@ -17,7 +17,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
 from analysis.trace.engine import judging_rows_above_band
 from analysis.trace.fitted_model import with_effect_values
-from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
+from analysis.trace.judge.curves import CurveRange
 from analysis.trace.judge.gates import held_out_above_band
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
@@ -72,10 +72,10 @@ def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
 ) -> None:
     """The knots span `reach` of the piston's travel; too few rows within them cannot judge."""
     data, _, fit = sprung(rig, reach)
-    notes = beyond_curve_notes(data, fit)
+    notes = CurveRange(data, fit).notes
     assert [note.partition(":")[0] for note in notes] == ["torque_2"]
     assert says in notes[0]
-    known = rows_within_curves(data, fit).row_counts
+    known = CurveRange(data, fit).rows.row_counts
     assert (known["torque_2"] < data.row_counts["torque_2"]) is (reach > 0.1)
     assert known["flow_cap_2"] == data.row_counts["flow_cap_2"]
 
