@@ -15,7 +15,7 @@ from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.finding import Finding, has_tied_rival, remainders
 from analysis.trace.judge import gates
 from analysis.trace.judge.curves import CurveRange
-from analysis.trace.result import CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
+from analysis.trace.result import CONFOUNDED, EXPLAINED, UNEXPLAINED
 from analysis.trace.search.confounders import act_at_one_joint
 from analysis.trace.search.hypothesis import (
     Hypothesis,
@@ -56,7 +56,8 @@ def explained_by_free_form(
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
         log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in left], failed)
         passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in left)
-        if passed and not _ties_with_name(effects, named):
+        ties = any(r.tied and r.name in named for f in effects if f.free for r in f.rivals)
+        if passed and not ties:
             verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
             return Finding(found.rows, extended, hypothesis, verdict, effects, left)
     return None
@@ -67,11 +68,6 @@ def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
     to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
     several = len(winner.laws) > 1
     return not to_noise and (several or not hypotheses.within_form_tolerance(winner))
-
-
-def _ties_with_name(effects: Sequence[JudgedEffect], named: set[str]) -> bool:
-    """Return whether one of the `named` effects fits as well as a free form."""
-    return any(r.tied and r.name in named for f in effects if f.free for r in f.rivals)
 
 
 def _sets_with_free_form(

@@ -154,7 +154,9 @@ def _is_better(found: Finding, finding: Finding, joints: Collection[int]) -> boo
     if explains and finding.verdict == UNEXPLAINED:
         return True
     fewer = sum(r.veto for r in found.remainders) < sum(r.veto for r in finding.remainders)
-    return (explains or fewer) and _meets_noise(found, joints)
+    ratios = held_out_ratios(found.rows, found.winner)
+    meets_noise = all(ratios[equation("torque", joint)] <= TRACE.noted_ratio for joint in joints)
+    return (explains or fewer) and meets_noise
 
 
 def _hides_breakaway(found: Finding, finding: Finding, joint: int) -> bool:
@@ -222,12 +224,6 @@ def _friction_in(winner: Hypothesis) -> list[Effect]:
 def _friction_of(winner: Hypothesis, joint: int) -> list[Effect]:
     """Return the friction effects of a set at a joint (0-based)."""
     return [e for e in _friction_in(winner) if e.joint == joint]
-
-
-def _meets_noise(found: Finding, joints: Collection[int]) -> bool:
-    """Return whether a finding leaves little over the noise in the torque balances of `joints`."""
-    ratios = held_out_ratios(found.rows, found.winner)
-    return all(ratios[equation("torque", joint)] <= TRACE.noted_ratio for joint in joints)
 
 
 def equations_above_noise(rows: TraceRows, winner: Hypothesis) -> set[str]:

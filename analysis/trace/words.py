@@ -70,7 +70,7 @@ def sentence(result: Trace) -> str:
             f"{prefix}The training records are met to within the noise, the held-out ones are not. "
             f"{_largest_errors(result)}"
         )
-    clue = ", ".join(d.text for d in result.depends_on[:2])
+    clue, best = ", ".join(d.text for d in result.depends_on[:2]), surest_formula(result.formulas)
     share = f"{plain(100 * result.unexplained_fraction, 2)} % of the repeatable residual energy"
     remains = f"{share} remains unexplained"
     if result.unexplained_fraction <= TRACE.held_out_share:
@@ -79,7 +79,7 @@ def sentence(result: Trace) -> str:
         f"{prefix}{remains}"
         + (f"; it depends on {clue}" if clue else "")
         + _symmetry(result)
-        + _formula(result)
+        + (f"; a sparse fit is {best.text}" if best else "")
         + (f". {errors}" if named else f". {_largest_errors(result)}")
     )
 
@@ -92,12 +92,6 @@ def _largest_errors(result: Trace) -> str:
     return f"Held-out errors over the noise floor: {errors}."
 
 
-def _formula(result: Trace) -> str:
-    """Return the sure formula that leaves least, in words ('' where none is sure)."""
-    best = surest_formula(result.formulas)
-    return f"; a sparse fit is {best.text}" if best else ""
-
-
 def _symmetry(result: Trace) -> str:
     """Say what spectral lines show of the largest remaining residual ('' if none exceeds noise)."""
     largest = max(result.lines, key=lambda lines: lines.above_noise_after, default=None)
@@ -107,15 +101,11 @@ def _symmetry(result: Trace) -> str:
 
 
 def _variables_in_words(effects: tuple[JudgedEffect, ...]) -> str:
-    named = [e.variable for e in effects if e.variable and not _constant(e.variable)]
+    named = [e.variable for e in effects if e.variable and not e.variable.startswith("nothing")]
     variables = list(dict.fromkeys(named))
     if len(named) < len(effects) and variables:
         variables.append("a constant")
     return "The residual follows " + " and ".join(variables) if variables else "Explained"
-
-
-def _constant(variable: str) -> bool:
-    return variable.startswith("nothing")
 
 
 def _effect(effect: JudgedEffect, rig: Rig) -> str:

@@ -15,13 +15,13 @@ sine and a cosine of it, with a phase for each record, must remove most of the e
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.trace.clues.equation_rows import (
-    EquationPart,
     EquationRows,
     equation_rows,
     explained_share,
@@ -195,7 +195,10 @@ def _curve_shares(
     ]
     curves: dict[str, list[Array]] = {"": [np.ones((len(p.signals.t), 1)) for p in every]}
     for name in values[0]:
-        moving = [v[name] for v, p in zip(values, every, strict=True) if _moves(p, joint)]
+        moving = [
+            v[name] for v, p in zip(values, every, strict=True)
+            if joint + 1 not in p.conditioned.record.locked
+        ]  # fmt: skip
         knots = _knots(np.concatenate(moving)) if moving else None
         if knots is not None:
             curves[name] = [hat_functions(v[name], knots) for v in values]
@@ -215,10 +218,6 @@ def _curve_shares(
                 explained_share(two, second, one, first),
             )
     return out
-
-
-def _moves(part: EquationPart, joint: int) -> bool:
-    return joint + 1 not in part.conditioned.record.locked
 
 
 def _knots(values: Array) -> Array | None:
@@ -243,24 +242,17 @@ def frequency_clue(
     `residual` (M,) and `holdout_residual` are the whitened residuals of the averaged training and
     held-out records.
     """
-    for equation_lines in sorted(
-        lines, key=lambda equation_lines: -equation_lines.above_noise_after
-    ):
-        near = _peak_frequency(equation_lines) if equation_lines.above_noise_after >= 1.0 else None
+    for own in sorted(lines, key=lambda own: -own.above_noise_after):
+        near = _peak_frequency(own) if own.above_noise_after >= 1.0 else None
         if near is None:
             continue
-        width = equation_lines.frequency[1]
-        tried = np.linspace(near - width, near + width, CLUES.frequency_steps)
-        f = max(
-            tried, key=lambda f: _energy_of_sine(train, residual, equation_lines.equation, float(f))
-        )
-        energy = energy_above_noise(holdout_data, holdout_residual)[equation_lines.equation]
-        share = _energy_of_sine(
-            holdout_data, holdout_residual, equation_lines.equation, float(f)
-        ) / max(energy, 1e-300)
+        e, width = own.equation, own.frequency[1]
+        tried = np.linspace(near - width, near + width, CLUES.frequency_steps).tolist()
+        f = max(tried, key=functools.partial(_energy_of_sine, train, residual, e))
+        energy = energy_above_noise(holdout_data, holdout_residual)[e]
+        share = _energy_of_sine(holdout_data, holdout_residual, e, f) / max(energy, 1e-300)
         if energy > 0 and share >= CLUES.frequency_share:
-            words = f"a frequency of {f:.3g} Hz"
-            return Dependence(FREQUENCY, min(1.0, share), equation_lines.equation, words=words)
+            return Dependence(FREQUENCY, min(1.0, share), e, words=f"a frequency of {f:.3g} Hz")
     return None
 
 
@@ -282,11 +274,9 @@ def _peak_frequency(lines: SpectralLines) -> float | None:
 def _energy_of_sine(data: RegressionData, residual: Array, equation: str, f: float) -> float:
     """Return the energy above noise that a sine and a cosine of f [Hz] remove in all records."""
     total = 0.0
-    for conditioned, rows in zip(data.records, data.rows, strict=True):
-        for s in data.segments:
-            if s.group == conditioned.group and s.equation == equation:
-                angle = 2 * np.pi * f * rows[equation].time
-                waves = np.column_stack((np.sin(angle), np.cos(angle)))
-                Q, _ = np.linalg.qr(waves)
-                total += float(np.sum((Q.T @ residual[s.where]) ** 2)) - 2.0
+    for s in data.segments:
+        if s.equation == equation:
+            angle = 2 * np.pi * f * data.source(s)[1].time
+            Q, _ = np.linalg.qr(np.column_stack((np.sin(angle), np.cos(angle))))
+            total += float(np.sum((Q.T @ residual[s.where]) ** 2)) - 2.0
     return total

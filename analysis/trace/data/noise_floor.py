@@ -19,7 +19,7 @@ same in every repeat counts as noise too, up to its size by the rig file.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -33,8 +33,7 @@ from analysis.regression.noise import (
     with_added_noise,
     with_added_rounding,
 )
-from analysis.regression.rows import Filtering, Rows, in_common
-from analysis.signals.filters import Smoother
+from analysis.regression.rows import Rows, in_common
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.settings import DATA
@@ -74,6 +73,11 @@ class Floor:
         """The repeatable part over the noise."""
         return self.repeatable / self.noise if self.noise > 0 else float("inf")
 
+    def unrepeated(self, noise: float, source: str) -> Floor:
+        """Return the floor with a noise without repeats: all above it counts as repeatable."""
+        repeatable = float(np.sqrt(max(0.0, self.total**2 - noise**2)))
+        return replace(self, noise=noise, repeatable=repeatable, count=1, source=source)
+
 
 def noise_and_repeatable(repeats: Array) -> tuple[float, float]:
     """Return noise and repeatable rms of residuals (n, m) of n repeats."""
@@ -101,49 +105,50 @@ def floors(
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
         groups.setdefault(conditioned.group, []).append(index)
-    out, coarse = [], _has_coarse_converters(rig)
-    for group, indices in groups.items():
-        stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
-        rounding = (
-            stated_noise(
-                rig,
-                terms,
-                members[indices[0]],
-                rows[indices[0]],
-                beta,
-                partial(with_added_rounding, smoother=_smoother(members[indices[0]].filtering)),
-                DATA.rounding_draws,
-            )
-            if coarse
-            else {}
-        )
-        for equation in rows[indices[0]]:
-            parts = [rows[i][equation] for i in indices if equation in rows[i]]
-            residual = [row_residual(r, beta) for r in parts]
-            every = np.concatenate(residual)
-            total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
-            sensors = stated[equation]
-            table, source = stacked_repeats(members[indices[0]], parts, residual)
-            if table is not None:
-                noise, repeatable = noise_and_repeatable(table)
-                rounded = min(repeatable, rounding.get(equation, 0.0))
-                noise = max(float(np.hypot(noise, rounded)), DATA.least_noise * sensors)
-                repeatable = float(np.sqrt(repeatable**2 - rounded**2))
-                out.append(
-                    Floor(group, equation, noise, repeatable, total, len(table), source, sensors)
-                )
-                continue
-            noise, source = sensors, STATED
-            if len(parts) == 1:
-                near = noise_by_neighbours(members[indices[0]], parts[0], residual[0])
-                if near is not None:
-                    noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
-            out.append(_unrepeated(group, equation, noise, total, source, sensors))
+    sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+    # Whether the rounding error of a sensor's converter is much the same in all repeats.
+    coarse = any(repeated_rounding(s) >= DATA.least_rounding * sensor_variance(s) for s in sensors)
+    out = []
+    for indices in groups.values():
+        first, own = members[indices[0]], [rows[i] for i in indices]
+        stated, rounding = stated_noise(rig, terms, first, own[0], beta), dict[str, float]()
+        if coarse:  # of the filter of the rows, or of the channels where rows have none
+            smoother = first.filtering.rows or first.filtering.channels
+            rounded = partial(with_added_rounding, smoother=smoother)
+            rounding = stated_noise(rig, terms, first, own[0], beta, rounded, DATA.rounding_draws)
+        for equation, by_sensors in stated.items():
+            parts = [r[equation] for r in own if equation in r]
+            out.append(_floor(first, parts, beta, by_sensors, rounding.get(equation, 0.0)))
     by_repeats = _measured_over_stated([*out, *others], (REPEATS,))
     scale = _measured_over_stated([*out, *others], (NEIGHBOURS,))
     scale |= _measured_over_stated([*out, *others], (REPEATS, PERIODS))
     scaled = (_scaled(_without_aperiodic(f, by_repeats), scale, OTHER_STEPS) for f in out)
     return [_scaled(floor, noise_ratio or {}, UNSTATED) for floor in scaled]
+
+
+def _floor(
+    conditioned: ConditionedRecord, parts: Sequence[Rows], beta: Mapping[str, float],
+    stated: float, rounding: float,
+) -> Floor:  # fmt: skip
+    """Return the split of one equation's residual in the repeats of a step, of rows `parts`.
+
+    `stated` and `rounding` are the rms that the rig's sensor noise and their converters make.
+    """
+    residual = [row_residual(rows, beta) for rows in parts]
+    every = np.concatenate(residual)
+    total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
+    floor = Floor(conditioned.group, parts[0].equation, stated, 0.0, total, 1, STATED, stated)
+    table, source = stacked_repeats(conditioned, parts, residual)
+    if table is not None:
+        noise, repeatable = noise_and_repeatable(table)
+        rounded = min(repeatable, rounding)
+        noise = max(float(np.hypot(noise, rounded)), DATA.least_noise * stated)
+        repeatable = float(np.sqrt(repeatable**2 - rounded**2))
+        return replace(floor, noise=noise, repeatable=repeatable, count=len(table), source=source)
+    near = noise_by_neighbours(conditioned, parts[0], residual[0]) if len(parts) == 1 else None
+    if near is None:
+        return floor.unrepeated(stated, STATED)
+    return floor.unrepeated(max(near, DATA.least_noise * stated), NEIGHBOURS)
 
 
 def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
@@ -155,7 +160,7 @@ def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
     noisy = floor.noise > DATA.unrepeated_ratio * floor.stated
     if floor.source != PERIODS or not noisy or floor.equation not in by_repeats:
         return floor
-    return _unrepeated(floor.group, floor.equation, floor.stated, floor.total, STATED, floor.stated)
+    return floor.unrepeated(floor.stated, STATED)
 
 
 def _measured_over_stated(split: Sequence[Floor], sources: Collection[str]) -> dict[str, float]:
@@ -181,16 +186,7 @@ def _scaled(floor: Floor, scale: Mapping[str, float], source: str) -> Floor:
     """Return a floor by stated noise times the ratio of its equation, others unchanged."""
     if floor.source != STATED or floor.equation not in scale:
         return floor
-    noise = floor.stated * scale[floor.equation]
-    return _unrepeated(floor.group, floor.equation, noise, floor.total, source, floor.stated)
-
-
-def _unrepeated(
-    group: Group, equation: str, noise: float, total: float, source: str, stated: float
-) -> Floor:
-    """Return the floor of a group without repeats: all above its noise counts as repeatable."""
-    repeatable = float(np.sqrt(max(0.0, total**2 - noise**2)))
-    return Floor(group, equation, noise, repeatable, total, 1, source, stated)
+    return floor.unrepeated(floor.stated * scale[floor.equation], source)
 
 
 def noise_by_neighbours(
@@ -295,14 +291,3 @@ def stated_noise(
             if len(change):
                 squares[name].append(float(np.mean(change**2)))
     return {n: float(np.sqrt(np.mean(drawn))) if drawn else NO_ROWS for n, drawn in squares.items()}
-
-
-def _smoother(filtering: Filtering) -> Smoother:
-    """Return the filter of the rows, or of the channels where rows have none."""
-    return filtering.channels if filtering.rows is None else filtering.rows
-
-
-def _has_coarse_converters(rig: Rig) -> bool:
-    """Return whether the rounding error of a sensor's converter is much the same in all repeats."""
-    sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
-    return any(repeated_rounding(s) >= DATA.least_rounding * sensor_variance(s) for s in sensors)

@@ -84,18 +84,13 @@ def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Ru
     """Return the runs with NaN at the samples that are set aside in `divided` groups."""
     out = []
     for number, run in enumerate(runs):
-        records = [
-            _without_judging_samples(record) if (number, record.step) in divided else record
-            for record in run.records
-        ]
+        records = []
+        for record in run.records:
+            aside = in_judging_block(np.asarray(record.time)) & ((number, record.step) in divided)
+            channels = {name: np.where(aside, np.nan, x) for name, x in record.channels.items()}
+            records.append(replace(record, channels=channels) if aside.any() else record)
         out.append(replace(run, records=tuple(records)))
     return tuple(out)
-
-
-def _without_judging_samples(record: Record) -> Record:
-    aside = in_judging_block(np.asarray(record.time))
-    channels = {name: np.where(aside, np.nan, x) for name, x in record.channels.items()}
-    return replace(record, channels=channels)
 
 
 def _division_note(divided: Collection[Group], short: Sequence[str]) -> str:

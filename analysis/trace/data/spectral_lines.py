@@ -116,19 +116,16 @@ def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, .
     """
     ratios = {(f.group, f.equation): f.ratio for f in data.floors}
     out = []
-    for conditioned, rows in zip(data.records, data.rows, strict=True):
+    for s in data.segments:
+        conditioned, rows = data.source(s)
         record = conditioned.record
-        if not record.period or not record.lines or not all(k % 2 for k in record.lines):
-            continue
-        for s in data.segments:
-            if s.group == conditioned.group:
-                residual = data.residual[: s.repeats, s.where] * s.noise
-                rest = after[s.where] * s.noise / np.sqrt(s.repeats)
-                both = np.vstack((residual, rest))
-                ratio = ratios[s.group, s.equation]
-                of_segment = _segment_lines(s, conditioned, rows[s.equation], both, ratio)
-                if of_segment is not None:
-                    out.append(of_segment)
+        if record.period and record.lines and all(k % 2 for k in record.lines):
+            residual = data.residual[: s.repeats, s.where] * s.noise
+            rest = after[s.where] * s.noise / np.sqrt(s.repeats)
+            both, ratio = np.vstack((residual, rest)), ratios[s.group, s.equation]
+            of_segment = _segment_lines(s, conditioned, rows, both, ratio)
+            if of_segment is not None:
+                out.append(of_segment)
     return tuple(sorted(out, key=lambda equation_lines: -equation_lines.above_noise))
 
 

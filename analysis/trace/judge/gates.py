@@ -107,7 +107,7 @@ def judge_effects(
         errors = inference.effect_errors(train_data, winner.fit, used)
         estimates = inference.estimates(train_data, used, errors, shift)
         unknown = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
-        differing = invariance(train_data, winner.fit, used, errors, _joint_index(effect))
+        differing = invariance(train_data, winner.fit, used, errors)
         unphysical = hypotheses.physical_problem(winner, used)
         tied = [r for r in others if r.tied]
         inseparable = [
@@ -243,11 +243,6 @@ def _noise_samples(train_data: RegressionData, residual: Array) -> Array:
     return out
 
 
-def _joint_index(effect: Effect) -> int | None:
-    words = effect.where.split()
-    return int(words[1]) - 1 if words[0] == "joint" else None
-
-
 def _differences_in_words(differing: Sequence[Difference]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
@@ -276,7 +271,8 @@ def judged_beside_unknown_cause(
     def problem(group: Sequence[Used]) -> str:
         """Return in words why effects that act together are not named ('' if they are)."""
         without = hypotheses.refined([u for u in winner.effects if u not in group])
-        own = set().union(*(_equations_of(data, winner, u) for u in group))
+        columns = [jacobian(data, winner.fit, used)[1] for used in group]
+        own = {s.equation for s in data.segments if any(np.any(J[s.where]) for J in columns)}
         removed = {e: without.excess_energy[e] - winner.excess_energy[e] for e in own}
         share = sum(removed.values()) / max(1e-30, sum(without.excess_energy[e] for e in own))
         if share < TRACE.least_removed_beside:
@@ -301,7 +297,11 @@ def judged_beside_unknown_cause(
     def refused(effect: JudgedEffect) -> JudgedEffect:
         own = used[effect.name, effect.at]
         why = together or problem([own]) or _size_includes_zero(data.rig, own, effect)
-        return _refused(tied_in_held_out(effect), why)
+        out = tied_in_held_out(effect)
+        if not why:
+            return out
+        gates = (Gate(REMOVES, False, why) if g.name == REMOVES else g for g in out.gates)
+        return replace(out, gates=tuple(gates))
 
     return tuple(map(refused, effects))
 
@@ -318,20 +318,6 @@ def _size_includes_zero(rig: Rig, used: Used, effect: JudgedEffect) -> str:
         return ""
     names = ", ".join(name for name in sizes if name in effect.parameters)
     return f"{names} may be nothing within the interval beside a cause that is not known"
-
-
-def _refused(effect: JudgedEffect, problem: str) -> JudgedEffect:
-    """Return an effect that fails the gate of what it removes, unchanged without a problem."""
-    if not problem:
-        return effect
-    gates = (Gate(REMOVES, False, problem) if g.name == REMOVES else g for g in effect.gates)
-    return replace(effect, gates=tuple(gates))
-
-
-def _equations_of(data: RegressionData, winner: Hypothesis, used: Used) -> set[str]:
-    """Return the equations in whose rows an effect acts."""
-    J = jacobian(data, winner.fit, used)[1]
-    return {s.equation for s in data.segments if np.any(J[s.where])}
 
 
 def _energy(data: RegressionData, hypothesis: Hypothesis, rows: NDArray[np.bool_]) -> float:

@@ -69,11 +69,8 @@ def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> Exact
 
 
 def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
-    return _with_better_known(rig, rows, _at_temperature(rows, model))
-
-
-def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
-    """Return the model with directions of coefficients fitted to rows with more information."""
+    """Return `refitted_to_held_out` by the design of the held-out rows."""
+    model = _at_temperature(rows, model)
     of_effects = {
         c.parameter for effect in effects_among(model.terms) for c in effect.coefficients(rig)
     }  # fmt: skip

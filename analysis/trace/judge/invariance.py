@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, basis_of_others, flip_blocks
 from analysis.trace.search.exact_fit import ExactFit, contribution, design_matrix, jacobian
@@ -76,12 +77,6 @@ def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
     return numbers
 
 
-def _blockwise_deviation(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
-    """Return the root of the sum over blocks of (own . residual)^2."""
-    _, index = np.unique(clusters, return_inverse=True)
-    return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
-
-
 def _shift(
     own: Array, residual: Array, base: Array, blocks: NDArray[np.int64] | None
 ) -> tuple[float, float]:
@@ -95,7 +90,9 @@ def _shift(
     error = 1.0 / np.sqrt(size)
     if blocks is not None:
         noise = residual - base @ (base.T @ residual) - own * shift
-        error = max(error, _blockwise_deviation(own, noise, blocks) / size)
+        _, index = np.unique(blocks, return_inverse=True)
+        by_block = np.bincount(index, weights=own * noise)
+        error = max(error, float(np.linalg.norm(by_block)) / size)
     return shift, float(error)
 
 
@@ -130,12 +127,13 @@ def _column_off_others(columns: Array, k: int) -> Array:
 
 
 def invariance(
-    train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors, joint: int | None
+    train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors
 ) -> list[Difference]:
     """Return the parts of the rows in which a size of an effect differs from that of all rows."""
+    joint = effect_in(used).joint if used.term.where.startswith("joint") else None
     names, J = jacobian(train_data, model, used)
     base = basis_of_others(train_data, model, names)
-    if isinstance(used.term, Effect) and used.term.free:
+    if effect_in(used).free:
         return _whole_effect_differences(train_data, model, used, base, joint)
     residual = model.residual
     # Shapes without a neutral value, such as a presliding distance, are no sizes.

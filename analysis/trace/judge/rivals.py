@@ -58,7 +58,9 @@ def rivals_of(
     for hypothesis, fresh in hypotheses.replacements(winner, used):
         other = effect_in(fresh)
         same_law = of_one_law(judged_effect, other)
-        justified = _numbers_justified(winner, hypothesis)
+        # Each further free number must remove its price.
+        more = hypothesis.size[1] - winner.size[1]
+        justified = more <= 0 or hypothesis.total <= winner.total - SEARCH.number_price * more
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
         if (
             not (justified or alike)
@@ -104,12 +106,6 @@ def _rival(
     moved: tuple[str, float] | None = None,
 ) -> Rival:  # fmt: skip
     return Rival(effect.name, place_of(effect), ratio, training_ratio, tied, effect.where, moved)
-
-
-def _numbers_justified(winner: Hypothesis, rival: Hypothesis) -> bool:
-    """Return whether each further free number of a rival removes `SEARCH.number_price`."""
-    more = rival.size[1] - winner.size[1]
-    return more <= 0 or rival.total <= winner.total - SEARCH.number_price * more
 
 
 def moved_parameter(

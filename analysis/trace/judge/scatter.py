@@ -114,27 +114,22 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     not grow in proportion, with x (1 + e |x| / rms x) in place of its contribution x to the rows.
     Where e exceeds `TRACE.standard_errors` of its noise, the shift that it makes counts.
     """
-    squares = _growth_shift_squares(train_data, fit)
+    rig, squares = train_data.rig, _growth_shift_squares(train_data, fit)
     for used, other in fits_in_other_forms(train_data, fit):
-        if not _is_possible(train_data.rig, other):
+        values = other.parameters(rig)
+        effects = [(u.term, u.shape) for u in other.terms if isinstance(u.term, Effect)]
+        if any(e.problem(rig, values, s) or e.outside(rig, s) for e, s in effects):
             continue
         left = fit.residual[contribution(train_data, fit, used) != 0.0]
         own = max(float(left @ left) - len(left), TRACE.form_noise)
         share = own / (own + max(0.0, other.energy - fit.energy))
-        incomparable = _of_other_meaning(train_data.rig, fit, other)
+        incomparable = _of_other_meaning(rig, fit, other)
         for name, value in other.beta.items():
             if name in incomparable:
                 continue
             shift = value - fit.beta.get(name, value)
             squares[name] = squares.get(name, 0.0) + share * shift**2
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
-
-
-def _is_possible(rig: Rig, fit: ExactFit) -> bool:
-    """Return whether the numbers of all effects of a fit are physically possible."""
-    values = fit.parameters(rig)
-    effects = [(u.term, u.shape) for u in fit.terms if isinstance(u.term, Effect)]
-    return not any(e.problem(rig, values, s) or e.outside(rig, s) for e, s in effects)
 
 
 def _of_other_meaning(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:

@@ -22,7 +22,7 @@ from analysis.identify.output_error.hidden_states import (
     shot,
     window_error,
 )
-from analysis.simulation.model import Estimate, Model
+from analysis.simulation.model import Model
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import rms_of
@@ -104,16 +104,11 @@ def with_shots(judged: JudgedEffect, shots: Sequence[ShootingEstimate]) -> Judge
     """Return an effect with the shapes from shooting, or with intervals that include them."""
     for result in shots:
         if (result.name, result.where) == (judged.name, judged.where):
-            shapes = {
-                name: new if result.taken
-                else _interval_including(judged.parameters[name], new)
-                for name, new in result.shapes.items()
-            }  # fmt: skip
+            shapes = dict(result.shapes)
+            if not result.taken:
+                for name, new in result.shapes.items():
+                    rows = judged.parameters[name]
+                    low, high = min(rows.ci95[0], new.value), max(rows.ci95[1], new.value)
+                    shapes[name] = replace(rows, ci95=(low, high))
             return replace(judged, parameters={**judged.parameters, **shapes}, shot=result)
     return judged
-
-
-def _interval_including(rows: Estimate, new: Estimate) -> Estimate:
-    """Return the rows' estimate with an interval that includes the value of the other."""
-    low, high = rows.ci95
-    return replace(rows, ci95=(min(low, new.value), max(high, new.value)))

@@ -11,7 +11,7 @@ records.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -47,9 +47,9 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 TELL, COVER, SHOW = "tell apart", "cover", "make visible"
-LEAST_SEPARATION: Final = (
-    SEARCH.band
-)  # separation over noise; less would be within the noise's band
+LEAST_SEPARATION: Final = SEARCH.band  # over noise; less would be within the noise's band
+LINES: Final = "lines"
+TIME: Final = "time"  # no excitation extends it
 
 
 @dataclass(frozen=True)
@@ -100,19 +100,14 @@ def rig_with_estimates(train_data: RegressionData) -> Rig:
     """Return the rig with nominal values from the records, so that its twin is more accurate."""
     plain = tuple(map(Used, baseline_of(train_data.rig)))
     parameters = parameter_values(train_data.rig, plain, train_data.beta)
-    before = train_data.rig.nominal
+    before, most = train_data.rig.nominal, EXPERIMENT.parameter_ratio
     likely = {
         name: value
         for name, value in parameters.items()
         # A parameter that the records hardly determine may have any estimate.
-        if _within(EXPERIMENT.parameter_ratio, value, before.get(name, abs(value)))
+        if (nominal := before.get(name, abs(value))) != 0.0 and 1 / most < value / nominal < most
     }
     return train_data.rig.model_copy(update={"nominal": {**before, **likely}})
-
-
-def _within(ratio: float, value: float, nominal: float) -> bool:
-    """Return whether a value is at most `ratio` times a nominal one, and at least its inverse."""
-    return nominal != 0.0 and 1 / ratio < value / nominal < ratio
 
 
 def _questions(
@@ -123,7 +118,9 @@ def _questions(
     old: ComparisonRows,
 ) -> list[PredictedAnswer]:
     if verdict == CLEAN:
-        asked = [OpenQuestion(h, Explanation(), False) for h in _smallest_effects(hypotheses)]
+        rig = hypotheses.train_data.rig
+        small = [smallest_effect(effect, rig) for effect in dict.fromkeys(hypotheses.effects)]
+        asked = [OpenQuestion(h, Explanation(), False) for h in small if h is not None]
         answers = [PredictedAnswer(q, present_separation(q, old)) for q in asked]
         return [a for a in answers if a.present < LEAST_SEPARATION]
     if verdict == CONFOUNDED:
@@ -157,13 +154,6 @@ def _undecided_questions(hypotheses: HypothesisSet) -> list[OpenQuestion]:
     return [OpenQuestion(explanation(best), explanation(o)) for o in near]
 
 
-def _smallest_effects(hypotheses: HypothesisSet) -> list[Explanation]:
-    rig = hypotheses.train_data.rig
-    effects = dict.fromkeys(hypotheses.effects)
-    smallest_sizes = (smallest_effect(effect, rig) for effect in effects)
-    return [h for h in smallest_sizes if h is not None]
-
-
 def _best_steps(
     asked: Sequence[PredictedAnswer],
     tried: Sequence[ex.CandidateExcitation],
@@ -176,20 +166,16 @@ def _best_steps(
     table: list[list[PredictedAnswer]] = []
     for view in views:
         new = ComparisonRows(old.train_data, view, old)
+        found = (separation(a.question, old, new) for a in asked)
         table.append(
-            [
-                PredictedAnswer(a.question, a.present, *separation(a.question, old, new))
-                for a in asked
-            ]
+            [replace(a, predicted=s, equation=e) for a, (s, e) in zip(asked, found, strict=True)]
         )
     chosen: list[int] = []
     while len(chosen) < min(EXPERIMENT.steps, len(tried)):
         worth = [_total_answered(_best_answers(table, [*chosen, k])) for k in range(len(tried))]
         k = int(np.argmax(worth))
-        if (
-            worth[k] - (_total_answered(_best_answers(table, chosen)) if chosen else 0.0)
-            < EXPERIMENT.least_step_gain
-        ):
+        before = _total_answered(_best_answers(table, chosen)) if chosen else 0.0
+        if worth[k] - before < EXPERIMENT.least_step_gain:
             break
         chosen.append(k)
     if not chosen:
@@ -217,21 +203,20 @@ def _covering_experiment(
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
     """Return an experiment beyond the range or the lines of the records, None if none is."""
-    candidates = wider_range(train_data, moves, views, EXPERIMENT.least_gain) or more_lines(
-        train_data, moves, tried
-    )
-    if candidates is None:
+    found = wider_range(train_data, moves, views, EXPERIMENT.least_gain)
+    found = found or more_lines(train_data, moves, tried)
+    if found is None:
         return None
     now = largest_rms(train_data, winner.fit.residual)
     return {
         "kind": COVER,
         "separates": [],
-        "covers": {"variable": candidates.variable, "times": candidates.times},
+        "covers": {"variable": found.variable, "times": found.times},
         "present": now,
-        "predicted": now * (candidates.times if candidates.variable != LINES else 1.0),
-        "equation": candidates.equation,
-        "text": f"{tried[candidates.index].text}: {candidates.words}",
-        **_protocols(train_data, [tried[candidates.index]]),
+        "predicted": now * (found.times if found.variable != LINES else 1.0),
+        "equation": found.equation,
+        "text": f"{tried[found.index].text}: {found.words}",
+        **_protocols(train_data, [tried[found.index]]),
     }
 
 
@@ -314,10 +299,6 @@ def _separated_by(name: str, rival: str) -> str:
     return ""
 
 
-LINES: Final = "lines"
-TIME: Final = "time"  # no excitation extends it
-
-
 @dataclass(frozen=True)
 class RangeExtension:
     """An excitation, by its index, with `times` the records' range of a variable."""
@@ -330,11 +311,9 @@ class RangeExtension:
 
 
 def wider_range(
-    train_data: RegressionData,
-    moves: Sequence[Dependence],
-    views: Sequence[MeasurementView],
+    train_data: RegressionData, moves: Sequence[Dependence], views: Sequence[MeasurementView],
     least: float,
-) -> RangeExtension | None:
+) -> RangeExtension | None:  # fmt: skip
     """Return the excitation with the widest range of a clue's variable, None if none is wider.
 
     The first clue in `moves` is used for which an excitation reaches `least` times the range of the
@@ -348,11 +327,8 @@ def wider_range(
             values = [v for v in seen if v is not None]
             if not values:
                 continue
-            low, high = np.percentile(np.concatenate(values), [1, 99])
-            reach = [
-                _range_ratio(train_data, view, joint, name, float(low), float(high))
-                for view in views
-            ]
+            low, high = np.percentile(np.concatenate(values), [1, 99]).tolist()
+            reach = [_range_ratio(view, joint, name, low, high) for view in views]
             k = int(np.argmax(reach))
             if reach[k] >= least:
                 words = (
@@ -363,18 +339,11 @@ def wider_range(
     return None
 
 
-def _range_ratio(
-    train_data: RegressionData,
-    view: MeasurementView,
-    joint: int,
-    name: str,
-    low: float,
-    high: float,
-) -> float:
+def _range_ratio(view: MeasurementView, joint: int, name: str, low: float, high: float) -> float:
     """Return a variable's range in records and candidate together over that in the records."""
     if joint + 1 in view.conditioned.record.locked:
         return 0.0
-    least, most = np.percentile(variables(train_data.rig, view.signals, joint)[name], [1, 99])
+    least, most = np.percentile(variables(view.rig, view.signals, joint)[name], [1, 99])
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 
@@ -388,9 +357,7 @@ def more_lines(
     equation = moves[0].equation
     joint = int(equation.rsplit("_", 1)[1]) - 1
     held = [len(s.record.lines) for s in train_data.records if joint + 1 not in s.record.locked]
-    counts = [
-        len(measured.tones[joint].lines) if joint in measured.tones else 0 for measured in tried
-    ]
+    counts = [len(one.tones[joint].lines) if joint in one.tones else 0 for one in tried]
     if not held or not min(held) or not counts:
         return None
     k = int(np.argmax(counts))

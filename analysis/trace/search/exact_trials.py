@@ -31,7 +31,8 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
     It is asked while the set leaves more than noise. A set within the tolerance for its forms is
     left only for one that leaves a tenth, or only noise.
     """
-    while above := _equations_above(hypotheses, now):
+    band = hypotheses.noise_band.by_equation
+    while above := {e for e, v in now.excess_energy.items() if v > band[e]}:
         tried = [
             hypotheses.refined_below(energy, effects)
             for energy, effects in _best_trials(hypotheses, now, above)
@@ -44,12 +45,6 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypo
             break
         now = better
     return now
-
-
-def _equations_above(hypotheses: HypothesisSet, now: Hypothesis) -> set[str]:
-    """Return the equations that keep more than noise."""
-    band = hypotheses.noise_band.by_equation
-    return {e for e, v in now.excess_energy.items() if v > band[e]}
 
 
 def _best_trials(
