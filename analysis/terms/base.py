@@ -205,6 +205,11 @@ def equation(kind: str, joint: int) -> str:
     return f"{kind}_{joint + 1}"
 
 
+def joint_of(name: str) -> int:
+    """Return the joint, 0-based, of an equation's name."""
+    return int(name.rsplit("_", 1)[1]) - 1
+
+
 def family_of(name: str) -> str:
     """Return the family, `mechanical` or `fluid`, of an equation's name."""
     kind: Any = name.rsplit("_", 1)[0]

@@ -16,7 +16,7 @@ from analysis.identify.coupled import with_identified_bulk_modulus
 from analysis.identify.geometry import NAME as GEOMETRY
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
-from analysis.terms.base import FAMILIES, Used
+from analysis.terms.base import FAMILIES, Used, joint_of
 from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.nuisance_terms import temperature_terms
@@ -192,7 +192,7 @@ def _prepared(records: TraceRuns, options: _Options) -> _Prepared:
     if lines := unlocked_lines(rows.train):
         records = replace(records, lines=lines)
         rows = trace_rows(records)
-    moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
+    moving = len({joint_of(s.equation) for s in rows.train.segments})
     baseline = identified(records.train, rows.train.terms)
     notes = (
         *undetermined_notes(baseline.model),
@@ -248,7 +248,7 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
     if by_geometry := _traced_within_tolerances(records, options, finding, done):
         return by_geometry
     done(JUDGED)
-    records = replace(prepared.records, lines=finding.rows.lines)
+    records = replace(prepared.records, lines=finding.rows.filtering.lines)
     finding, fitted, free_runs = _with_free_runs(prepared, records, finding)
     hypotheses, train_data, unseen = finding.hypotheses, finding.rows.train, finding.rows.unseen
     lines = spectral_lines(train_data, finding.winner.fit.residual)
@@ -299,7 +299,7 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
         *refitted_notes(winner.fit, last, after),
         *(why for _, why in shared_parameters(winner, after).values()),
         *record_condition_notes(train_data, winner),
-        *undetermined_notes(after, before, finding.rows.in_motion),
+        *undetermined_notes(after, before, finding.rows.filtering.in_motion),
         *kept,
         *fitted.notes,
         *detection_limit_notes(hidden),
@@ -363,7 +363,7 @@ def _final_verdict(
         finding.rows.unseen.judging, finding.hypotheses.empty, winner
     )
     joints = joints_with_friction(winner, kept)
-    if joints and not finding.rows.in_motion:
+    if joints and not finding.rows.filtering.in_motion:
         rows, hypotheses, moving = fitted_in_motion(records, winner, joints)
         if not judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
             kept, words = set(), rest_phase_notes(joints, included=True)

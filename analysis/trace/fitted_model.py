@@ -170,8 +170,14 @@ def _identified_with_effects(
     """
     if not winner.effects:
         return before, {}
-    train_data = rows.train
-    found = identified(runs, (*train_data.terms, *winner.effects), rows.filters_like)
+    train_data, own = rows.train, rows.filtering
+
+    def like_rows(filtering: Filtering) -> Filtering:
+        return replace(
+            filtering, in_motion=own.in_motion, full_weight=own.full_weight, lines=own.lines
+        )
+
+    found = identified(runs, (*train_data.terms, *winner.effects), like_rows)
     shift = form_shift(train_data, winner.fit)
     model = with_form_errors(train_data, winner.fit, found.model, shift)
     geometry = found.geometry

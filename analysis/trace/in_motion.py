@@ -83,7 +83,7 @@ def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Find
     above_noise, joints = _joints_to_weight(
         finding, [e for e in candidates.named if e.family == "friction"]
     )
-    weighted = set(finding.rows.in_motion)
+    weighted = set(finding.rows.filtering.in_motion)
     if joints <= weighted:
         return finding
 
@@ -92,7 +92,7 @@ def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Find
         moving = moving_filtering({*weighted, *joints}, full_weight)
         rows = trace_rows(records, moving, unweighted)
         found = search_and_judge(rows, candidates, lambda _: None)
-        resting = rest_phase_notes(rows.in_motion, included=False)
+        resting = rest_phase_notes(rows.filtering.in_motion, included=False)
         return replace(found, notes=(*resting, *found.notes))
 
     for full_weight in (1.0, TRACE.breakaway_speed):

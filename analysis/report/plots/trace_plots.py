@@ -34,7 +34,7 @@ from analysis.report.plots.style import (
 )
 from analysis.report.settings import REPORT
 from analysis.simulation.model import Model
-from analysis.terms.base import family_of
+from analysis.terms.base import family_of, joint_of
 from analysis.trace.clues.equation_rows import variables
 from analysis.trace.data.conditioned_record import (
     conditioned_records,
@@ -98,7 +98,7 @@ def abscissae(
     model: Model,
 ) -> Array:
     """Return the variable that an equation's residuals are plotted against, or the effect's."""
-    joint = int(equation.rsplit("_", 1)[1]) - 1
+    joint = joint_of(equation)
     out = []
     for line in lines:
         if effect is not None:

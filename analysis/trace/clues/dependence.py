@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.terms.base import joint_of
 from analysis.trace.clues.equation_rows import (
     EquationRows,
     equation_rows,
@@ -184,7 +185,7 @@ def _curve_shares(
     """
     if first is None or second is None:
         return {}
-    joint = int(equation.rsplit("_", 1)[1]) - 1
+    joint = joint_of(equation)
     every = [*first.parts, *second.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
     values = [variables(rig, p.signals, joint) for p in every]

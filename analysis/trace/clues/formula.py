@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
+from analysis.terms.base import joint_of
 from analysis.trace.clues.equation_rows import (
     EquationRows,
     equation_rows,
@@ -87,7 +88,7 @@ def _candidate_monomials(
     rig: Rig, equation: str, fitted: EquationRows, judged: EquationRows
 ) -> tuple[list[str], Array, Array]:  # fmt: skip
     """Return the monomials' names and columns on either side, nearly equal ones only once."""
-    joint = int(equation.rsplit("_", 1)[1]) - 1
+    joint = joint_of(equation)
     every = [*fitted.parts, *judged.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
     made = [_monomials(rig, equation, p.signals, joint, travel) for p in every]

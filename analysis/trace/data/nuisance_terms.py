@@ -25,7 +25,7 @@ from analysis.identify.estimators.nuisance import KAPPA, BulkTemperature, sample
 from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline_of
-from analysis.terms.base import Used
+from analysis.terms.base import Used, joint_of
 from analysis.trace.data.conditioned_record import model_rows
 from analysis.trace.data.regression_data import RegressionData, least_squares
 from analysis.trace.settings import DATA
@@ -125,7 +125,7 @@ def path_terms(data: RegressionData) -> tuple[Used, ...]:
     """
     rig, kind = data.rig, "torque" if data.rig.electric else "flow"
     moved = [s.equation for s in data.segments if s.equation.startswith(kind)]
-    joints = sorted({int(equation.rsplit("_", 1)[1]) - 1 for equation in moved})
+    joints = sorted({joint_of(equation) for equation in moved})
     paths = sample_paths(rig, joints, {name: float(v) for name, v in data.beta.items()})
     if not paths:
         return ()

@@ -23,7 +23,7 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import Used, family_of
+from analysis.terms.base import FAMILIES, Used, family_of
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 class Segment:
     """The rows (`where`) of one equation of one group, averaged over `repeats` records.
 
-    `noise` is the noise floor of one record [SI], `locked` are the locked joints (1-based).
+    `noise` is the noise floor of one record [SI].
     """
 
     group: Group
@@ -53,7 +53,6 @@ class Segment:
     where: slice
     noise: float
     repeats: int
-    locked: tuple[int, ...]
 
     @property
     def count(self) -> int:
@@ -165,10 +164,8 @@ def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecor
 def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, float]:
     """Return the unweighted least-squares coefficients of all rows, the shortest if not unique."""
     out: dict[str, float] = {}
-    for kinds in (("torque",), ("flow_cap", "flow_rod")):
-        parts = [
-            r for record in rows for name, r in record.items() if name.rsplit("_", 1)[0] in kinds
-        ]
+    for family in FAMILIES:
+        parts = [r for record in rows for e, r in record.items() if family_of(e) == family]
         if not parts:
             continue
         X, y = np.concatenate([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
@@ -224,11 +221,7 @@ def regression_data(
                 table[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
             residual.append(table)
             where = slice(start, start + len(time))
-            segments.append(
-                Segment(
-                    conditioned.group, equation, where, sigma, len(own), conditioned.record.locked
-                )
-            )
+            segments.append(Segment(conditioned.group, equation, where, sigma, len(own)))
             start = where.stop
     if not segments:
         raise InputError(

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows, lines_cutoff
+from analysis.terms.base import joint_of
 from analysis.trace.data.conditioned_record import filtered
 from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData, Segment
@@ -143,7 +144,7 @@ def _segment_lines(
     K = int(min([beyond, *(DATA.lines_per_pair * len(p) for p in pairs)]))
     if not pairs or highest > K:
         return None
-    joint = int(s.equation.rsplit("_", 1)[1]) - 1
+    joint = joint_of(s.equation)
     velocity = filtered({"v": conditioned.signals.sd[:, joint]}, conditioned, rows)["v"]
     series = np.vstack((residuals, velocity))
     spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])

@@ -63,21 +63,9 @@ class TraceRows:
     unseen: UnseenRows
 
     @property
-    def in_motion(self) -> tuple[int, ...]:
-        """The joints (0-based) whose torque rows are weighted by speed, by 0 at rest."""
-        return self.train.records[0].filtering.in_motion
-
-    @property
-    def lines(self) -> tuple[Line, ...]:
-        """The sines that are taken out of torque rows: joint (0-based) and frequency [Hz]."""
-        return self.train.records[0].filtering.lines
-
-    def filters_like(self, filtering: Filtering) -> Filtering:
-        """Return filters with the weights of these torque rows and the sines taken out of them."""
-        own = self.train.records[0].filtering
-        return replace(
-            filtering, in_motion=own.in_motion, full_weight=own.full_weight, lines=own.lines
-        )
+    def filtering(self) -> Filtering:
+        """The filters of the training rows, weights by speed and sines taken out among them."""
+        return self.train.records[0].filtering
 
 
 def trace_rows(

@@ -97,7 +97,7 @@ def judge_effects(
         without = held_out_residual(holdout_data, alternative.fit)
         changes = held_out.removed_energy(winner, alternative)
         tie_test = rivals.TieTest(holdout_data, changes, after, without)
-        others = rivals.rivals_of(hypotheses, winner, used, alternative, holdout_data, tie_test)
+        others = rivals.rivals_of(hypotheses, winner, used, alternative, tie_test)
         removed = held_out.removal_of(holdout_data, changes, without, after)
         disturbed = {
             *held_out.disturbed_equations(hypotheses, winner, alternative),
@@ -109,49 +109,33 @@ def judge_effects(
         unknown = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
         differing = invariance(train_data, winner.fit, used, errors)
         unphysical = hypotheses.physical_problem(winner, used)
-        tied = [r for r in others if r.tied]
         inseparable = [
             Rival(name, rivals.place_of(effect_of(name, at)), 1.0, 1.0, True, at)
             for name, at in effect.inseparable()
         ]
+        removes = removed.share >= TRACE.least_removed and not disturbed
+        significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown else "")
+        nearest = rivals.rivals_in_words([*inseparable, *others])
+        nearest += rivals.composites_in_words(hypotheses, winner, used, tie_test)
         gates = (
-            Gate(
-                REMOVES,
-                removed.share >= TRACE.least_removed and not disturbed,
-                held_out.removal_in_words(removed, disturbed),
-            ),
+            Gate(REMOVES, removes, held_out.removal_in_words(removed, disturbed)),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences_in_words(differing)),
-            Gate(
-                SIGNIFICANT,
-                p <= TRACE.p_limit and not unknown,
-                f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown else ""),
-            ),
-            Gate(
-                NO_RIVAL,
-                not (tied or inseparable),
-                rivals.rivals_in_words([*inseparable, *others])
-                + rivals.composites_in_words(hypotheses, winner, used, holdout_data, tie_test),
-            ),
+            Gate(SIGNIFICANT, p <= TRACE.p_limit and not unknown, significance),
+            Gate(NO_RIVAL, not (inseparable or any(r.tied for r in others)), nearest),
         )
         out.append(
             JudgedEffect(
-                effect.name,
-                rivals.place_of(effect),
+                effect.name, rivals.place_of(effect),
                 {n: e for n, e in estimates.items() if n not in train_data.beta},
-                p,
-                removed.share,
-                (*inseparable, *others),
-                gates,
+                p, removed.share, (*inseparable, *others), gates,
                 effect.variable_on(train_data.rig),
-                mechanism=effect.mechanism,
-                free=effect.free,
+                mechanism=effect.mechanism, free=effect.free, at=effect.where,
                 curves=curves_of(train_data, winner.fit, used),
                 left_without=held_out.rms_in(holdout_data, without, changes),
                 left_with=held_out.rms_in(holdout_data, after, changes),
-                at=effect.where,
             )
-        )
+        )  # fmt: skip
     return tuple(out)
 
 

@@ -7,13 +7,14 @@ catalogue's simpler form, and the form error of a larger effect together may cau
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shapes_of
-from analysis.terms.base import Used
+from analysis.terms.base import Used, joint_of
 from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, basis_of_others, flip_blocks
@@ -51,7 +52,7 @@ def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Arra
         conditioned, rows = train_data.source(s)
         time = rows.time
         early[s.where] = time < 0.5 * (time[0] + time[-1])
-        own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
+        own = joint if joint is not None else joint_of(s.equation)
         speed = conditioned.signals.sd[conditioned.samples_at(time), own]
         ahead[s.where] = speed > 0
         size = np.abs(speed)
@@ -75,6 +76,17 @@ def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
     for k, s in enumerate(train_data.segments):
         numbers[s.where] += between * k
     return numbers
+
+
+def _parts(
+    train_data: RegressionData, base: Array, joint: int | None
+) -> Iterator[tuple[str, Array, Array, NDArray[np.int64] | None]]:
+    """Yield the parts of the rows: name, mask (M,), basis of `base` in them, `_blocks_as_noise`."""
+    numbers = _blocks_as_noise(train_data)
+    for label, mask in row_subsets(train_data, joint).items():
+        if mask.any():
+            blocks = None if numbers is None else numbers[mask]
+            yield label, mask, orthonormal(base[mask]), blocks
 
 
 def _shift(
@@ -135,16 +147,14 @@ def invariance(
     base = basis_of_others(train_data, model, names)
     if effect_in(used).free:
         return _whole_effect_differences(train_data, model, used, base, joint)
-    residual = model.residual
-    # Shapes without a neutral value, such as a presliding distance, are no sizes.
-    sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
-    sizes |= {s.parameter for s in shapes_of(train_data.rig, used) if s.neutral is not None}
+    shapes = shapes_of(train_data.rig, used)
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
-    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
-    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
+    # Shapes without a neutral value, such as a presliding distance, are no sizes.
+    sizes = {*units, *(s.parameter for s in shapes if s.neutral is not None)}
+    units |= {s.parameter: s.unit for s in shapes}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
-    clusters = _blocks_as_noise(train_data)
     J_all = J - base @ (base.T @ J)
     whole = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
     # A number that the effect's other numbers can replace is no size of its own: then the whole
@@ -157,10 +167,7 @@ def invariance(
     if ridge:
         out += _whole_effect_differences(train_data, model, used, base, joint)
         sizes -= ridge
-    for label, mask in row_subsets(train_data, joint).items():
-        if not mask.any():
-            continue
-        B = orthonormal(base[mask])
+    for label, mask, B, blocks in _parts(train_data, base, joint):
         J_s = J[mask] - B @ (B.T @ J[mask])
         for k, name in enumerate(names):
             if name not in sizes:
@@ -176,8 +183,7 @@ def invariance(
                 or not np.isfinite(value.value[k])
             ):
                 continue
-            blocks = None if clusters is None else clusters[mask]
-            shift, error = _shift(own, residual[mask], B, blocks)
+            shift, error = _shift(own, model.residual[mask], B, blocks)
             spill = np.sqrt(
                 SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
             )
@@ -205,18 +211,14 @@ def _whole_effect_differences(
     """
     whole = contribution(train_data, model, used)
     start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
-    clusters, out = _blocks_as_noise(train_data), []
-    for label, mask in row_subsets(train_data, joint).items():
-        if not mask.any():
-            continue
-        B = orthonormal(base[mask])
+    out = []
+    for label, mask, B, blocks in _parts(train_data, base, joint):
         own = whole[mask] - B @ (B.T @ whole[mask])
         size = float(own @ own)
         if size <= TRACE.informative_share * start or size < 0.01 * float(
             whole[mask] @ whole[mask]
         ):
             continue
-        blocks = None if clusters is None else clusters[mask]
         shift, error = _shift(own, model.residual[mask], B, blocks)
         if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
             error, TRACE.invariance_tolerance / TRACE.standard_errors

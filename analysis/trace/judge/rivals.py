@@ -36,7 +36,6 @@ def rivals_of(
     winner: Hypothesis,
     used: Used,
     alternative: Hypothesis,
-    holdout_data: RegressionData,
     held_out_test: TieTest,
 ) -> list[Rival]:
     """Return the rivals of an effect: fitted sets with another effect in its place.
@@ -46,6 +45,7 @@ def rivals_of(
     parameter of another law, or where the effect cannot be separated from others anyway.
     """
     judged_effect, train_data = effect_in(used), hypotheses.train_data
+    holdout_data = held_out_test.data
     others = winner.keys - {judged_effect.key}
     training_test = TieTest(
         train_data,
@@ -88,7 +88,7 @@ def rivals_of(
             out.append(rival)
         elif tied:
             richer.append(rival)
-    for composite, ratio in _tied_composites(hypotheses, winner, used, holdout_data, held_out_test):
+    for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
         moved = moved_parameter(train_data, winner, composite)
         # One effect is the simpler explanation, unless the records prefer two.
         if moved and _cost(composite, holdout_data) < _cost(winner, holdout_data):
@@ -263,9 +263,8 @@ def _of_law(rig: Rig, law: str) -> set[str]:
 
 
 def _tied_composites(
-    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData,
-    held_out_test: TieTest,
-) -> Iterator[tuple[Hypothesis, float]]:  # fmt: skip
+    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, held_out_test: TieTest
+) -> Iterator[tuple[Hypothesis, float]]:
     """Yield the sets with two effects in the place of one that leave as little in held-out rows.
 
     From levels of friction by direction one level and an offset torque differ by the lever arm
@@ -275,20 +274,19 @@ def _tied_composites(
         both = hypotheses.refined(effects)
         if hypotheses.physical_problem(both):
             continue
-        residual = held_out_residual(holdout_data, both.fit)
+        residual = held_out_residual(held_out_test.data, both.fit)
         if held_out_test.ties(residual, TRACE.tie_ratio):
             yield both, held_out_test.ratio(residual)
 
 
 def composites_in_words(
-    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData,
-    held_out_test: TieTest,
-) -> str:  # fmt: skip
+    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, held_out_test: TieTest
+) -> str:
     """Name two effects that together leave as little as one ('' if none do).
 
     They are no rival where no parameter changes with them, since one effect is simpler.
     """
-    for both, ratio in _tied_composites(hypotheses, winner, used, holdout_data, held_out_test):
+    for both, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
         names = " and ".join(u.term.name for u in both.effects[-2:])
         return f"; {names} together would leave {ratio:.2f} times the held-out rms"
     return ""
@@ -320,7 +318,7 @@ class TieTest:
     def __init__(
         self, data: RegressionData, equations: Collection[str], left: Array, without: Array
     ) -> None:
-        self.rows = data.in_equations(equations)
+        self.data, self.rows = data, data.in_equations(equations)
         self.left = left[self.rows]
         self.energy = float(self.left @ self.left)
         self.taken = float(without[self.rows] @ without[self.rows]) - self.energy

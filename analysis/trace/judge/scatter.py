@@ -21,6 +21,7 @@ from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
+from analysis.terms.base import joint_of
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.search.exact_fit import ExactFit, contribution, design_matrix, tangent
 from analysis.trace.search.refinement import fits_in_other_forms
@@ -94,8 +95,7 @@ def _row_groups(conditioned: ConditionedRecord, s: Segment, time: Array, by: str
     if by == PERIOD:
         return segments(time, record.period / record.sample_rate)
     signals, at = conditioned.signals, conditioned.samples_at(time)
-    kind, joint = s.equation.rsplit("_", 1)
-    i = int(joint) - 1
+    kind, i = s.equation.rsplit("_", 1)[0], joint_of(s.equation)
     state = {"flow_cap": signals.p_cap, "flow_rod": signals.p_rod}.get(kind, signals.s)
     x = (signals.sd if by == SPEED else state)[at, i]
     rank = np.argsort(np.argsort(x))

@@ -24,7 +24,7 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import WAVES, Line, sines_at, without_sines
 from analysis.simulation.model import Estimate
-from analysis.terms.base import equation
+from analysis.terms.base import equation, joint_of
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import PERIODS, REPEATS, Floor, Group
 from analysis.trace.data.regression_data import RegressionData, Segment
@@ -61,7 +61,7 @@ def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
             found[e] = f
     out = []
     for e, f in found.items():
-        joint = int(e.rsplit("_", 1)[1]) - 1
+        joint = joint_of(e)
         others = [g for other, g in found.items() if other != e]
         velocities = [_velocity(data, s, joint) for s in scattered[e]]
         length = max(float(time[-1] - time[0]) for time, _ in velocities)
@@ -162,41 +162,27 @@ def judged_line(
     ]
     p = _probability(own)
     limit, effect = torque_limit(rig, joint), PeriodicDisturbance(f"joint {joint + 1}")
-    size = f"{plain(amplitude.value, 2)} of the {plain(limit, 2)} that may be"
+    size = f"amplitude {plain(amplitude.value, 2)} of the {plain(limit, 2)} that may be"
+    share = f"{100 * removed:.0f} % of the energy above noise"
+    alike = "; ".join(differing[:3]) or "the same amplitude in all records"
     gates = (
-        Gate(
-            REMOVES,
-            removed >= TRACE.least_removed,
-            f"{100 * removed:.0f} % of the energy above noise",
-        ),
-        Gate(PHYSICAL, amplitude.value < limit, f"amplitude {size}"),
-        Gate(
-            INVARIANT,
-            not differing,
-            "; ".join(differing[:3]) or "the same amplitude in all records",
-        ),
+        Gate(REMOVES, removed >= TRACE.least_removed, share),
+        Gate(PHYSICAL, amplitude.value < limit, size),
+        Gate(INVARIANT, not differing, alike),
         Gate(SIGNIFICANT, p <= TRACE.p_limit, f"p = {p:.3g} over all frequencies"),
         Gate(NO_RIVAL, True, "its phase does not follow the excitation, as effects of motion do"),
     )
     error = _frequency_error(own, amplitude.value)
     scale = noise * math.sqrt(max(sum(f.count for f in unseen), 1))
+    parameters = {
+        f"T_amplitude_{joint + 1}": amplitude,
+        effect.shape_names()[0]: _estimate(frequency, "Hz", error),
+    }
     return JudgedEffect(
-        effect.name,
-        effect.where,
-        {
-            f"T_amplitude_{joint + 1}": amplitude,
-            effect.shape_names()[0]: _estimate(frequency, "Hz", error),
-        },
-        p,
-        removed,
-        (),
-        gates,
-        effect.variable,
-        mechanism=effect.mechanism,
-        left_without=math.sqrt(before) / scale,
-        left_with=math.sqrt(after) / scale,
-        at=effect.where,
-    )
+        effect.name, effect.where, parameters, p, removed, (), gates, effect.variable,
+        mechanism=effect.mechanism, at=effect.where,
+        left_without=math.sqrt(before) / scale, left_with=math.sqrt(after) / scale,
+    )  # fmt: skip
 
 
 def _mean_amplitude(rig: Rig, joint: int, own: Sequence[_LineFit]) -> Estimate:
@@ -278,25 +264,16 @@ def _unrepeated_note(data: RegressionData, floor: Floor) -> str:
     segment = next(
         s for s in data.segments if (s.group, s.equation) == (floor.group, floor.equation)
     )
-    frequency, share = _dominant_frequency(data, segment)
     at = ""
-    if share > DATA.unrepeated_share:
-        at = f", {plain(100 * share, 2)} % of it at {plain(frequency, 3)} Hz"
+    if segment.repeats > 1:  # periods hold no other frequency
+        frequency, share = dominant_frequency([scatter(data, segment)])
+        if share > DATA.unrepeated_share:
+            at = f", {plain(100 * share, 2)} % of it at {plain(frequency, 3)} Hz"
     return (
         f"{floor.equation}: what differs between repeats is {plain(floor.noise / floor.stated, 2)} "
         f"times what the stated sensor noise makes{at}: a sensor is noisier than stated, or "
         "something acts that does not follow the excitation, which the trace cannot see"
     )
-
-
-def _dominant_frequency(data: RegressionData, segment: Segment) -> tuple[float, float]:
-    """Return the frequency [Hz] at which most of the scatter between repeats lies, and its share.
-
-    The share is of the energy, 0 with fewer than two repeats (periods hold no other frequency).
-    """
-    if segment.repeats < 2:
-        return 0.0, 0.0
-    return dominant_frequency([scatter(data, segment)])
 
 
 def scatter(data: RegressionData, segment: Segment) -> tuple[Array, Array]:

@@ -197,17 +197,17 @@ class ComparisonRows:
     def columns(self, used: Used) -> dict[str, Array]:
         """Return an effect's columns (m,) by name; '' is the change of the signals it makes."""
         if used not in self._known:
-            before = (
-                self._old.columns(used) if self._old is not None else self._training_columns(used)
-            )
+            if self._old is not None:
+                before = self._old.columns(used)
+            else:
+                found = variant_columns(self.train_data, [used])
+                before = {
+                    n: c for one in found for n, c in zip(one.names, one.columns.T, strict=True)
+                }
             self._known[used] = (
                 before if self.view is None else self._with_view_columns(used, before)
             )
         return self._known[used]
-
-    def _training_columns(self, used: Used) -> dict[str, Array]:
-        columns = variant_columns(self.train_data, [used])
-        return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
     def _with_view_columns(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
         assert self.view is not None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.terms import baseline_of, known
-from analysis.terms.base import Used
+from analysis.terms.base import Used, joint_of
 from analysis.trace.clues.equation_rows import variables
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.rivals import tied_sets
@@ -320,7 +320,7 @@ def wider_range(
     records.
     """
     for clue in moves:
-        joint = int(clue.equation.rsplit("_", 1)[1]) - 1
+        joint = joint_of(clue.equation)
         own = [s for s in train_data.records if joint + 1 not in s.record.locked]
         for name in (n for n in (clue.variable, clue.by) if n and n != TIME):
             seen = [variables(train_data.rig, s.signals, joint).get(name) for s in own]
@@ -355,7 +355,7 @@ def more_lines(
     A single sine gives one path through a nonlinearity, which many forms fit equally well.
     """
     equation = moves[0].equation
-    joint = int(equation.rsplit("_", 1)[1]) - 1
+    joint = joint_of(equation)
     held = [len(s.record.lines) for s in train_data.records if joint + 1 not in s.record.locked]
     counts = [len(one.tones[joint].lines) if joint in one.tones else 0 for one in tried]
     if not held or not min(held) or not counts:

@@ -15,32 +15,21 @@ from analysis.trace.search.refinement import at_best_point
 BENCH: Final = "bench"
 
 
-def is_confusable(effect: Effect, used: Used) -> bool:
+def act_at_one_joint(effect: Effect, other: Effect) -> bool:
+    """Return whether two effects are at the same joint, or one of them is of the bench."""
+    places = {" ".join(e.where.split()[:2]) for e in (effect, other)}
+    return len({place for place in places if not place.startswith(BENCH)}) <= 1
+
+
+def _is_confusable(effect: Effect, own: Effect) -> bool:
     """Return whether a candidate is easily confused with an effect of the set.
 
     It is another name of its mechanism at the same place, or, at its joint or of the bench, the
     same effect on another channel or chamber or one of its confounders.
     """
-    own = effect_in(used)
     same = effect.mechanism == own.mechanism and effect.where == own.where
     alike = effect.name in (own.name, *own.confounders) and act_at_one_joint(effect, own)
     return (same or alike) and not effect.free
-
-
-def is_confounder(effect: Effect, own: Effect) -> bool:
-    """Return whether an effect is a confounder of another one, at its joint or of the bench."""
-    return effect.name in own.confounders and act_at_one_joint(effect, own)
-
-
-def act_at_one_joint(effect: Effect, other: Effect) -> bool:
-    """Return whether two effects are at the same joint, or one of them is of the bench."""
-    return len({_joint(effect), _joint(other)} - {BENCH}) <= 1
-
-
-def _joint(effect: Effect) -> str:
-    """Return the part of an effect's place that names its joint, or the bench."""
-    place = effect.where
-    return BENCH if place.startswith(BENCH) else " ".join(place.split()[:2])
 
 
 def confusable_sets(
@@ -49,13 +38,13 @@ def confusable_sets(
     """Return the sets with one effect exchanged for another candidate or for two."""
     sets = [effects for used in now.effects for effects in composites(data, candidates, now, used)]
     for used in now.effects if len(now.effects) > 1 else ():
-        others = now.without(used)
+        own, others = effect_in(used), now.without(used)
         for effect in candidates:
-            if effect.key in now.keys or not is_confusable(effect, used):
+            if effect.key in now.keys or not _is_confusable(effect, own):
                 continue
             fresh = at_best_point(data, effect, others)
             sets.append((*others, fresh))
-            if is_special_case(effect_in(used), effect):
+            if is_special_case(own, effect):
                 # Another effect may only have made up for what the simpler law lacks.
                 sets += [(*(u for u in others if u is not one), fresh) for one in others]
     return sets
@@ -77,7 +66,8 @@ def composites(
     simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
     confounders = [
         e for e in candidates
-        if is_confounder(e, own) and e.mechanism != own.mechanism and e.key not in known
+        if e.name in own.confounders and act_at_one_joint(e, own)
+        and e.mechanism != own.mechanism and e.key not in known
     ]  # fmt: skip
     return [
         (*others, *(at_start(data.rig, e) for e in (simple, other)))
