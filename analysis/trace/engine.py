@@ -6,9 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from analysis.effects.base import Effect, ordered
 from analysis.effects.mechanics import Payload
 from analysis.identify import checks as ck
@@ -76,8 +73,6 @@ from rig.model.records import (
     with_loads_stated,
 )
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 # Share of the work done after each stage, as measured on six records: reported as progress.
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8

@@ -40,15 +40,17 @@ WITHOUT_RESTS: Final = "judged without the samples at which the joint rests"
 def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
     """State where the noise floor is from few data, and which rows are left out."""
     out = []
-    sources = {f.source for f in train_data.floors}
-    single = sorted({f.group[1] for f in train_data.floors if f.source == STATED})
-    if single:
+
+    def steps(source: str, *data: RegressionData) -> str:
+        return " ".join(sorted({f.group[1] for d in data for f in d.floors if f.source == source}))
+
+    if single := steps(STATED, train_data):
         out.append(
-            f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
+            f"one repeat of {single} and no whole periods to compare: the noise floor is "
             "the rig file's stated sensor noise; noise above that value would be taken "
             "for model error, so the evidence for every name is weaker"
         )
-    if UNSTATED in sources:
+    if steps(UNSTATED, train_data):
         most = max(train_data.floors, key=lambda f: f.noise / f.stated)
         times = plain(most.noise / most.stated, 2)
         out.append(
@@ -57,17 +59,15 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
             "repeat a record to measure the noise"
         )
     for where in (PERIODS, NEIGHBOURS):
-        steps = sorted({f.group[1] for f in train_data.floors if f.source == where})
-        if steps:
-            words = f"one repeat of {' '.join(steps)}: the noise floor comes from {where}"
-            out.append(f"{words} within the record")
+        if single := steps(where, train_data):
+            out.append(
+                f"one repeat of {single}: the noise floor comes from {where} within the record"
+            )
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
-    every = (*train_data.floors, *holdout_data.floors)
-    scaled = sorted({f.group[1] for f in every if f.source == OTHER_STEPS})
-    if scaled:
+    if scaled := steps(OTHER_STEPS, train_data, holdout_data):
         out.append(
-            f"one repeat of {' '.join(scaled)}: the noise floor is the rig file's stated sensor "
+            f"one repeat of {scaled}: the noise floor is the rig file's stated sensor "
             "noise times the ratio that other steps show"
         )
     return [

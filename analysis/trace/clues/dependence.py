@@ -21,15 +21,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.terms.base import joint_of
 from analysis.trace.clues.equation_rows import (
-    EquationRows,
+    EquationSides,
     equation_rows,
     explained_share,
     factor_of,
     factors,
     variables,
-    whitened_columns,
 )
 from analysis.trace.clues.formula import formula, surest_formula
 from analysis.trace.data.regression_data import RegressionData
@@ -40,7 +38,6 @@ from analysis.trace.search.exact_fit import rebased
 from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
 from analysis.trace.settings import CLUES, TRACE
 from rig.model import channels as ch
-from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -64,13 +61,19 @@ def clues_to(
     equations = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in equations)
     equations = [e for e in equations if winner.excess_energy[e] > TRACE.clue_share * total]
-    moves = dependences(train_rows, residual, holdout_rows, held_residual, equations)
+    sides = []
+    for e in equations:
+        first = equation_rows(train_rows, residual, e)
+        second = equation_rows(holdout_rows, held_residual, e)
+        if first is not None and second is not None:
+            sides.append(EquationSides(train_data.rig, e, first, second))
+    weight = {e: v for e, v in winner.excess_energy.items() if e in equations}
+    moves = dependences(sides, weight)
     hum = frequency_clue(split, train_data, residual, holdout_data, held_residual)
-    candidates = [formula(train_rows, residual, holdout_rows, held_residual, e) for e in equations]
-    formulas = tuple(expression for expression in candidates if expression is not None)
-    first = _formula_clue(formulas) if hum is None else [hum]
-    listed = {d.variable for d in first}
-    return (*first, *(d for d in moves if d.variable not in listed)), formulas
+    formulas = tuple(found for found in map(formula, sides) if found is not None)
+    surest = _formula_clue(formulas) if hum is None else [hum]
+    listed = {d.variable for d in surest}
+    return (*surest, *(d for d in moves if d.variable not in listed)), formulas
 
 
 def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
@@ -95,33 +98,18 @@ def hat_functions(v: Array, knots: Array) -> Array:
     return out
 
 
-def dependences(
-    train: RegressionData,
-    residual: Array,
-    holdout_data: RegressionData,
-    holdout_residual: Array,
-    equations: Sequence[str],
-) -> list[Dependence]:
+def dependences(sides: Sequence[EquationSides], weight: Mapping[str, float]) -> list[Dependence]:
     """Return the variables that the residual depends on, those with most evidence first.
 
     The evidence is the share of energy above noise that a curve removes, times the variable's
-    weight (`_independence_weight`). Each variable is returned once.
-
-    `residual` (M,) and `holdout_residual` are the whitened residuals of the training and held-out
-    rows under the model of `train`.
+    weight (`_independence_weight`). Each variable is returned once. `weight` is the training energy
+    above noise of each equation.
     """
-    weight = {
-        e: max(0.0, v) for e, v in energy_above_noise(train, residual).items() if e in equations
-    }
     total = sum(weight.values()) or 1.0
     shares: dict[tuple[str, str], dict[str, float]] = {}
-    for equation in equations:
-        sides = (
-            equation_rows(train, residual, equation),
-            equation_rows(holdout_data, holdout_residual, equation),
-        )
-        for key, share in _curve_shares(train.rig, equation, *sides).items():
-            shares.setdefault(key, {})[equation] = share
+    for both in sides:
+        for key, share in _curve_shares(both).items():
+            shares.setdefault(key, {})[both.equation] = share
     sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in shares.items()}
     out: list[tuple[float, Dependence]] = []
     for (name, factor), by in shares.items():
@@ -175,23 +163,17 @@ def _independence_weight(
     return CLUES.spool_weight if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
 
 
-def _curve_shares(
-    rig: Rig, equation: str, first: EquationRows | None, second: EquationRows | None
-) -> dict[tuple[str, str], float]:
+def _curve_shares(sides: EquationSides) -> dict[tuple[str, str], float]:
     """Return the explained share of every curve, factor (variable '') and product of both.
 
     Each is fitted on one side and judged on the other, both ways round, and the larger share is
     used: a curve fitted to small motions does not predict large ones, but the reverse does.
     """
-    if first is None or second is None:
-        return {}
-    joint = joint_of(equation)
-    every = [*first.parts, *second.parts]
-    travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
-    values = [variables(rig, p.signals, joint) for p in every]
-    by = factors(equation)
+    first, second, every, joint = sides.first, sides.second, sides.parts, sides.joint
+    values = [variables(sides.rig, p.signals, joint) for p in every]
+    by = factors(sides.equation)
     scales = [
-        {f: v[f] if f in v else factor_of(f, p.signals, joint, travel) for f in by}
+        {f: v[f] if f in v else factor_of(f, p.signals, joint, sides.travel) for f in by}
         for v, p in zip(values, every, strict=True)
     ]
     curves: dict[str, list[Array]] = {"": [np.ones((len(p.signals.t), 1)) for p in every]}
@@ -203,7 +185,6 @@ def _curve_shares(
         knots = _knots(np.concatenate(moving)) if moving else None
         if knots is not None:
             curves[name] = [hat_functions(v[name], knots) for v in values]
-    count = len(first.parts)
     out = {}
     for name, curve in curves.items():
         for factor in ("", *by) if name else by:
@@ -212,7 +193,7 @@ def _curve_shares(
                 if factor
                 else curve
             )
-            one, two = whitened_columns(first, made[:count]), whitened_columns(second, made[count:])
+            one, two = sides.columns(made)
             out[name, factor] = max(
                 0.0,
                 explained_share(one, first, two, second),

@@ -13,6 +13,7 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
+from analysis.terms.base import joint_of
 from analysis.trace.data.conditioned_record import filtered, prepared_signals
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import orthonormal
@@ -62,6 +63,37 @@ def equation_rows(data: RegressionData, residual: Array, equation: str) -> Equat
     B = orthonormal(np.concatenate(base))
     r = np.concatenate(rest)
     return EquationRows(tuple(parts), r - B @ (B.T @ r), B)
+
+
+@dataclass(frozen=True)
+class EquationSides:
+    """One equation's rows of training records (`first`) and of held-out ones (`second`)."""
+
+    rig: Rig
+    equation: str
+    first: EquationRows
+    second: EquationRows
+
+    @property
+    def joint(self) -> int:
+        """The equation's joint, 0-based."""
+        return joint_of(self.equation)
+
+    @property
+    def parts(self) -> tuple[EquationPart, ...]:
+        """The records' rows of both sides."""
+        return (*self.first.parts, *self.second.parts)
+
+    @property
+    def travel(self) -> float:
+        """The joint's largest travel [m, rad] in one record."""
+        return max(float(np.ptp(p.conditioned.signals.s[:, self.joint])) for p in self.parts)
+
+    def columns(self, made: Sequence[Array]) -> tuple[Array, Array]:
+        """Return `whitened_columns` of either side, of columns (n, k) for each of `parts`."""
+        count = len(self.first.parts)
+        first, second = made[:count], made[count:]
+        return whitened_columns(self.first, first), whitened_columns(self.second, second)
 
 
 def whitened_columns(side: EquationRows, made: Sequence[Array]) -> Array:

@@ -16,16 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import joint_of
 from analysis.trace.clues.equation_rows import (
     EquationRows,
-    equation_rows,
+    EquationSides,
     explained_share,
     factor_of,
     fitted_coefficients,
-    whitened_columns,
 )
-from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Formula
 from analysis.trace.settings import CLUES
 from rig.model import channels as ch
@@ -39,23 +36,10 @@ def surest_formula(formulas: Sequence[Formula]) -> Formula | None:
     return max((f for f in formulas if f.sure), key=lambda f: f.share, default=None)
 
 
-def formula(
-    train: RegressionData,
-    residual: Array,
-    holdout_data: RegressionData,
-    holdout_residual: Array,
-    equation: str,
-) -> Formula | None:
-    """Return a formula for an equation's residual, None where none removes `CLUES.shown_share`.
-
-    `residual` (M,) and `holdout_residual` are the whitened residuals of the training and held-out
-    rows under the model of `train`.
-    """
-    first = equation_rows(train, residual, equation)
-    second = equation_rows(holdout_data, holdout_residual, equation)
-    if first is None or second is None:
-        return None
-    names, fitted, checked = _candidate_monomials(train.rig, equation, first, second)
+def formula(sides: EquationSides) -> Formula | None:
+    """Return a formula for an equation's residual, None where none removes `CLUES.shown_share`."""
+    rig, equation, first, second = sides.rig, sides.equation, sides.first, sides.second
+    names, fitted, checked = _candidate_monomials(sides)
     both = EquationRows((), np.concatenate((first.residual, second.residual)), np.zeros((0, 0)))
     chosen = _selected_columns(np.concatenate((fitted, checked)), both)
     share = explained_share(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
@@ -65,7 +49,7 @@ def formula(
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
     if is_balance(equation, terms):
         return None
-    at_piston = equation.startswith("torque") and not train.rig.electric
+    at_piston = equation.startswith("torque") and not rig.electric
     return Formula(equation, terms, share, at_piston)
 
 
@@ -84,21 +68,15 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
     return kind == "torque" and any(cap[by] * rod[by] < 0.0 for by in cap.keys() & rod.keys())
 
 
-def _candidate_monomials(
-    rig: Rig, equation: str, fitted: EquationRows, judged: EquationRows
-) -> tuple[list[str], Array, Array]:  # fmt: skip
+def _candidate_monomials(sides: EquationSides) -> tuple[list[str], Array, Array]:
     """Return the monomials' names and columns on either side, nearly equal ones only once."""
-    joint = joint_of(equation)
-    every = [*fitted.parts, *judged.parts]
-    travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
-    made = [_monomials(rig, equation, p.signals, joint, travel) for p in every]
+    travel = sides.travel
+    made = [
+        _monomials(sides.rig, sides.equation, part.signals, sides.joint, travel)
+        for part in sides.parts
+    ]
     names = list(made[0])
-    stacks = [np.column_stack([m[n] for n in names]) for m in made]
-    count = len(fitted.parts)
-    first, second = (
-        whitened_columns(fitted, stacks[:count]),
-        whitened_columns(judged, stacks[count:]),
-    )
+    first, second = sides.columns([np.column_stack([m[n] for n in names]) for m in made])
     both = np.concatenate((first, second))
     size = np.linalg.norm(both, axis=0)
     kept: list[int] = []

@@ -156,14 +156,10 @@ def shared_rows(
     Many models share the terms that act on a family of rows. The columns of an effect that changes
     no signal are filtered separately and appended to the rows of the other terms.
     """
-    here = [
-        (u, _families(rig, u.term, cache))
-        for u in terms
-        if not is_hidden_by_lock(u.term, conditioned)
-    ]
+    here = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
     out: dict[str, Rows] = {}
     for family in conditioned.families:
-        acting = [u for u, families in here if family in families]
+        acting = acting_on(rig, here, family, cache)
         added = [u for u in acting if isinstance(u.term, Effect) and not changes_rows(u.term)]
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))

@@ -10,7 +10,6 @@ number of repeats: noise then adds 1 per row to a residual's energy, whatever un
 from __future__ import annotations
 
 import functools
-import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -38,7 +37,6 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

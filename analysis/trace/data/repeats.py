@@ -10,15 +10,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.trace.settings import DATA
 from rig.model import channels as ch
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from rig.model.units import plain
-
-Array = NDArray[np.float64]
 
 
 def with_other_motions_apart(runs: Sequence[Run]) -> tuple[list[Run], tuple[str, ...]]:

@@ -32,7 +32,6 @@ from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-Key = tuple[str, str]
 
 
 def flip_blocks(train_data: RegressionData) -> NDArray[np.int64]:

@@ -10,7 +10,6 @@ simpler than the real one.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -32,8 +31,6 @@ from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
 from analysis.trace.settings import TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.design.limits import Spectrum, forecast_of, used
 from analysis.design.moves import Tone, with_tones
@@ -27,7 +26,6 @@ from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.terms import baseline_of, known
@@ -43,8 +42,6 @@ from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import EXPERIMENT, SEARCH
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 TELL, COVER, SHOW = "tell apart", "cover", "make visible"
 LEAST_SEPARATION: Final = SEARCH.band  # over noise; less would be within the noise's band

@@ -126,8 +126,7 @@ def noise_band(data: RegressionData) -> NoiseBand:
     band: dict[str, float] = {}
     rows = data.row_counts
     for s in data.segments:
-        count = s.count
-        band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * count
+        band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * s.count
     return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
 
 

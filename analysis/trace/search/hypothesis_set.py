@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import logging
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 
@@ -58,7 +57,6 @@ from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 class HypothesisSet:

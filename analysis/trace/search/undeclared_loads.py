@@ -87,6 +87,10 @@ class _LoadRows:
         """Return what 1 kg adds (M,) where the records `loaded` (U,) carry it."""
         return np.where(loaded[self.unit], self.column, 0.0)
 
+    def chosen(self, loaded: Mask) -> frozenset[Key]:
+        """Return the records of a mask (U,)."""
+        return frozenset(key for key, here in zip(self.keys, loaded, strict=True) if here)
+
 
 def undeclared_load(records: TraceRuns, beside: Sequence[Effect] = ()) -> UndeclaredLoad | None:
     """Return the runs with the load that the torque rows show in some records, None if in none.
@@ -163,7 +167,7 @@ def fitted_load(rig: Rig, terms: Sequence[Used], runs: Sequence[Run]) -> LoadFit
     beta = dict(rows.data.beta)
     for name, step in zip(rows.data.names, change, strict=True):
         beta[name] = beta.get(name, 0.0) + float(step)
-    return LoadFit(mass, _chosen(rows, loaded), beta, agrees is not None)
+    return LoadFit(mass, rows.chosen(loaded), beta, agrees is not None)
 
 
 def loaded_records(
@@ -178,7 +182,7 @@ def loaded_records(
     for s in rows.data.segments if divided else ():
         asked[s.where] = ~in_judging_block(rows.data.source(s)[1].time)
     rows = replace(rows, column=rows.column * asked)
-    return _chosen(rows, _states(rows, rows.residual, load.mass))
+    return rows.chosen(_states(rows, rows.residual, load.mass))
 
 
 def with_loads(runs: Sequence[Run], loaded: frozenset[Key]) -> tuple[Run, ...]:
@@ -288,7 +292,3 @@ def _states(rows: _LoadRows, residual: Array, mass: float) -> Mask:
     """Return which records (U,) a residual (M,) without load fits better with the mass."""
     added = mass * rows.column
     return np.asarray(rows.sums(residual * added) > 0.5 * rows.sums(added * added))
-
-
-def _chosen(rows: _LoadRows, loaded: Mask) -> frozenset[Key]:
-    return frozenset(key for key, here in zip(rows.keys, loaded, strict=True) if here)

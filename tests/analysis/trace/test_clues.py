@@ -12,10 +12,11 @@ from analysis.signals.conditioning import Signals
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.clues.dependence import dependences
-from analysis.trace.clues.equation_rows import factor_of
+from analysis.trace.clues.equation_rows import EquationSides, equation_rows, factor_of
 from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared_signals
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.result import Dependence
+from analysis.trace.search.hypothesis import energy_above_noise
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import pair_of_runs
 
@@ -54,7 +55,13 @@ def clues(
 ) -> list[Dependence]:
     rng = np.random.default_rng(3)
     one, other = (residual(b, equation, force, rng) for b in boards)
-    return dependences(boards[0], one, boards[1], other, [equation])
+    first, second = (
+        equation_rows(b, r, equation) for b, r in zip(boards, (one, other), strict=True)
+    )
+    assert first is not None
+    assert second is not None
+    sides = EquationSides(boards[0].rig, equation, first, second)
+    return dependences([sides], {equation: max(0.0, energy_above_noise(boards[0], one)[equation])})
 
 
 def test_a_spring_that_hardens_moves_with_the_piston_alone(
