@@ -18,10 +18,14 @@ from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.nuisance_terms import temperature_terms
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.repeats import with_other_motions_apart
 from analysis.trace.data.set_aside import refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
-from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
+from analysis.trace.data.trace_rows import (
+    TraceRows,
+    TraceRuns,
+    trace_rows,
+    with_other_motions_apart,
+)
 from analysis.trace.finding import Finding
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
@@ -52,26 +56,14 @@ from analysis.trace.notes import (
     undetermined_notes,
     unseen_load_notes,
 )
-from analysis.trace.result import (
-    CLEAN,
-    CONFOUNDED,
-    EXPLAINED,
-    UNEXPLAINED,
-    Gate,
-    Trace,
-)
+from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, Gate, Trace
 from analysis.trace.search.geometry import geometry_for_smaller_set
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.settings import SEARCH, TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
-from rig.model.records import (
-    Run,
-    refuse_malformed,
-    with_common_bandwidth,
-    with_loads_stated,
-)
+from rig.model.records import Run, refuse_malformed, with_common_bandwidth, with_loads_stated
 from rig.model.rig import Rig
 
 # Share of the work done after each stage, as measured on six records: reported as progress.

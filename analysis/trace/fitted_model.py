@@ -1,4 +1,12 @@
-"""The model with the effects that a trace found, and the intervals of its parameters."""
+"""The model with the effects that a trace found, and the intervals of its parameters.
+
+Shapes of effects with a hidden state are searched by multiple shooting too, from those found with
+the rows (see `analysis.identify.output_error.hidden_states`). They are used where the model with
+them is closer to held-out records in simulation and the errors of held-out rows do not grow.
+Otherwise the shapes from the rows are kept, and the interval of each shape is extended to include
+both values: two estimates that differ by more than their errors show that the effect's form is
+simpler than the real one.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +16,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.effects.base import Effect, ordered
+from analysis.effects.base import Effect, ordered, shape_values
 from analysis.identify.coupled import coupled
 from analysis.identify.estimators.nuisance import BulkTemperature, DrivePath, SpoolPath
+from analysis.identify.output_error.hidden_states import (
+    ShootingEstimate,
+    completed,
+    hidden_effects,
+    shot,
+    window_error,
+)
 from analysis.identify.result import Identification, reciprocal_interval
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
@@ -21,10 +36,10 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.trace_rows import TraceRows, TraceRuns
 from analysis.trace.finding import Finding
 from analysis.trace.in_motion import equations_above_noise
+from analysis.trace.judge.held_out import rms_of
 from analysis.trace.judge.inference import with_form_error
 from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives
 from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
-from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
 from analysis.trace.next_experiment.detection_limits import (
     AbsorbedEffects,
     absorbed_effects,
@@ -35,8 +50,10 @@ from analysis.trace.notes import shared_parameters
 from analysis.trace.result import UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_fit import contribution, design_matrix, fit_coefficients
 from analysis.trace.search.geometry import shape_errors
-from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
+from analysis.trace.settings import TRACE
 from rig.model.records import Record, Run
+from rig.model.rig import Rig
 
 # Other estimators replace columns where noise in them matters; the trace compares residuals of
 # least squares only, before and after alike.
@@ -71,13 +88,11 @@ def model_with_effects(
     `before` is the baseline's model, `choosing_runs` and `candidates` are those of the search.
     """
     runs, rows = records.train, finding.rows
-    winner = finding.winner
-    after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
-    shooting = shoot_hidden_states(
-        runs, choosing_runs, after, rows.train, rows.unseen.choosing, winner
+    after, from_tolerances = _identified_with_effects(runs, finding.winner, before, rows)
+    winner, shots = shoot_hidden_states(
+        runs, choosing_runs, after, rows.train, rows.unseen.choosing, finding.winner
     )
-    if shooting.winner is not winner:
-        winner = shooting.winner
+    if winner is not finding.winner:
         after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
     from_tolerances |= shape_errors(rows.train, winner.fit)
     others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
@@ -96,7 +111,7 @@ def model_with_effects(
     by_alternatives = errors_by_alternatives(after, alternatives)
     after = with_errors(after, by_alternatives)
     effects = tuple(
-        with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shooting.shots)
+        with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shots)
         for f in finding.named
     )
     after = with_effect_values(after, effects)
@@ -211,3 +226,74 @@ def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> 
         for name, estimate in effect.parameters.items()
     }
     return replace(effect, parameters=parameters)
+
+
+def shoot_hidden_states(
+    runs: Sequence[Run],
+    holdout: Sequence[Run],
+    after: Model,
+    train_data: RegressionData,
+    holdout_data: RegressionData,
+    winner: Hypothesis,
+) -> tuple[Hypothesis, list[ShootingEstimate]]:
+    """Return the set after multiple shooting of its effects with a hidden state, and their shapes.
+
+    `after` is the identified model of the set `winner`; electric rigs are returned unchanged.
+    """
+    shots: list[ShootingEstimate] = []
+    if after.rig.electric or not hidden_effects(after):
+        return winner, shots
+    ready = completed([*runs, *holdout], after)
+    if ready is None:
+        return winner, shots
+    after = ready
+    for effect in hidden_effects(after):
+        shot_effect = shot(runs, after, effect)
+        if shot_effect is None:
+            continue
+        other = _with_shapes_of(after.rig, after.terms, effect, shot_effect)
+        before, now = (
+            window_error(holdout, model, effect) for model in (after, replace(after, terms=other))
+        )
+        fitted = fit_coefficients(
+            train_data, _with_shapes_of(after.rig, winner.fit.terms, effect, shot_effect)
+        )
+        rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
+        better = now < TRACE.shooting_ratio * before and all(
+            again[e] <= TRACE.shooting_cost * rows[e] for e in rows
+        )
+        shots.append(
+            replace(shot_effect, before=before, after=now, taken=better and shot_effect.settled)
+        )
+        if shots[-1].taken:
+            winner = replace(
+                winner, effects=_with_shapes_of(after.rig, winner.effects, effect, shot_effect),
+                fit=fitted, excess_energy=energy_above_noise(train_data, fitted.residual),
+            )  # fmt: skip
+            after = replace(after, terms=other)
+    return winner, shots
+
+
+def _with_shapes_of(
+    rig: Rig, terms: Sequence[Used], effect: Effect, shot: ShootingEstimate
+) -> tuple[Used, ...]:
+    """Return the terms with the shapes from shooting; shapes that it did not search are kept."""
+    found = {name: estimate.value for name, estimate in shot.shapes.items()}
+    return tuple(
+        Used(u.term, tuple({**shape_values(rig, u), **found}.values())) if u.term == effect else u
+        for u in terms
+    )
+
+
+def with_shots(judged: JudgedEffect, shots: Sequence[ShootingEstimate]) -> JudgedEffect:
+    """Return an effect with the shapes from shooting, or with intervals that include them."""
+    for result in shots:
+        if (result.name, result.where) == (judged.name, judged.where):
+            shapes = dict(result.shapes)
+            if not result.taken:
+                for name, new in result.shapes.items():
+                    rows = judged.parameters[name]
+                    low, high = min(rows.ci95[0], new.value), max(rows.ci95[1], new.value)
+                    shapes[name] = replace(rows, ci95=(low, high))
+            return replace(judged, parameters={**judged.parameters, **shapes}, shot=result)
+    return judged

@@ -12,13 +12,7 @@ from analysis.effects.free_flows import BulkModulusCurve
 from analysis.effects.free_forces import FrictionCurve, PositionForce
 from analysis.simulation.model import Model
 from analysis.terms.base import Used, equation
-from analysis.trace.data.noise_floor import (
-    NEIGHBOURS,
-    OTHER_STEPS,
-    PERIODS,
-    STATED,
-    UNSTATED,
-)
+from analysis.trace.data.noise_floor import NEIGHBOURS, OTHER_STEPS, PERIODS, STATED, UNSTATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.data.trace_rows import WHY_MASKED
 from analysis.trace.finding import Remainder

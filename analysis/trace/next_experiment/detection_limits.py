@@ -40,11 +40,7 @@ from analysis.trace.next_experiment.discrimination import (
 )
 from analysis.trace.result import DetectionLimit
 from analysis.trace.search.exact_fit import parameter_values, rebased, tangent
-from analysis.trace.search.hypothesis import (
-    Hypothesis,
-    is_special_case,
-    law_of,
-)
+from analysis.trace.search.hypothesis import Hypothesis, is_special_case, law_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.channels import place_in_words

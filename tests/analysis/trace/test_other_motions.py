@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from analysis.trace import engine
-from analysis.trace.data.repeats import with_other_motions_apart
+from analysis.trace.data.trace_rows import with_other_motions_apart
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace.gate_cases import at_joint_2

@@ -12,7 +12,7 @@ from analysis.simulation.model import Estimate, Model
 from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.engine import trace
-from analysis.trace.judge.shooting import with_shots
+from analysis.trace.fitted_model import with_shots
 from analysis.trace.result import Trace, to_json
 from analysis.trace.words import shot_in_words
 from rig.model.records import Run

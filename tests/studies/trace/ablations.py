@@ -18,7 +18,6 @@ from typing import Any, Final
 from analysis.trace import engine, fitted_model
 from analysis.trace.data import trace_rows
 from analysis.trace.judge import held_out
-from analysis.trace.judge.shooting import ShootingResult
 from analysis.trace.result import Trace
 from analysis.trace.search import hypothesis_set
 from rig.model.records import Record, Run
@@ -157,7 +156,7 @@ def decisions_only(kept: Kept) -> Iterator[None]:
         (
             fitted_model,
             "shoot_hidden_states",
-            lambda runs, holdout, after, train, judged, one: ShootingResult(one, ()),
+            lambda runs, holdout, after, train, judged, one: (one, []),
         ),
         (engine, "clues_to", lambda *_: ((), ())),
         (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),
