@@ -16,6 +16,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, joint_of
 from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import catalogue, free_mechanisms
+from analysis.trace.data.conditioned_record import moving_filtering
 from analysis.trace.data.nuisance_terms import temperature_terms
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import refuse_repeated_records
@@ -30,7 +31,6 @@ from analysis.trace.finding import Finding
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
     find,
-    fitted_in_motion,
     held_out_ratios,
     joints_with_friction,
     rest_phase_notes,
@@ -351,7 +351,9 @@ def _final_verdict(
     )
     joints = joints_with_friction(winner, kept)
     if joints and not finding.rows.filtering.in_motion:
-        rows, hypotheses, moving = fitted_in_motion(records, winner, joints)
+        rows = trace_rows(records, moving_filtering(joints))
+        hypotheses = HypothesisSet(rows.train, [])
+        moving = hypotheses.refined(winner.effects)
         if not judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
             kept, words = set(), rest_phase_notes(joints, included=True)
     return (UNEXPLAINED if kept else finding.verdict), words

@@ -24,7 +24,6 @@ from analysis.trace.notes import WITHOUT_RESTS
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_fit import design_matrix
 from analysis.trace.search.hypothesis import Hypothesis
-from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
 
 
@@ -241,18 +240,6 @@ def held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
 def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:
     """Return the joints (0-based) in whose torque balance, one of `equations`, friction acts."""
     return {e.joint for e in _friction_in(winner) if equation("torque", e.joint) in equations}
-
-
-def fitted_in_motion(
-    records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
-) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
-    """Return rows that are weighted by the speed of `joints` (0-based), and the set fitted to them.
-
-    The middle element is the collection of sets that the fitted set belongs to.
-    """
-    rows = trace_rows(records, moving_filtering(joints))
-    hypotheses = HypothesisSet(rows.train, [])
-    return rows, hypotheses, hypotheses.refined(winner.effects)
 
 
 def rest_phase_notes(joints: Iterable[int], included: bool) -> list[str]:

@@ -79,14 +79,6 @@ class Floor:
         return replace(self, noise=noise, repeatable=repeatable, count=1, source=source)
 
 
-def noise_and_repeatable(repeats: Array) -> tuple[float, float]:
-    """Return noise and repeatable rms of residuals (n, m) of n repeats."""
-    n = len(repeats)
-    noise2 = float(np.mean(np.var(repeats, axis=0, ddof=1)))
-    mean2 = float(np.mean(np.mean(repeats, axis=0) ** 2))
-    return float(np.sqrt(noise2)), float(np.sqrt(max(0.0, mean2 - noise2 / n)))
-
-
 def floors(
     rig: Rig,
     terms: Sequence[Used],
@@ -140,9 +132,11 @@ def _floor(
     floor = Floor(conditioned.group, parts[0].equation, stated, 0.0, total, 1, STATED, stated)
     table, source = stacked_repeats(conditioned, parts, residual)
     if table is not None:
-        noise, repeatable = noise_and_repeatable(table)
+        noise2 = float(np.mean(np.var(table, axis=0, ddof=1)))
+        mean2 = float(np.mean(np.mean(table, axis=0) ** 2))
+        repeatable = float(np.sqrt(max(0.0, mean2 - noise2 / len(table))))
         rounded = min(repeatable, rounding)
-        noise = max(float(np.hypot(noise, rounded)), DATA.least_noise * stated)
+        noise = max(float(np.hypot(np.sqrt(noise2), rounded)), DATA.least_noise * stated)
         repeatable = float(np.sqrt(repeatable**2 - rounded**2))
         return replace(floor, noise=noise, repeatable=repeatable, count=len(table), source=source)
     near = noise_by_neighbours(conditioned, parts[0], residual[0]) if len(parts) == 1 else None
