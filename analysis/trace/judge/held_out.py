@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -130,8 +130,9 @@ def errors(
     """
     repeats = Counter(c.group for c in members)
     compared: list[dict[str, Rows]] = []
-    first: list[dict[str, Rows]] = []
-    other: list[dict[str, Rows]] = []
+    first: list[tuple[str, Rows]] = []
+    other: list[tuple[str, Rows]] = []
+    groups: list[Group] = []
     for c in members:
         bare = replace(c, filtering=replace(c.filtering, lines=()))
         whole = model_rows(rig, after.terms, c)
@@ -139,52 +140,44 @@ def errors(
         if c.group in divided:
             sides = [{e: judging_rows(r) for e, r in rows.items()} for rows in sides]
         compared.append(sides[1] if repeats[c.group] > 1 else whole)
+        groups += [c.group] * len(whole)
         for side, rows_of in zip((first, other), sides, strict=True):
-            side.append(
-                {e: rows_within(rig, (curves or {}).get(e, ()), c, r) for e, r in rows_of.items()}
-            )
+            side += [
+                (e, rows_within(rig, (curves or {}).get(e, ()), c, r)) for e, r in rows_of.items()
+            ]
     split = floors(rig, after.terms, members, compared, after.beta, others, noise_ratio)
     floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
-    for conditioned, rows_of in zip(members, other, strict=True):
-        for equation, rows in rows_of.items():
-            noise.setdefault(equation, []).append(floor[conditioned.group, equation])
-            counts.setdefault(equation, []).append(len(rows.rhs))
+    for group, (e, rows) in zip(groups, other, strict=True):
+        noise.setdefault(e, []).append(floor[group, e])
+        counts.setdefault(e, []).append(max(len(rows.rhs), 1))
     return Errors(
         {
-            e: float(np.sqrt(np.average(np.square(noise[e]), weights=np.maximum(counts[e], 1))))
-            for e in sorted(noise)
+            e: float(np.sqrt(np.average(np.square(own), weights=counts[e])))
+            for e, own in sorted(noise.items())
         },
-        _by_equation(first, lambda rows: rows.rhs),
-        _by_equation(first, lambda rows: row_residual(rows, before.beta)),
-        _by_equation(other, lambda rows: row_residual(rows, after.beta)),
+        _rms_by_equation((e, rows.rhs) for e, rows in first),
+        _rms_by_equation((e, row_residual(rows, before.beta)) for e, rows in first),
+        _rms_by_equation((e, row_residual(rows, after.beta)) for e, rows in other),
     )
-
-
-def _by_equation(
-    built: Sequence[Mapping[str, Rows]], part: Callable[[Rows], Array]
-) -> dict[str, float]:
-    """Return the rms of `part(rows)` over all records, by equation."""
-    collected: dict[str, list[Array]] = {}
-    for rows_of in built:
-        for equation, rows in rows_of.items():
-            collected.setdefault(equation, []).append(part(rows))
-    return {e: _rms(parts) for e, parts in sorted(collected.items())}
 
 
 def rms_of(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
     """Return the rms of every equation's held-out residual, SI, repeats averaged."""
     rest = held_out_residual(holdout_data, model)
+    return _rms_by_equation(
+        (s.equation, rest[s.where] * s.noise / np.sqrt(s.repeats)) for s in holdout_data.segments
+    )
+
+
+def _rms_by_equation(parts: Iterable[tuple[str, Array]]) -> dict[str, float]:
+    """Return the rms of each equation's values over all its parts, NaN without values."""
     collected: dict[str, list[Array]] = {}
-    for s in holdout_data.segments:
-        collected.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
-    return {e: _rms(parts) for e, parts in sorted(collected.items())}
-
-
-def _rms(parts: Sequence[Array]) -> float:
-    joined = np.concatenate(parts)
-    return float(np.sqrt(np.mean(joined**2))) if len(joined) else float("nan")
+    for equation, part in parts:
+        collected.setdefault(equation, []).append(part)
+    joined = {e: np.concatenate(own) for e, own in sorted(collected.items())}
+    return {e: float(np.sqrt(np.mean(x**2))) if len(x) else math.nan for e, x in joined.items()}
 
 
 @dataclass(frozen=True)
@@ -257,21 +250,14 @@ def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRunErrors:
         results = validate(model, holdout)
     except InputError:  # a parameter that is not identified: there is no simulation
         return FreeRunErrors({}, {}, {})
-    fits: dict[str, list[float]] = {}
-    squares: dict[str, list[float]] = {}
-    windows: dict[str, list[float]] = {}
-    for r in results:
-        for channel in r.fit:
-            lost = bool(r.failure)
-            fits.setdefault(channel, []).append(float("nan") if lost else r.fit[channel])
-            squares.setdefault(channel, []).append(float("nan") if lost else r.rmse[channel] ** 2)
-            windows.setdefault(channel, []).append(r.window_rmse[channel] ** 2)
-    return FreeRunErrors(
-        {c: float(np.mean(v)) for c, v in sorted(fits.items())},
-        {c: float(np.sqrt(np.mean(v))) for c, v in sorted(squares.items())},
-        {c: float(np.sqrt(np.mean(v))) for c, v in sorted(windows.items())},
-        next((r for r in results if not r.failure), None),
-    )
+    fit, rmse, windows = {}, {}, {}
+    for c in sorted({channel for r in results for channel in r.fit}):
+        own = [r for r in results if c in r.fit]
+        lost = np.array([math.nan if r.failure else 1.0 for r in own])
+        fit[c] = float(np.mean(lost * [r.fit[c] for r in own]))
+        rmse[c] = float(np.sqrt(np.mean(lost * [r.rmse[c] ** 2 for r in own])))
+        windows[c] = float(np.sqrt(np.mean([r.window_rmse[c] ** 2 for r in own])))
+    return FreeRunErrors(fit, rmse, windows, next((r for r in results if not r.failure), None))
 
 
 def removed_energy(winner: Hypothesis, alternative: Hypothesis) -> dict[str, float]:
