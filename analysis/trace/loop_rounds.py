@@ -7,6 +7,7 @@ other, per new row, is given as an rms in units of one record's noise.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -76,9 +77,13 @@ def achieved(
     terms = base_terms(rig, [*before, new])
     both = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
     if experiment["kind"] == SHOW:
-        rows = ComparisonRows(both)
-        asked = [_visibility_question(q["one"], rig) for q in experiment["questions"]]
-        return min(present_separation(q, rows) for q in asked)
+        separations = []
+        for question in experiment["questions"]:
+            (used,) = effects_of(question["one"])
+            shown = smallest_effect(effect_in(used), rig) or Explanation((used,))
+            asked = OpenQuestion(shown, Explanation(), False)
+            separations.append(present_separation(asked, ComparisonRows(both)))
+        return min(separations)
     old = regression_data(rig, terms, conditioned_records(rig, before))
     return min(
         _question_separation(old, both, terms, len(before), q["one"], q["other"])
@@ -91,31 +96,22 @@ def _question_separation(
     first: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
     """Return one question's separation: the largest rms difference per new row of an equation."""
-    gap = {}
-    for train_data in (old, both):
-        residual = [
-            refine(train_data, (*terms, *effects_of(side))).residual for side in (first, other)
-        ]
-        ends = [energy_above_noise(train_data, part) for part in residual]
-        gap[train_data is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
-    rows: dict[str, int] = {}
+
+    def gap(data: RegressionData) -> dict[str, float]:
+        """Return the energy above noise that `other` leaves more than `first`, by equation."""
+        one, two = (
+            energy_above_noise(data, refine(data, (*terms, *effects_of(side))).residual)
+            for side in (first, other)
+        )
+        return {e: two[e] - one[e] for e in one}
+
+    before, after = gap(old), gap(both)
+    rows: Counter[str] = Counter()
     for s in both.segments:
         if s.group[0] == index:
-            count = s.count * s.repeats
-            rows[s.equation] = rows.get(s.equation, 0) + count
-    return max(
-        (
-            float(np.sqrt(abs(gap[True][e] - gap[False].get(e, 0.0)) / count))
-            for e, count in rows.items()
-        ),
-        default=0.0,
-    )
-
-
-def _visibility_question(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
-    (used,) = effects_of(effects)
-    shown = smallest_effect(effect_in(used), rig) or Explanation((used,))
-    return OpenQuestion(shown, Explanation(), False)
+            rows[s.equation] += s.count * s.repeats
+    energy = {e: abs(after[e] - before.get(e, 0.0)) for e in rows}
+    return max((float(np.sqrt(energy[e] / count)) for e, count in rows.items()), default=0.0)
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:

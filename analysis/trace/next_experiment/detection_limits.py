@@ -54,11 +54,11 @@ Array = NDArray[np.float64]
 class AbsorbedEffects:
     """Further effects at their smallest sizes of interest, beside a set.
 
-    What each adds to the whitened `rows` is `shown` (M, n) in the residual and `taken` (k, n) in
-    the coefficients and shapes `names` of the set.
+    What each adds to the whitened rows of `data` is `shown` (M, n) in the residual and `taken`
+    (k, n) in the coefficients and shapes `names` of the set.
     """
 
-    rows: ComparisonRows
+    data: RegressionData
     explanations: Sequence[Explanation]
     names: Sequence[str]
     taken: Array
@@ -87,22 +87,25 @@ def absorbed_effects(
         and not (effect.beside and effect.joint in in_motion)
         and not any(is_special_case(effect, other) for other in named)
     ]  # fmt: skip
-    fitted = _fitted_instead(hypotheses, winner)
-    small = [
-        explanation
-        for effect in asked
-        if (explanation := smallest_effect(effect, train_data.rig, fitted.get(effect, ())))
-        is not None
-    ]
+    fitted = {
+        effect_in(other): other.shape
+        for own in winner.effects for _, other in hypotheses.replacements(winner, own)
+        if law_of(effect_in(other)) == law_of(effect_in(own))
+    }  # fmt: skip
+    tried = [smallest_effect(effect, train_data.rig, fitted.get(effect, ())) for effect in asked]
+    small = [explanation for explanation in tried if explanation is not None]
     if not small:
         return None
     names, X = tangent(train_data, winner.fit)
     added = np.column_stack([rows.prediction(explanation) for explanation in small])
     pairs = _pairs_of_chambers(small)
-    both = [_together(small[cap], small[rod]) for cap, rod in pairs]
+    both = [
+        Explanation(small[cap].effects + small[rod].effects, {**small[cap].beta, **small[rod].beta})
+        for cap, rod in pairs
+    ]
     added = np.column_stack((added, *(added[:, [cap, rod]].sum(axis=1) for cap, rod in pairs)))
     taken = shortest(X, added, TRACE.rank_limit)
-    return AbsorbedEffects(rows, [*small, *both], names, taken, added - X @ taken)
+    return AbsorbedEffects(rows.train_data, [*small, *both], names, taken, added - X @ taken)
 
 
 def _pairs_of_chambers(single: Sequence[Explanation]) -> list[tuple[int, int]]:
@@ -111,16 +114,12 @@ def _pairs_of_chambers(single: Sequence[Explanation]) -> list[tuple[int, int]]:
     Both chambers' pressures read against vacuum, or both pipes longer than stated, are as likely as
     one alone, and the parameters may absorb more of the two.
     """
-    at = {(e.effects[0].term.name, e.effects[0].term.where): k for k, e in enumerate(single)}
+    at = {e.effects[0].term.key: k for k, e in enumerate(single)}
     return [
         (k, at[name, where.removesuffix("cap") + "rod"])
         for (name, where), k in at.items()
         if where.endswith(" cap") and (name, where.removesuffix("cap") + "rod") in at
     ]
-
-
-def _together(cap: Explanation, rod: Explanation) -> Explanation:
-    return Explanation((*cap.effects, *rod.effects), {**cap.beta, **rod.beta})
 
 
 def detection_limits(
@@ -134,11 +133,15 @@ def detection_limits(
     """
     if absorbed is None:
         return []
-    data = absorbed.rows.train_data
+    data, residual = absorbed.data, winner.fit.residual
     known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
     found = []
     for k, explanation in enumerate(absorbed.explanations):
-        times = _largest_multiple(absorbed.shown[:, k], winner.fit.residual)
+        shown = absorbed.shown[:, k]
+        energy, times = float(shown @ shown), 0.0
+        if energy > 0.0:  # else nothing remains in the residual, and no size can be stated
+            most_noise = IDENTIFY.normal_quantile * energy**0.5
+            times = float((abs(shown @ residual) + most_noise) / energy)
         moved = dict(zip(absorbed.names, times * absorbed.taken[:, k], strict=True))
         shifts = _parameter_shifts(data, moved, known)
         most = max(shifts, key=lambda name: shifts[name], default="")
@@ -166,31 +169,6 @@ def _places(explanation: Explanation) -> tuple[str, str]:
         return first["where"], first["at"]
     both = f"{first['at'].removesuffix('cap')}both chambers"
     return both, both
-
-
-def _fitted_instead(
-    hypotheses: HypothesisSet, winner: Hypothesis
-) -> dict[Effect, tuple[float, ...]]:
-    """Return the fitted shapes of other names of a set's laws, each in place of the set's name."""
-    out: dict[Effect, tuple[float, ...]] = {}
-    for own in winner.effects:
-        for _, other in hypotheses.replacements(winner, own):
-            effect = effect_in(other)
-            if law_of(effect) == law_of(effect_in(own)):
-                out[effect] = other.shape
-    return out
-
-
-def _largest_multiple(shown: Array, residual: Array) -> float:
-    """Return the largest size of an effect over its smallest size of interest.
-
-    `shown` (M,) is the part of the effect at its smallest size that remains in the residual; 0 is
-    returned where nothing remains, since no size can then be stated.
-    """
-    energy = float(shown @ shown)
-    if not energy > 0.0:
-        return 0.0
-    return float((abs(shown @ residual) + IDENTIFY.normal_quantile * energy**0.5) / energy)
 
 
 def _parameter_shifts(
