@@ -1,10 +1,4 @@
-"""Rows of conditioned records under a model, and columns of candidates for them.
-
-Effects that change the signals (`prepare`) enter as a pseudo-column: with X, y the rows before and
-X', y' the rows after the change, and beta the present coefficients,
- d = (y - X beta) - (y' - X' beta),
-which to first order in the change is what the effect adds to the residual.
-"""
+"""Rows of conditioned records under a model; parts that many models share are computed once."""
 
 from __future__ import annotations
 
@@ -24,9 +18,7 @@ from analysis.regression.rows import (
     TermPart,
     assembled,
     default_filtering,
-    in_common,
     low_passed,
-    matrix_of,
     parameters_of,
     places_of,
     record_rows,
@@ -176,7 +168,7 @@ def shared_rows(
         rows = bare
         for u in added:
             more = cache.rows.get(
-                (*key, u), partial(_added_columns, rig, own, prepared, bare, u, cache)
+                (*key, u), partial(added_columns, rig, own, prepared, bare, u, cache)
             )
             rows = {e: _with_columns(r, more.get(e, {})) for e, r in rows.items()}
         out |= rows
@@ -207,7 +199,7 @@ def _term_part(
     return part
 
 
-def _added_columns(
+def added_columns(
     rig: Rig, conditioned: ConditionedRecord, prepared: Callable[[], Signals],
     rows: Mapping[str, Rows], used: Used, cache: RowCache,
 ) -> dict[str, dict[str, Array]]:  # fmt: skip
@@ -227,48 +219,6 @@ def _with_columns(rows: Rows, columns: Mapping[str, Array]) -> Rows:
         return rows
     matrix = np.column_stack([rows.matrix, *columns.values()])
     return replace(rows, names=(*rows.names, *columns), matrix=matrix)
-
-
-def candidate_columns(
-    rig: Rig,
-    terms: Sequence[Used],
-    conditioned: ConditionedRecord,
-    prepared: Signals,
-    rows: Mapping[str, Rows],
-    beta: Mapping[str, float],
-    used: Used,
-    cache: RowCache,
-) -> dict[str, dict[str, Array]]:
-    """Return the columns that a candidate adds to a record's rows: equation -> name -> column (m,).
-
-    `prepared` and `rows` are the signals and rows under `terms`, `beta` the rows' coefficients
-    (1/b for b). The pseudo-column of a change of signals (see the module) is named ''.
-    """
-    if not changes_rows(used.term):
-        return _added_columns(rig, conditioned, lambda: prepared, rows, used, cache)
-    acting = _families(rig, used.term, cache)
-    families = tuple(f for f in conditioned.families if f in acting)
-    changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), cache)
-    own = [c.parameter for c in used.term.coefficients(rig)]
-    out: dict[str, dict[str, Array]] = {}
-    for name, after in changed.items():
-        if name not in rows:
-            continue
-        before = rows[name]
-        here, there = in_common(before, after)
-        # Column by column, so that an unchanged column gives a difference of exactly 0.
-        moved = matrix_of(after, before.names)[there] - before.matrix[here]
-        side = after.rhs[there] - before.rhs[here]
-        columns = {"": np.zeros(len(before.rhs))}
-        columns[""][here] = moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side
-        for k, parameter in enumerate(after.names):
-            if parameter in own and np.any(after.matrix[:, k]):
-                columns[parameter] = np.zeros(len(before.rhs))
-                columns[parameter][here] = after.matrix[there, k]
-        columns = {key: column for key, column in columns.items() if np.any(column)}
-        if columns:
-            out[name] = columns
-    return out
 
 
 def row_residual(rows: Rows, beta: Mapping[str, float]) -> Array:

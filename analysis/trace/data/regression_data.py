@@ -20,16 +20,19 @@ from numpy.typing import NDArray
 from analysis.effects.base import Evidence
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
-from analysis.regression.rows import Rows, matrix_of
+from analysis.regression.rows import Rows, in_common, matrix_of
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Used, family_of
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import (
-    candidate_columns,
+    acting_on,
+    added_columns,
+    changes_rows,
     is_hidden_by_lock,
     model_rows,
     prepared_signals,
     row_residual,
+    shared_rows,
 )
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.settings import TRACE
@@ -292,6 +295,47 @@ def variant_columns(
     return [entry for entry in columns if entry is not None]
 
 
+def candidate_columns(
+    data: RegressionData, conditioned: ConditionedRecord, prepared: Signals,
+    rows: Mapping[str, Rows], used: Used,
+) -> dict[str, dict[str, Array]]:  # fmt: skip
+    """Return the columns that a candidate adds to a record's rows: equation -> name -> column (m,).
+
+    `prepared` and `rows` are the record's signals and rows under the model of `data`. It has none
+    where the lock of its joint hides it. Effects that change the signals (`prepare`) enter as a
+    pseudo-column, named '': with X, y the rows before and X', y' the rows after the change, and
+    beta the present coefficients,
+     d = (y - X beta) - (y' - X' beta),
+    which to first order in the change is what the effect adds to the residual.
+    """
+    if is_hidden_by_lock(used.term, conditioned):
+        return {}
+    if not changes_rows(used.term):
+        return added_columns(data.rig, conditioned, lambda: prepared, rows, used, data.cache)
+    families = tuple(f for f in conditioned.families if acting_on(data.rig, (used,), f, data.cache))
+    own = [c.parameter for c in used.term.coefficients(data.rig)]
+    of_families = replace(conditioned, families=families)
+    out: dict[str, dict[str, Array]] = {}
+    for name, after in shared_rows(data.rig, (*data.terms, used), of_families, data.cache).items():
+        if name not in rows:
+            continue
+        before = rows[name]
+        here, there = in_common(before, after)
+        # Column by column, so that an unchanged column gives a difference of exactly 0.
+        moved = matrix_of(after, before.names)[there] - before.matrix[here]
+        side = after.rhs[there] - before.rhs[here]
+        columns = {"": np.zeros(len(before.rhs))}
+        columns[""][here] = moved @ np.array([data.beta.get(n, 0.0) for n in before.names]) - side
+        for k, parameter in enumerate(after.names):
+            if parameter in own and np.any(after.matrix[:, k]):
+                columns[parameter] = np.zeros(len(before.rhs))
+                columns[parameter][here] = after.matrix[there, k]
+        columns = {key: column for key, column in columns.items() if np.any(column)}
+        if columns:
+            out[name] = columns
+    return out
+
+
 def _columns_of(
     data: RegressionData, records: Sequence[ConditionedRecord], segments: Sequence[Segment],
     used: Used, seen: Sequence[Signals],
@@ -300,13 +344,8 @@ def _columns_of(
     columns: dict[str, Array] = {}
     touched = set()
     M = data.base.shape[0]
-    for index, conditioned in enumerate(records):
-        if is_hidden_by_lock(used.term, conditioned):
-            continue
-        candidate = candidate_columns(
-            data.rig, data.terms, conditioned, seen[index], data.rows[index], data.beta,
-            used, data.cache,
-        )  # fmt: skip
+    for conditioned, signals, rows in zip(records, seen, data.rows, strict=True):
+        candidate = candidate_columns(data, conditioned, signals, rows, used)
         for segment in segments:
             if segment.group == conditioned.group and segment.equation in candidate:
                 touched.add(segment.equation)

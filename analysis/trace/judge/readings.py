@@ -138,8 +138,11 @@ def _needs_richer(
     if added:
         return all(_is_determined(hypotheses, other, u) for u in fresh)
     # A law leaves form error beside noise: a number that removes little may only adapt the form.
-    return removed > TRACE.richer_name_share * hypothesis.total or all(
-        _is_distinct(hypotheses, other, u) for u in fresh
+    if removed > TRACE.richer_name_share * hypothesis.total:
+        return True
+    return all(
+        effect_in(u).distinct({n: e.ci95 for n, e in _numbers(hypotheses, other, u).items()})
+        for u in fresh
     )
 
 
@@ -154,12 +157,6 @@ def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used
     numbers = _numbers(hypotheses, hypothesis, used)
     intervals = [e.ci95 for name, e in numbers.items() if name not in details]
     return all(not low <= 0.0 <= high for low, high in intervals)
-
-
-def _is_distinct(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> bool:
-    """Return whether an effect's 95 % intervals exclude those that it includes."""
-    numbers = _numbers(hypotheses, hypothesis, used)
-    return effect_in(used).distinct({name: e.ci95 for name, e in numbers.items()})
 
 
 def _numbers(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> dict[str, Estimate]:

@@ -171,27 +171,19 @@ def best_tied_set(
 ) -> Hypothesis:  # fmt: skip
     """Return the winner, or the set with a tied rival that training and held-out rows prefer.
 
-    A richer name of a law is left out: `readings.best_readings` has found that none is needed.
-    """
-    tied = [o for o in tied_sets(hypotheses, winner, effects) if not _is_richer(o, winner)]
-    best = min(tied, key=lambda o: _cost(o, holdout_data), default=winner)
-    return best if _is_cheaper(best, winner, holdout_data) else winner
-
-
-def _is_richer(hypothesis: Hypothesis, winner: Hypothesis) -> bool:
-    """Return whether a set has a richer name of one of the winner's laws."""
-    named, others = (effects_among(one.effects) for one in (winner, hypothesis))
-    return any(is_special_case(effect, other) for effect in named for other in others)
-
-
-def _is_cheaper(hypothesis: Hypothesis, winner: Hypothesis, holdout_data: RegressionData) -> bool:
-    """Return whether training and held-out rows prefer a set to the winner.
-
     It leaves less energy by more than `SEARCH.number_price`, and by that for each further effect
-    and free number: the search saw the training rows only.
+    and free number: the search saw the training rows only. A richer name of a law of the winner is
+    left out: `readings.best_readings` has found that none is needed.
     """
-    cost = _cost(hypothesis, holdout_data)
-    return cost < _cost(winner, holdout_data) - SEARCH.number_price
+
+    def is_richer(hypothesis: Hypothesis) -> bool:
+        named, others = effects_among(winner.effects), effects_among(hypothesis.effects)
+        return any(is_special_case(effect, other) for effect in named for other in others)
+
+    tied = [o for o in tied_sets(hypotheses, winner, effects) if not is_richer(o)]
+    best = min(tied, key=lambda o: _cost(o, holdout_data), default=winner)
+    least = _cost(winner, holdout_data) - SEARCH.number_price
+    return best if _cost(best, holdout_data) < least else winner
 
 
 def _cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:

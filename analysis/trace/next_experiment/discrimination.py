@@ -15,7 +15,7 @@ equation where it is largest. The criterion is T-optimality (Atkinson and Fedoro
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -29,14 +29,16 @@ from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import (
-    candidate_columns,
-    is_hidden_by_lock,
     model_rows,
     prepared_signals,
     trace_filtering,
 )
 from analysis.trace.data.noise_floor import stated_noise
-from analysis.trace.data.regression_data import RegressionData, variant_columns
+from analysis.trace.data.regression_data import (
+    RegressionData,
+    candidate_columns,
+    variant_columns,
+)
 from analysis.trace.next_experiment.excitations import CandidateExcitation
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import EXPERIMENT
@@ -103,25 +105,20 @@ class OpenQuestion:
 
 @dataclass(frozen=True)
 class MeasurementView:
-    """An excitation's rows on the twin under the baseline, and the `noise` by equation, SI."""
+    """An excitation's rows on the twin under the baseline, and the `noise` by equation, SI.
 
-    rig: Rig
-    terms: tuple[Used, ...]
-    beta: Mapping[str, float]
+    `train_data` are the training rows, of the rig with channels sampled at the tick (the twin's).
+    """
+
+    train_data: RegressionData
     conditioned: ConditionedRecord
     signals: Signals
     rows: Mapping[str, Rows]
     noise: Mapping[str, float]
-    cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
         """Return what an effect would add in SI: equation -> name -> column (m,)."""
-        if is_hidden_by_lock(used.term, self.conditioned):
-            return {}
-        return candidate_columns(
-            self.rig, self.terms, self.conditioned, self.signals, self.rows, self.beta, used,
-            self.cache,
-        )  # fmt: skip
+        return candidate_columns(self.train_data, self.conditioned, self.signals, self.rows, used)
 
     def weight(self, equation: str) -> float:
         """Return the factor that whitens an equation's averaged rows."""
@@ -162,9 +159,8 @@ def measurement_view(
     stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
     signals = prepared_signals(rig, train_data.terms, conditioned)
-    return MeasurementView(
-        rig, tuple(train_data.terms), train_data.beta, conditioned, signals, rows, noise
-    )
+    model = replace(train_data, rig=rig, cache=RowCache())
+    return MeasurementView(model, conditioned, signals, rows, noise)
 
 
 class ComparisonRows:

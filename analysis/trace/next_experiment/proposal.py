@@ -340,7 +340,7 @@ def _range_ratio(view: MeasurementView, joint: int, name: str, low: float, high:
     """Return a variable's range in records and candidate together over that in the records."""
     if joint + 1 in view.conditioned.record.locked:
         return 0.0
-    least, most = np.percentile(variables(view.rig, view.signals, joint)[name], [1, 99])
+    least, most = np.percentile(variables(view.train_data.rig, view.signals, joint)[name], [1, 99])
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 
