@@ -19,14 +19,9 @@ from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.conditioned_record import moving_filtering
 from analysis.trace.data.nuisance_terms import temperature_terms
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.set_aside import refuse_repeated_records
+from analysis.trace.data.set_aside import TraceRows, refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
-from analysis.trace.data.trace_rows import (
-    TraceRows,
-    TraceRuns,
-    trace_rows,
-    with_other_motions_apart,
-)
+from analysis.trace.data.trace_rows import TraceRuns, trace_rows, with_other_motions_apart
 from analysis.trace.finding import Finding
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import (
@@ -204,7 +199,7 @@ def _with_free_runs(
     before = prepared.baseline
 
     def fit(finding: Finding) -> FittedModel:
-        choosing, named = prepared.rows.unseen.choosing_runs, prepared.candidates.named
+        choosing, named = prepared.rows.choosing_runs, prepared.candidates.named
         return model_with_effects(prepared.records, choosing, before, named, finding)
 
     fitted = fit(finding)
@@ -237,12 +232,12 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
     done(JUDGED)
     records = replace(prepared.records, lines=finding.rows.filtering.lines)
     finding, fitted, free_runs = _with_free_runs(prepared, records, finding)
-    hypotheses, train_data, unseen = finding.hypotheses, finding.rows.train, finding.rows.unseen
+    hypotheses, rows, train_data = finding.hypotheses, finding.rows, finding.rows.train
     lines = spectral_lines(train_data, finding.winner.fit.residual)
     moves, formulas = (
         ((), ())
         if finding.verdict in (CLEAN, EXPLAINED) or finding.held_out_only
-        else clues_to(train_data, unseen.choosing, finding.winner, lines)
+        else clues_to(train_data, rows.choosing, finding.winner, lines)
     )
     further = (
         propose(hypotheses, finding.winner, finding.named, finding.verdict, moves)
@@ -254,12 +249,12 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
         lines = spectral_lines(train_data, winner.fit.residual)
     # Everything is chosen. From here on the judging rows are read, and nothing is chosen by them.
     first, last = (
-        held_out.refitted_to_held_out(unseen.judging, fit)
+        held_out.refitted_to_held_out(rows.judging, fit)
         for fit in (hypotheses.empty.fit, winner.fit)
     )
-    curves = CurveRange(unseen.judging, winner.fit).limits
+    curves = CurveRange(rows.judging, winner.fit).limits
     error = held_out.errors(
-        records.rig, unseen.members, first, last, unseen.divided, curves, train_data.floors,
+        records.rig, rows.members, first, last, rows.divided, curves, train_data.floors,
         records.noise_ratio,
     )  # fmt: skip
     verdict, kept = _final_verdict(records, finding, winner)
@@ -271,8 +266,8 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
         hidden = detection_limits(absorbed, winner, after)
     notes = [
         *unseen_load_notes(records.train, records.unseen),
-        *prepared.rows.unseen.notes,
-        *evidence_notes(prepared.rows.train, prepared.rows.unseen.choosing),
+        *prepared.rows.notes,
+        *evidence_notes(prepared.rows.train, prepared.rows.choosing),
         *prepared.notes,
         *unrepeated_notes(train_data),
         *finding.notes,
@@ -346,15 +341,13 @@ def _final_verdict(
     """
     if finding.verdict == UNEXPLAINED:
         return UNEXPLAINED, []
-    kept, words = judging_rows_above_band(
-        finding.rows.unseen.judging, finding.hypotheses.empty, winner
-    )
+    kept, words = judging_rows_above_band(finding.rows.judging, finding.hypotheses.empty, winner)
     joints = joints_with_friction(winner, kept)
     if joints and not finding.rows.filtering.in_motion:
         rows = trace_rows(records, moving_filtering(joints))
         hypotheses = HypothesisSet(rows.train, [])
         moving = hypotheses.refined(winner.effects)
-        if not judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
+        if not judging_rows_above_band(rows.judging, hypotheses.empty, moving)[0]:
             kept, words = set(), rest_phase_notes(joints, included=True)
     return (UNEXPLAINED if kept else finding.verdict), words
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.trace_rows import TraceRows
+from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.judge import gates
 from analysis.trace.result import UNEXPLAINED, Gate, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
@@ -137,6 +137,6 @@ def without_unnamed_effects(finding: Finding) -> Finding:
     if len(kept) == len(winner.effects):
         return finding
     winner = hypotheses.refined(kept)
-    left = remainders(hypotheses, winner, finding.rows.unseen.choosing) if kept else ()
+    left = remainders(hypotheses, winner, finding.rows.choosing) if kept else ()
     notes = remainder_notes(finding.verdict, left, in_noise=False, named=bool(kept))
     return replace(finding, winner=winner, remainders=left, notes=notes)

@@ -33,7 +33,8 @@ from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.nuisance_terms import at_nominal_temperature
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.trace_rows import TraceRows, TraceRuns
+from analysis.trace.data.set_aside import TraceRows
+from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.finding import Finding
 from analysis.trace.in_motion import equations_above_noise
 from analysis.trace.judge.held_out import rms_of
@@ -90,7 +91,7 @@ def model_with_effects(
     runs, rows = records.train, finding.rows
     after, from_tolerances = _identified_with_effects(runs, finding.winner, before, rows)
     winner, shots = shoot_hidden_states(
-        runs, choosing_runs, after, rows.train, rows.unseen.choosing, finding.winner
+        runs, choosing_runs, after, rows.train, rows.choosing, finding.winner
     )
     if winner is not finding.winner:
         after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
@@ -99,9 +100,7 @@ def model_with_effects(
     absorbed = None
     if finding.verdict != UNEXPLAINED:
         absorbed = absorbed_effects(finding.hypotheses, candidates, finding.winner)
-    larger = sets_with_small_effect(
-        finding.hypotheses, absorbed, finding.winner, rows.unseen.choosing
-    )
+    larger = sets_with_small_effect(finding.hypotheses, absorbed, finding.winner, rows.choosing)
     others += [(hypothesis, "") for hypothesis, _ in larger]
     alternatives = [
         (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
@@ -131,7 +130,7 @@ def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
     another day an unknown cause moves them otherwise. The rows are fitted, not the records: those
     would lack the judging blocks, which long filters reach from everywhere.
     """
-    rows = finding.rows.unseen.choosing
+    rows = finding.rows.choosing
     fit = fit_coefficients(rows, winner.fit.terms)
     values = fit.parameters(rows.rig)
     relative = {n: d / abs(fit.beta[n]) for n, d in deviations(rows, fit).items() if fit.beta[n]}

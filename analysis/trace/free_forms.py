@@ -50,7 +50,7 @@ def explained_by_free_form(
     named = {kind.name for kind in extended.effects if not kind.free}
     sets = _sets_with_free_form(extended, winner, explained)
     for hypothesis in _simplest_first(extended, sets):
-        compared = CurveRange(found.rows.unseen.choosing, hypothesis.fit).rows
+        compared = CurveRange(found.rows.choosing, hypothesis.fit).rows
         effects = gates.judge_effects(extended, hypothesis, compared, rng)
         left = remainders(extended, hypothesis, compared)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]

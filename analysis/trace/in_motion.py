@@ -14,7 +14,8 @@ from analysis.terms.base import equation
 from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
+from analysis.trace.data.set_aside import TraceRows
+from analysis.trace.data.trace_rows import TraceRuns, trace_rows
 from analysis.trace.finding import Finding, without_unnamed_effects
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.held_out import held_out_residual
@@ -57,16 +58,16 @@ def find(
 
 def _judged_lines(records: TraceRuns, found: Finding) -> tuple[JudgedEffect, ...]:
     """Return the torques at `records.lines` with their gates, beside the effects found."""
-    unseen, fit = found.rows.unseen, found.winner.fit
+    rows, fit = found.rows, found.winner.fit
     train, holdout = (
         conditioned_records(records.rig, runs, families=records.families)
         for runs in (records.train, records.holdout)
     )
     judged = []
     for line in records.lines:
-        own = [s for s in unseen.choosing.segments if s.equation == equation("torque", line[0])]
+        own = [s for s in rows.choosing.segments if s.equation == equation("torque", line[0])]
         noise = float(np.sqrt(np.mean([s.noise**2 for s in own]))) if own else np.inf
-        judged.append(judged_line(records.rig, line, fit, train, holdout, unseen.divided, noise))
+        judged.append(judged_line(records.rig, line, fit, train, holdout, rows.divided, noise))
     return tuple(judged)
 
 
@@ -233,7 +234,7 @@ def equations_above_noise(rows: TraceRows, winner: Hypothesis) -> set[str]:
 
 def held_out_ratios(rows: TraceRows, winner: Hypothesis) -> dict[str, float]:
     """Return the error of a set in the choosing rows over the noise floor, by equation."""
-    choosing = rows.unseen.choosing
+    choosing = rows.choosing
     return held_out.error_over_floor(choosing, held_out_residual(choosing, winner.fit))
 
 

@@ -14,7 +14,8 @@ from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.trace_rows import TraceRows, TraceRuns, trace_rows
+from analysis.trace.data.set_aside import TraceRows
+from analysis.trace.data.trace_rows import TraceRuns, trace_rows
 from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
@@ -53,7 +54,7 @@ def search_and_judge(
 
     `done` receives the share of the candidates' columns that is computed.
     """
-    hypotheses, choosing = HypothesisSet(rows.train, candidates.named), rows.unseen.choosing
+    hypotheses, choosing = HypothesisSet(rows.train, candidates.named), rows.choosing
     in_noise = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
@@ -106,7 +107,7 @@ class Judge:
     @property
     def choosing(self) -> RegressionData:
         """The rows that choose between effects."""
-        return self.rows.unseen.choosing
+        return self.rows.choosing
 
     def best_finding(self, winner: Hypothesis) -> Finding:
         """Judge the set that the search has found, and try free forms where it does not explain.
@@ -290,7 +291,7 @@ def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, Tra
     ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in power.items()}
     if not ratio or max(ratio.values()) > DATA.unstated_ratio:
         return None
-    moves, formulas = clues_to(data, finding.rows.unseen.choosing, winner, ())
+    moves, formulas = clues_to(data, finding.rows.choosing, winner, ())
     if formulas or any(m.share > DATA.unstated_clue for m in moves):
         return None
     above = {name: max(1.0, value) for name, value in ratio.items()}

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import Rows
+from analysis.regression.rows import Filtering, Rows
 from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.settings import DATA, TRACE
@@ -34,14 +34,15 @@ def in_judging_block(time: Array) -> Mask:
 
 
 @dataclass(frozen=True)
-class UnseenRows:
-    """Rows that choose between effects and rows that judge.
+class TraceRows:
+    """Rows that are fitted (`train`), that choose between effects, and that judge.
 
     `members` are the records of the judging rows, each repeat by itself; of those whose group is in
     `divided`, only the judging blocks count. `choosing_runs` are the records that choose, for
     simulations. `notes` say how the rows were divided.
     """
 
+    train: RegressionData
     choosing: RegressionData
     judging: RegressionData
     members: tuple[ConditionedRecord, ...]
@@ -49,10 +50,16 @@ class UnseenRows:
     divided: frozenset[Group] = frozenset()
     notes: tuple[str, ...] = ()
 
+    @property
+    def filtering(self) -> Filtering:
+        """The filters of the training rows, weights by speed and sines taken out among them."""
+        return self.train.records[0].filtering
+
 
 def set_aside(
-    data: RegressionData, members: Sequence[ConditionedRecord], runs: Sequence[Run]
-) -> UnseenRows:
+    train: RegressionData, data: RegressionData, members: Sequence[ConditionedRecord],
+    runs: Sequence[Run],
+) -> TraceRows:  # fmt: skip
     """Divide the rows `data` of held-out `runs` into choosing and judging rows.
 
     A group is not divided where an equation of it would have fewer than `TRACE.least_rows` on
@@ -69,9 +76,9 @@ def set_aside(
         if s.group in short:
             judge[s.where] = choose[s.where] = True
     divided = frozenset(conditioned.group for conditioned in data.records) - short
-    return UnseenRows(
-        data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided), divided,
-        (_division_note(divided, sorted({step for _, step in short})),),
+    return TraceRows(
+        train, data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided),
+        divided, (_division_note(divided, sorted({step for _, step in short})),),
     )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import conditioned_records, trace_filtering
 from analysis.trace.data.nuisance_terms import path_terms
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.set_aside import UnseenRows, set_aside
+from analysis.trace.data.set_aside import TraceRows, set_aside
 from analysis.trace.settings import DATA, TRACE
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -62,19 +62,6 @@ class TraceRuns:
         return replace(self, rig=rig, train=train, holdout=holdout, judge=judge)
 
 
-@dataclass(frozen=True)
-class TraceRows:
-    """Rows that are fitted (`train`), and rows that no parameter is fitted to (`unseen`)."""
-
-    train: RegressionData
-    unseen: UnseenRows
-
-    @property
-    def filtering(self) -> Filtering:
-        """The filters of the training rows, weights by speed and sines taken out among them."""
-        return self.train.records[0].filtering
-
-
 def trace_rows(
     records: TraceRuns, filtering: Callable[[Record], Filtering] = trace_filtering,
     cache: RowCache | None = None,
@@ -103,10 +90,10 @@ def trace_rows(
     members = conditioned(records.holdout)
     data = unseen(members)
     if not records.judge:
-        return TraceRows(train_data, set_aside(data, members, records.holdout))
+        return set_aside(train_data, data, members, records.holdout)
     members = conditioned(records.judge)
     judging = unseen(members)
-    return TraceRows(train_data, UnseenRows(data, judging, tuple(members), records.holdout))
+    return TraceRows(train_data, data, judging, tuple(members), records.holdout)
 
 
 def _training_rows(

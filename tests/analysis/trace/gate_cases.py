@@ -15,8 +15,7 @@ from analysis.trace import engine, finding
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.set_aside import UnseenRows
-from analysis.trace.data.trace_rows import TraceRows
+from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.judge import gates
 from analysis.trace.judging import Judge
 from analysis.trace.result import JudgedEffect, Trace
@@ -65,8 +64,9 @@ class Searched:
 
     def judge(self, rng: np.random.Generator) -> Judge:
         """Return who judges the bench's sets, without free forms."""
-        unseen = UnseenRows(self.holdout_data, self.holdout_data, (), ())
-        return Judge(TraceRows(self.hypotheses.train_data, unseen), self.hypotheses, (), rng)
+        held_out = self.holdout_data
+        rows = TraceRows(self.hypotheses.train_data, held_out, held_out, (), ())
+        return Judge(rows, self.hypotheses, (), rng)
 
     def vetoes(self, one: Hypothesis) -> str:
         """Return what is left and speaks against a set, in words; '' for nothing."""

@@ -167,7 +167,7 @@ def test_every_third_second_is_set_aside_and_no_row_is_in_both(
     rig: Rig, leaky: tuple[Run, Run]
 ) -> None:
     data = rows_of(rig, leaky[1])
-    unseen = set_aside(data, (), (leaky[1],))
+    unseen = set_aside(data, data, (), (leaky[1],))
     for equation, rows in unseen.judging.rows[0].items():
         others = unseen.choosing.rows[0][equation].time
         assert in_judging_block(rows.time).all()
@@ -187,7 +187,7 @@ def test_a_record_too_short_to_be_divided_chooses_and_judges(
     ))  # fmt: skip
     data = rows_of(rig, short)
     assert all(s.where.stop - s.where.start >= TRACE.least_rows for s in data.segments)
-    unseen = set_aside(data, (), (short,))
+    unseen = set_aside(data, data, (), (short,))
     same(unseen.choosing, data)
     same(unseen.judging, data)
     assert unseen.divided == frozenset()
