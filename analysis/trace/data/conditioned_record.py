@@ -99,14 +99,11 @@ def families_of(rig: Rig, term: Term) -> frozenset[str]:
 
 def acting_on(rig: Rig, terms: Iterable[Used], family: str, cache: RowCache) -> tuple[Used, ...]:
     """Return the terms that have columns in a family's rows or change their signals."""
-    return tuple(u for u in terms if family in _families(rig, u.term, cache))
-
-
-def _families(rig: Rig, term: Term, cache: RowCache) -> frozenset[str]:
-    found = cache.families.get(term)
-    if found is None:
-        found = cache.families[term] = families_of(rig, term)
-    return found
+    terms = tuple(terms)
+    for used in terms:
+        if used.term not in cache.families:
+            cache.families[used.term] = families_of(rig, used.term)
+    return tuple(u for u in terms if family in cache.families[u.term])
 
 
 def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
