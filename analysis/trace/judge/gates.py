@@ -256,13 +256,16 @@ def judged_beside_unknown_cause(
         """Return in words why effects that act together are not named ('' if they are)."""
         without = hypotheses.refined([u for u in winner.effects if u not in group])
         columns = [jacobian(data, winner.fit, used)[1] for used in group]
-        own = {s.equation for s in data.segments if any(np.any(J[s.where]) for J in columns)}
+        # Sorted: the order of a sum decides its last digit.
+        own = sorted(
+            {s.equation for s in data.segments if any(np.any(J[s.where]) for J in columns)}
+        )
         removed = {e: without.excess_energy[e] - winner.excess_energy[e] for e in own}
         share = sum(removed.values()) / max(1e-30, sum(without.excess_energy[e] for e in own))
         if share < TRACE.least_removed_beside:
             return (
                 f"{100 * max(0.0, share):.0f} % of the repeatable energy of "
-                f"{', '.join(sorted(own))}, too little beside a cause that is not known"
+                f"{', '.join(own)}, too little beside a cause that is not known"
             )
         outside = sum(v for e, v in removed.items() if e not in unexplained)
         gain = _energy(data, without, rows) - left_outside
