@@ -99,10 +99,16 @@ class SensorGain(Sensor):
         return "the flow gains absorb a spool's gain completely" if self.side == "spool" else ""
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State the wrong area of a chamber that has the same force."""
-        if self.side not in ("cap", "rod"):
-            return ""
-        return _same_force(self.side, 1.0 / self.shape_of(rig, shape)[0])
+        """State the wrong area, or the gain of the other pressures, with the same residual."""
+        gain = self.shape_of(rig, shape)[0]
+        if self.where == "bench":
+            return (
+                f"a gain of {plain(1.0 / gain, 4)} of all chamber sensors leaves the same residual;"
+                " if they are wrong, masses, weights, viscous friction and b are "
+                f"{plain(gain, 4)} times those given, flow gains {plain(gain**-0.5, 4)} times: "
+                "compare a chamber's sensor with the supply's"
+            )
+        return _same_force(self.side, 1.0 / gain) if self.side in ("cap", "rod") else ""
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the gain, and the bend of a pressure."""

@@ -12,6 +12,21 @@ from rig.model.rig import Rig
 from tests.analysis.test_terms import signals_of
 
 
+def test_the_gain_of_all_chamber_sensors_that_would_do_the_same_is_stated(rig: Rig) -> None:
+    """Both meet the same flow balance of the cap chamber and the same balance of forces."""
+    supply = make("sensor_gain", "bench")
+    said = supply.remark(rig, [], (0.94, 0.0))  # type: ignore[attr-defined]
+    inverse, force, flow = (float(x) for x in re.findall(r"\d\.\d+", said))
+    b, c, V, u, piston = 1e9, 3e-8, 4e-4, 2.0, 1e-4  # SI; piston: the flow that it displaces
+    p, p_s, rate = 4e6, 7e6, 8e7  # true pressures, if the chambers' sensors are right
+    left = c * u * np.sqrt(p_s - p) - piston - V / b * rate
+    # If not, the readings of the chambers are `inverse` times the true pressures.
+    true, true_rate, true_supply = p / inverse, rate / inverse, 0.94 * p_s
+    other = flow * c * u * np.sqrt(true_supply - true) - piston - V / (force * b) * true_rate
+    assert other == pytest.approx(left, rel=1e-3)
+    assert true == pytest.approx(force * p, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("name", "shape"), [("sensor_gain", (0.93, 0.0)), ("sensor_crosstalk", (-0.04,))]
 )
