@@ -77,6 +77,13 @@ def test_a_piston_that_sticks_displaces_no_oil() -> None:
         assert (not out[plant.P : plant.P + 2].any()) == sticks
 
 
+def test_a_pair_whose_first_cause_leaves_no_sensor_for_the_second_is_drawn_anew() -> None:
+    """First drawn for this seed are a delay of all pressures and the gain of one of them."""
+    one, other = case_of(9120, kind="pair").hidden
+    assert (one.name, other.name) == ("channel_delay", "sensor_gain")
+    assert not set(one.sensors) & set(other.sensors)
+
+
 def test_a_seed_draws_the_same_bench_again_and_another_seed_another() -> None:
     one, again, other = case_of(4), case_of(4), case_of(6)
     assert (one.label, dict(one.bench.truth)) == (again.label, dict(again.bench.truth))

@@ -332,6 +332,9 @@ def _tapered(rng: np.random.Generator, i: int) -> Wrong:
 STRANGERS: Final[tuple[Draw, ...]] = (_hardening, _drag, _worn, _tapered)
 
 
+REDRAWN = 20  # times that the second of two causes alone is drawn again
+
+
 def _same_cause(one: Wrong, other: Wrong) -> bool:
     """Return whether two effects set the same sensor or the same number of a joint."""
     own = one.joint[0] == other.joint[0] and bool(set(one.joint[1]) & set(other.joint[1]))
@@ -369,8 +372,11 @@ def case_of(
     else:
         draws = [STRANGERS[int(rng.integers(len(STRANGERS)))]] if kind == OUTSIDE else []
     hidden = tuple(draw(rng, int(rng.integers(2))) for draw in draws)
+    tried = 0
     while len(hidden) == 2 and _same_cause(*hidden):
-        hidden = (hidden[0], draws[1](rng, int(rng.integers(2))))
+        tried += 1  # a delay of all pressures leaves no sensor for a gain
+        first = draws[0](rng, int(rng.integers(2))) if tried > REDRAWN else hidden[0]
+        hidden = (first, draws[1](rng, int(rng.integers(2))))
     hidden = hidden if alone is None else hidden[alone : alone + 1]
     machine: dict[str, float] = {}
     joints: tuple[dict[str, float], dict[str, float]] = ({**own}, {**own})
