@@ -60,7 +60,7 @@ class Shape:
     fixed: bool = False
 
     def given(self, value: float) -> bool:
-        """Return whether a form has this parameter; a 0 below its bounds means that it has not."""
+        """Return whether a form has this parameter: a 0 below its bounds means that it does not."""
         return value != 0.0 or self.low <= 0.0
 
     @property
@@ -69,11 +69,11 @@ class Shape:
         return self.grid[len(self.grid) // 2]
 
 
-# Of a sample that a held command may bend the spool's path: as `identify` accepts, four times its
-# `path_between_samples`.
+# [sample periods] below which a spool delay may be an artefact of a command held between samples:
+# four times the `path_between_samples` of `identify`.
 BETWEEN_SAMPLES: Final = 0.2
-LONGEST_LAG: Final = 0.1  # [s] of a delay or a time constant of a bench
-LONGEST_SAMPLES: Final = 100  # [samples] of them: a large machine moves and is sampled slowly
+LONGEST_LAG: Final = 0.1  # [s] longest delay or time constant on a bench
+LONGEST_SAMPLES: Final = 100  # [samples] the same on a large machine: slow, and sampled slowly
 
 
 def longest_lag(rig: Rig) -> float:
@@ -82,15 +82,14 @@ def longest_lag(rig: Rig) -> float:
 
 
 def between_samples(rig: Rig, seconds: float) -> str:
-    """Return why a spool delay cannot be told from its path between samples ('' if it can).
+    """Return why a spool delay [s] may be an artefact of sampling ('' if it is longer).
 
-    A first-order spool of time constant tau under a held command seems off by dt^2 / (12 tau).
+    The signals are linear between samples: under a held command, a first-order spool of time
+    constant tau then has an apparent delay of dt^2 / (12 tau).
     """
     if seconds * rig.sample_rate >= BETWEEN_SAMPLES:
         return ""
-    return (
-        f"{1e6 * seconds:.3g} us is what a held command may bend the spool's path between samples"
-    )
+    return f"a delay of {1e6 * seconds:.3g} us may come from a command held between samples"
 
 
 # The signal of each quantity (see `Effect.abscissa`), of a joint or of its chambers.
@@ -99,7 +98,7 @@ OF_JOINT: Final = {
     "spool": "u",
 }  # fmt: skip
 OF_CHAMBER: Final = {"pressure": "p", "pressure rate": "pd"}
-UNNAMED: Final = ("piston", "spool", "position", "drive")  # sensors that a place does not name
+UNNAMED: Final = ("piston", "spool", "position", "drive")  # sensors that `place` omits
 
 
 @dataclass(frozen=True)
@@ -150,11 +149,11 @@ class Effect(Term):
     `variable` names in plain words what the effect's contribution depends on, `quantity` what its
     residual is plotted against (see `plotted`, `abscissa`); `confounders` are
     effects whose columns are similar on poor excitation, `separated_by` an excitation on which they
-    differ; `includes` names effects that it equals at a limit of its own numbers and replaces, and
-    `beside` those that it may accompany as another part of their law, `excludes` those that cannot
-    act at the same place.
+    differ; `includes` names effects that are limits of this one and that it replaces, `beside` says
+    that it may also act together with them, `excludes` names those that cannot act at the same
+    place.
 
-    `shape_stems` are the names of its shape parameters without `mark`, their place.
+    `shape_stems` are the names of its shape parameters without the `suffix` of the place.
 
     `stage` orders the terms' `prepare` (see `ordered`): sensor errors are undone first, then come
     effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
@@ -164,8 +163,8 @@ class Effect(Term):
     cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
     [SI] of the smallest size of interest on a bench of some kW at some MPa.
 
-    `amplifies` marks effects that are undone by amplifying noise (a lag): as rivals they may leave
-    more, and be true.
+    `amplifies` marks effects whose correction amplifies noise (a lag): such a rival may be true
+    although its residual is larger.
 
     `exact` marks effects whose equation is a definition (a gain, an offset, a delay, a mass): a
     residual that they leave is not due to an error of their form.
@@ -226,7 +225,7 @@ class Effect(Term):
 
     @property
     def least_joints(self) -> int:
-        """Return how many joints must move for it to differ from other effects."""
+        """Return the least number of moving joints that separates it from other effects."""
         return 1
 
     def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
@@ -265,13 +264,13 @@ class Effect(Term):
         return ()
 
     @property
-    def mark(self) -> str:
-        """How its parameters' names end: `1`, `1_cap`, '' for the bench."""
+    def suffix(self) -> str:
+        """The end of its parameters' names: `1`, `1_cap`, '' for the bench."""
         return "_".join(self.where.split()[1:])
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the shape parameters; their number does not depend on the rig."""
-        end = f"_{self.mark}" if self.mark else ""
+        end = f"_{self.suffix}" if self.suffix else ""
         return tuple(f"{stem}{end}" for stem in self.shape_stems)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
@@ -311,7 +310,7 @@ class Effect(Term):
     def extrapolated(
         self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
     ) -> Mapping[str, tuple[float, float]]:
-        """Return the range, by name, of shapes that only the form gives beyond the records."""
+        """Return, by name, the range of shape parameters that are extrapolated by the form."""
         return {}
 
     def plotted(self) -> str:
@@ -341,10 +340,10 @@ class Effect(Term):
             return tuple(shape)
         return tuple(s.middle for s in self.shapes(rig) if not s.detail)
 
-    def whole(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+    def full_shape(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
         """Return `shape_of` with 0 for each detail that the shape lacks."""
-        given = self.shape_of(rig, shape)
-        return (*given, *(0.0 for _ in self.shape_names()[len(given) :]))
+        known = self.shape_of(rig, shape)
+        return (*known, *(0.0 for _ in self.shape_names()[len(known) :]))
 
     def remembers(self, shape: Sequence[float]) -> bool:
         """Return whether the effect has memory (a hidden state in use) at a shape."""
@@ -370,7 +369,7 @@ class Effect(Term):
         return ""
 
     def distinct(self, intervals: Mapping[str, tuple[float, float]]) -> bool:
-        """Return whether no numbers within `intervals` make it an effect of `includes`.
+        """Return whether it differs from every effect of `includes` throughout `intervals`.
 
         `intervals` holds the 95 % intervals of its linear coefficients, errors of forms included.
         False where it cannot be judged.
@@ -411,12 +410,12 @@ class SignalEffect(Effect):
 
 
 def exponent(shape: Sequence[float]) -> float:
-    """Return the exponent, the one number of a shape; 1 of a shape without it (none, or 0)."""
+    """Return the exponent of a shape with this one number; 1 where it is missing or 0."""
     return float(shape[0]) if len(shape) and shape[0] else 1.0
 
 
-def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.0) -> str:
-    """Return that a coefficient is not within (low, high), in words ('' if it is)."""
+def out_of_range(parameter: str, value: float, unit: str, high: float, low: float = 0.0) -> str:
+    """Return the message for a coefficient that is not within (low, high) ('' if it is)."""
     if low < value < high:
         return ""
     shown, least, most = (plain(x, 4) for x in (value, low, high))
@@ -447,7 +446,7 @@ NO_KERNEL: Kernel = _nothing  # of effects that do not act on the plant
 
 
 def open_shapes(rig: Rig, used: Used) -> bool:
-    """Return whether a term is an effect that needs a shape and has none.
+    """Return whether a term is an effect whose required shape is missing.
 
     A contact's presliding distance and details of a form are optional.
     """

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from analysis.effects.base import VOLUME, Array, Effect, Shape, SignalEffect, beyond, exponent
+from analysis.effects.base import VOLUME, Array, Effect, Shape, SignalEffect, exponent, out_of_range
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     COMP_CAP,
@@ -28,9 +28,9 @@ from rig.model.rig import Rig
 from rig.model.units import plain
 
 ATMOSPHERE: Final = 101_325.0  # [Pa]
-DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sensor's error
-MOST_AIR: Final = 0.2
-EXPONENTS: Final = (1.0, 1.4)
+DEEPEST: Final = 0.95 * ATMOSPHERE  # [Pa] below gauge zero: a deeper vacuum is a sensor's error
+MOST_AIR: Final = 0.2  # of the volume, at one atmosphere
+EXPONENTS: Final = (1.0, 1.4)  # polytropic: isothermal, adiabatic
 MOST_VOLUME: Final = 10.0  # of the oil in pipe and chamber at mid-stroke
 # A hose's stiffening times the supply's pressure, first tried and largest: at that pressure its
 # volume V_dead is a fourth, or an eleventh, of that at zero.
@@ -87,11 +87,11 @@ class EntrainedAir(Effect):
         return () if len(shape) else ((1.2,),)
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the shape as it is: the exponent belongs to another form."""
+        """Return the shape unchanged: the exponent is not a detail but another form."""
         return (tuple(shape),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return - V dp/dt times the softness of each chamber's gas per alpha."""
+        """Return - V dp/dt times the compressibility of each chamber's gas per alpha."""
         out: Columns = {}
         n = exponent(shape)
         for i in signals.excited_joints:
@@ -107,7 +107,7 @@ class EntrainedAir(Effect):
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a negative share, and one above `MOST_AIR`."""
-        return beyond("alpha_air", values["alpha_air"], "", MOST_AIR)
+        return out_of_range("alpha_air", values["alpha_air"], "", MOST_AIR)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return alpha and n."""
@@ -162,20 +162,20 @@ class DeadVolume(SignalEffect):
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the volume [m^3], up to `MOST_VOLUME` times the oil in pipe and chamber.
 
-        It is not below the stated pipe's volume, negative. Its stiffening [1/Pa] is a detail.
+        Its lower bound is minus the stated pipe's volume. The stiffening [1/Pa] is a detail.
         """
         cap, rod = map(float, rig.chamber_volumes(self.joint, np.zeros(())))
-        known = cap if self.side == "cap" else rod
+        oil = cap if self.side == "cap" else rod
         stated = self._stated(rig)
-        grid = (-0.2 * stated, 0.05 * known, 0.25 * known, 1.0 * known)
+        grid = (-0.2 * stated, 0.05 * oil, 0.25 * oil, 1.0 * oil)
         (volume, stiffening), p = self.shape_names(), rig.supply.pressure
         return (
-            Shape(volume, "m^3", -stated, MOST_VOLUME * known, grid, 0.0),
+            Shape(volume, "m^3", -stated, MOST_VOLUME * oil, grid, 0.0),
             Shape(stiffening, "1/Pa", 0.0, STIFFEST / p, (1.0 / p,), resolution=True, detail=True),
         )
 
     def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
-        """Return hoses: a smaller b can replace rigid volumes, but no stiffening."""
+        """Return hoses: a smaller b can replace a rigid volume, but not one that stiffens."""
         volume, _ = self.shapes(rig)
         return tuple((start, HOSE / rig.supply.pressure) for start in volume.grid[1:3])
 
@@ -184,7 +184,7 @@ class DeadVolume(SignalEffect):
         return (tuple(shape[:1]),) if len(shape) > 1 else ()
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Add the volume to the chamber's."""
+        """Add the volume to that of the chamber."""
         field = "V_cap" if self.side == "cap" else "V_rod"
         V = getattr(signals, field).copy()
         p = (signals.p_cap if self.side == "cap" else signals.p_rod)[:, self.joint]
@@ -195,11 +195,11 @@ class DeadVolume(SignalEffect):
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the pipe's volume where the rig file has too much."""
         stated = self._stated(rig)
-        more = self.shape_of(rig, shape)[0]
-        if more >= 0.0:
+        volume = self.shape_of(rig, shape)[0]
+        if volume >= 0.0:
             return ""
         return (
-            f"by these records the pipe holds {plain(1e6 * (stated + more), 3)} cm³, not the "
+            f"by these records the pipe holds {plain(1e6 * (stated + volume), 3)} cm³, not the "
             f"{plain(1e6 * stated, 3)} cm³ of the rig file (`{self.side}_pipe_volume`)"
         )
 
@@ -210,7 +210,7 @@ class DeadVolume(SignalEffect):
 
     def slack(self, rig: Rig, shape: Sequence[float]) -> tuple[float, float]:
         """Return the volume [m^3] at no pressure and its stiffening [1/Pa]."""
-        V, stiffening = self.whole(rig, shape)
+        V, stiffening = self.full_shape(rig, shape)
         return V * (1.0 + stiffening * 0.5 * rig.supply.pressure), stiffening
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:

@@ -6,7 +6,7 @@ stiffer the faster it is deformed (Ferry 1980), here in proportion, with the sti
 
     dz/ds = (1 + k |s'|) (sign(s') - z) / d
 
-It is the contact without stiffening along the path that is `worked`, ds_w = (1 + k |s'|) ds.
+Over the path s_w, ds_w = (1 + k |s'|) ds (`stiffened_path`), it is a contact without stiffening.
 
 Where the reversal is finished within less travel than the records resolve, z is a function of the
 velocity alone (`memoryless`), over a transition speed w: the mean sign of a velocity about s' that
@@ -34,7 +34,7 @@ GRID_RATIO: Final = 4.0  # between presliding distances where a search begins
 YIELD: Final = 5e-3  # of the stroke: the largest presliding distance; a longer one is a spring
 STIFFENING: Final = 30.0  # [s/m] where a search begins
 STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] a smaller one is below a tenth at 0.1 m/s: negligible
-FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
+FASTEST: Final = 3e3  # [1/s] largest relaxation in simulation; a faster one looks the same
 # Speed of the transition through rest [m/s, or rad/s] where no shape is given. A jump
 # would make the integrator chatter where a joint sticks; this creeps by less than 0.1 mm/s there.
 # On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
@@ -47,10 +47,10 @@ TWO_OVER_PI: Final = 2.0 / math.pi
 
 @dataclass(frozen=True)
 class ContactRange:
-    """What a contact's shapes may be: presliding distances [unit] and transition speeds [unit/s].
+    """Search range of a contact's shapes: presliding distance [unit], transition speed [unit/s].
 
-    `distances` are the points of a search, `speed` where a search begins. A wider transition than
-    the upper bound is viscous friction.
+    A search begins at each of `distances` and at `speed`. A transition wider than its upper bound
+    is viscous friction.
     """
 
     unit: str
@@ -71,16 +71,16 @@ def contact_range(rig: Rig, joint: int) -> ContactRange:
     A seal's section grows with the cylinder's bore, and with it its shear travel; what the
     cylinder's mounting yields under friction grows with the stroke.
     """
-    at = rig.joints[joint]
     if path_unit(rig, joint) == ROTARY.unit:
         return ROTARY
     if rig.electric:
         return LINEAR
     low, high = LINEAR.distance_bounds
-    bore = 2.0 * math.sqrt(at.cylinder.cap_area / math.pi)
-    high = max(high, SHEAR * bore, YIELD * at.cylinder.stroke)
+    cylinder = rig.joints[joint].cylinder
+    bore = 2.0 * math.sqrt(cylinder.cap_area / math.pi)
+    high = max(high, SHEAR * bore, YIELD * cylinder.stroke)
     distances = list(LINEAR.distances)
-    while distances[-1] * GRID_RATIO < high:  # a search from far below ends elsewhere
+    while distances[-1] * GRID_RATIO < high:  # from far below, a search ends at a local minimum
         distances.append(distances[-1] * GRID_RATIO)
     return replace(LINEAR, distances=tuple(distances), distance_bounds=(low, high))
 
@@ -90,9 +90,9 @@ def path_unit(rig: Rig, joint: int) -> str:
     return rig.unit_of(ch.channel(rig.position_kind, joint + 1))
 
 
-def presliding(name: str, among: ContactRange) -> Shape:
+def presliding(name: str, limits: ContactRange) -> Shape:
     """Return the presliding distance's shape; it may be below the sensors' resolution."""
-    return Shape(name, among.unit, *among.distance_bounds, among.distances, resolution=True)
+    return Shape(name, limits.unit, *limits.distance_bounds, limits.distances, resolution=True)
 
 
 def stiffening(name: str) -> Shape:
@@ -100,14 +100,14 @@ def stiffening(name: str) -> Shape:
     return Shape(name, "s/m", *STIFFENING_BOUNDS, (STIFFENING,), resolution=True, detail=True)
 
 
-def transition(name: str, among: ContactRange) -> Shape:
+def transition(name: str, limits: ContactRange) -> Shape:
     """Return the transition speed's shape of a contact without memory."""
-    unit, bounds = f"{among.unit}/s", among.speed_bounds
-    return Shape(name, unit, *bounds, (among.speed,), resolution=True, detail=True)
+    unit, speeds = f"{limits.unit}/s", limits.speed_bounds
+    return Shape(name, unit, *speeds, (limits.speed,), resolution=True, detail=True)
 
 
 def tail(name: str) -> Shape:
-    """Return the shape of a contact whose spread is Cauchy's; without it, it is normal."""
+    """Return the shape that makes the spread of a contact Cauchy's instead of normal."""
     return Shape(name, "1", CAUCHY, CAUCHY, (CAUCHY,), detail=True, fixed=True)
 
 
@@ -118,8 +118,8 @@ def memoryless(v: Array, speed: float, tail: float = NORMAL) -> Array:
     return np.asarray(erf(v / speed))
 
 
-def worked(s: Array, v: Array, stiffening: float) -> Array:
-    """Return the path (n,) [m] along which a contact is worked: ds_w = (1 + k |s'|) ds.
+def stiffened_path(s: Array, v: Array, stiffening: float) -> Array:
+    """Return the path s_w (n,) [m] of a contact with stiffening: ds_w = (1 + k |s'|) ds.
 
     `s` (n,) [m] is the piston's path, `v` (n,) [m/s] its speed, `stiffening` k [s/m].
     """
@@ -154,8 +154,8 @@ def contact_under_load(s, levels, stiffness):  # type: ignore[no-untyped-def]
     for k in range(1, len(s)):
         step = s[k] - s[k - 1]
         level = levels[k] if step > 0.0 else -levels[k]
-        keep = math.exp(-abs(step) * stiffness / levels[k]) if levels[k] > 0.0 else 0.0
-        w[k] = level + (w[k - 1] - level) * keep
+        decay = math.exp(-abs(step) * stiffness / levels[k]) if levels[k] > 0.0 else 0.0
+        w[k] = level + (w[k - 1] - level) * decay
     return w
 
 
@@ -166,17 +166,17 @@ def contact_levels(s, extending, retracting):  # type: ignore[no-untyped-def]
     for k in range(1, len(s)):
         step = s[k] - s[k - 1]
         if step > 0.0:
-            keep = math.exp(-step / extending)
-            a[k], r[k] = 1.0 + (a[k - 1] - 1.0) * keep, r[k - 1] * keep
+            decay = math.exp(-step / extending)
+            a[k], r[k] = 1.0 + (a[k - 1] - 1.0) * decay, r[k - 1] * decay
         else:
-            keep = math.exp(step / retracting)
-            a[k], r[k] = a[k - 1] * keep, 1.0 + (r[k - 1] - 1.0) * keep
+            decay = math.exp(step / retracting)
+            a[k], r[k] = a[k - 1] * decay, 1.0 + (r[k - 1] - 1.0) * decay
     return a, r
 
 
 @njit(cache=True, error_model="numpy")
 def mean_sign(v, speed, tail):  # type: ignore[no-untyped-def]
-    """Return z of one velocity v [m/s], as `memoryless` does."""
+    """Return `memoryless` of one velocity v [m/s]."""
     if tail == CAUCHY:
         return TWO_OVER_PI * math.atan(v / speed)
     return math.erf(v / speed)
@@ -186,7 +186,7 @@ def mean_sign(v, speed, tail):  # type: ignore[no-untyped-def]
 def slide(v, y, distance, stiffening, speed, tail):  # type: ignore[no-untyped-def]
     """Return (z, dy/dt) of the deflection y = d z, its relaxation bounded at `FASTEST`.
 
-    Without a distance the contact has no memory, but a transition speed and a spread's tail.
+    With a distance of 0 the contact is memoryless, of the transition speed and tail.
     """
     if distance <= 0.0:
         return mean_sign(v, speed, tail), 0.0

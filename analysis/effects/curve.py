@@ -18,8 +18,8 @@ from numba import njit
 
 from analysis.effects.base import Array, Shape
 
-APART: Final = 0.02  # of their range: knots nearer to each other are moved apart
-POINTS: Final = 61  # of a curve that is shown
+APART: Final = 0.02  # of the knots' range: the least distance between neighbours
+POINTS: Final = 61  # of a plotted curve
 LAST: Final = 0.999  # quantile of the outermost knots: beyond, the curve is straight
 
 
@@ -55,16 +55,16 @@ def _basis(t, S, x):  # type: ignore[no-untyped-def]
             j += 1
         h = t[j + 1] - t[j]
         b = (inner - t[j]) / h
-        a, beyond = 1.0 - b, x[k] - inner
+        a, outside = 1.0 - b, x[k] - inner
         m, n = (a * a - 1.0) * a * h * h / 6.0, (b * b - 1.0) * b * h * h / 6.0
-        if beyond < 0.0:  # the slope at the first knot
-            m, n = m - beyond * h / 3.0, n - beyond * h / 6.0
-        elif beyond > 0.0:  # at the last
-            m, n = m + beyond * h / 6.0, n + beyond * h / 3.0
+        if outside < 0.0:  # the slope at the first knot
+            m, n = m - outside * h / 3.0, n - outside * h / 6.0
+        elif outside > 0.0:  # at the last
+            m, n = m + outside * h / 6.0, n + outside * h / 3.0
         for i in range(K):
             out[k, i] = m * S[j, i] + n * S[j + 1, i]
-        out[k, j] += a - beyond / h
-        out[k, j + 1] += b + beyond / h
+        out[k, j] += a - outside / h
+        out[k, j + 1] += b + outside / h
     return out
 
 
@@ -95,16 +95,16 @@ def curve_at(x, par, first, K):  # type: ignore[no-untyped-def]
     return a * y + b * z + ((a * a - 1.0) * a * m + (b * b - 1.0) * b * n) * h * h / 6.0
 
 
-def freed(gauge: Array) -> Array:
-    """Return the values at the knots (K, K - 1) per free value; that of the largest weight depends.
+def knot_values(gauge: Array) -> Array:
+    """Return the values at the knots per independent value (K, K - 1), where gauge (K,) . y = 0.
 
-    It follows from gauge (K,) times the values being zero.
+    The value with the largest weight depends on the others.
     """
-    K, last = len(gauge), int(np.argmax(np.abs(gauge)))
-    others = [k for k in range(K) if k != last]
+    K, dependent = len(gauge), int(np.argmax(np.abs(gauge)))
+    others = [k for k in range(K) if k != dependent]
     out = np.zeros((K, K - 1))
     out[others, range(K - 1)] = 1.0
-    out[last] = -gauge[others] / gauge[last]
+    out[dependent] = -gauge[others] / gauge[dependent]
     return out
 
 
@@ -120,34 +120,34 @@ def shortest_wave(knots: Array) -> Array:
     return np.asarray(gauge / np.linalg.norm(gauge))
 
 
-def spread_knots(values: Array, shares: Sequence[float], low: float | None = None) -> Array:
-    """Return knots (K,) at quantiles of values (n,), spaced apart; `low` may fix the first.
+def spread_knots(values: Array, quantiles: Sequence[float], low: float | None = None) -> Array:
+    """Return knots (K,) at quantiles of values (n,), `APART` or more; `low` may fix the first.
 
     Empty where the values do not spread.
     """
     if not len(values):
         return np.zeros(0)
-    knots = np.quantile(values, shares)
+    knots = np.quantile(values, quantiles)
     if low is not None:
         knots[0] = low
-    least = APART * (knots[-1] - knots[0])
-    if not least > 0.0:
+    distance = APART * (knots[-1] - knots[0])
+    if not distance > 0.0:
         return np.zeros(0)
     for k in range(1, len(knots)):
-        knots[k] = max(knots[k], knots[k - 1] + least)
+        knots[k] = max(knots[k], knots[k - 1] + distance)
     return np.asarray(knots)
 
 
 def knot_points(
-    values: Array, shares: Sequence[float], low: float | None = None
+    values: Array, quantiles: Sequence[float], low: float | None = None
 ) -> tuple[tuple[float, ...], ...]:
-    """Return `spread_knots` as the one starting point of a search, none where nothing spreads."""
-    knots = spread_knots(values, shares, low)
+    """Return `spread_knots` as the only starting point of a search; none without a spread."""
+    knots = spread_knots(values, quantiles, low)
     return (tuple(map(float, knots)),) if len(knots) else ()
 
 
 def knot_shapes(names: Sequence[str], unit: str, low: float, high: float) -> tuple[Shape, ...]:
-    """Return the knots as shapes that the data place beforehand, evenly spread without data."""
+    """Return the knots as fixed shapes, evenly spread; `points` places them by the data."""
     even = np.linspace(low, high, len(names))
     return tuple(
         Shape(name, unit, min(low, -abs(high)), abs(high) + abs(low), (float(at),), fixed=True)
@@ -161,6 +161,6 @@ def shown(knots: Sequence[float]) -> Array:
 
 
 def refuse_large(y: Array, limit: float, what: str, unit: str) -> str:
-    """Return that a curve (m,) [unit] exceeds a limit, in words ('' if it does not)."""
+    """Return the message for a curve y (m,) [unit] that exceeds a limit ('' if it does not)."""
     most = float(np.max(np.abs(y))) if len(y) else 0.0
     return "" if most < limit else f"{what} reaches {most:.4g}, more than {limit:.4g} {unit}"

@@ -25,8 +25,8 @@ from rig.model.rig import Rig
 
 FREQUENCY: Final = (0.5, 60.0)  # [Hz] slower is drift, faster does not pass the rows' filter
 PEAKS: Final = 3  # of the residual's spectrum that a search begins at
-BAND: Final = 0.4  # of the rows' rate: what stands above is their filter's edge
-FINE: Final = 4  # frequencies looked at within one over the record's length
+BAND: Final = 0.4  # of the rows' rate: peaks above it come from the rows' filter
+FINE: Final = 4  # points of the spectrum per 1 / record length
 
 
 @kernel
@@ -41,8 +41,8 @@ class PeriodicDisturbance(Effect):
     """Torque T_sin sin(2 pi f t) + T_cos cos(2 pi f t) on the joint, t since the record began.
 
     For example an eccentric, mains hum, or a controller's dither that begins with the record (one
-    Fourier line). One whose phase differs between repeats is found in the differences between
-    them; its amplitude is then reported, and no model or free run contains it.
+    Fourier line). Where the phase differs between repeats, it is found in the differences between
+    them; then its amplitude is reported, and no model or free run contains it.
     """
 
     mechanism = "disturbance"
@@ -81,19 +81,19 @@ class PeriodicDisturbance(Effect):
         step = float(np.median(np.diff(parts[0][0])))
         length = max(float(time[-1] - time[0]) for time, _ in parts)
         high = min(FREQUENCY[1], BAND / step)
-        wide = math.ceil(FINE * length / step)
-        f = np.fft.rfftfreq(wide, step)
+        samples = math.ceil(FINE * length / step)
+        f = np.fft.rfftfreq(samples, step)
         total = np.zeros(len(f), dtype=complex)
-        for time, left in parts:
-            even = np.zeros(wide)  # rows that are left out are zero
-            even[np.rint((time - time[0]) / step).astype(int)] = left
-            total += np.exp(-2j * np.pi * f * time[0]) * np.fft.rfft(even)
+        for time, residual in parts:
+            uniform = np.zeros(samples)  # missing rows are zero
+            uniform[np.rint((time - time[0]) / step).astype(int)] = residual
+            total += np.exp(-2j * np.pi * f * time[0]) * np.fft.rfft(uniform)
         inside = (f >= max(FREQUENCY[0], 2.0 / length)) & (f < high)
         f, total = f[inside], total[inside]
         power = np.abs(total)
         inner = (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
-        at = 1 + np.flatnonzero(inner)
-        return tuple((float(f[k]),) for k in at[np.argsort(-power[at])][:PEAKS])
+        peaks = 1 + np.flatnonzero(inner)
+        return tuple((float(f[k]),) for k in peaks[np.argsort(-power[peaks])][:PEAKS])
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return -sin and -cos: the disturbance is on the drive's side."""

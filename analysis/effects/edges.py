@@ -1,4 +1,4 @@
-"""A metering edge: how far it is open at x of the spool's travel past it.
+"""Opening of a metering edge over the spool's travel x past it.
 
     opening = (x + (|x|^n + r^n)^(1/n)) / 2, n = 2 + c
 
@@ -19,15 +19,15 @@ from numba import njit
 from analysis.effects.base import Array, Shape
 
 CORNER: Final = 1.0  # where a search begins
-CORNER_BOUNDS: Final = (0.0, 10.0)  # beyond, all is nearer to straight lines than can be seen
+CORNER_BOUNDS: Final = (0.0, 10.0)  # above, the curve is indistinguishable from straight lines
 
 
 def rounding(name: str, stroke: float) -> Shape:
     """Return an edge's rounding [V], from sharp to 20 % of the spool's stroke [V].
 
     Clearances of some micrometres on a stroke of some tenths of a millimetre, and the notches of a
-    proportional valve's edges: an edge is open by half of its rounding, up to a tenth of the stroke
-    as by an underlap.
+    proportional valve's edges. At x = 0 the edge is open by half of its rounding: up to a tenth of
+    the stroke.
     """
     return Shape(name, "V", 0.0, 0.2 * stroke, (0.002 * stroke,), resolution=True)
 
@@ -48,7 +48,7 @@ def opened(x: Array, r: float, c: float) -> Array:
 
 @njit(cache=True)
 def edge(x, r, c):  # type: ignore[no-untyped-def]
-    """Return `opened` of one number."""
+    """Return `opened` at one x."""
     if c == 0.0:
         return 0.5 * (x + math.hypot(x, r))
     far, n = abs(x), 2.0 + c

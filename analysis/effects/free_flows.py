@@ -46,13 +46,13 @@ from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 from rig.model.units import plain
 
-OPENINGS: Final = 8  # knots of |u|, the first at the null; that and the last have no value
-PACKED: Final = 3 * OPENINGS  # numbers of an edge as `packed`
+OPENINGS: Final = 8  # knots of |u|, the first at the null; f is zero at it and at the last
+PACKED: Final = 3 * OPENINGS  # length of an edge's curve as `packed`
 # Quantiles of |u| for the knots: overlaps of a few per cent of the stroke lie near the first.
 TRAVEL: Final = (0.0, 0.04, 0.09, 0.16, 0.27, 0.45, 0.75, LAST)
-SOFTENS: Final = 0.2  # of a bulk modulus curve's range that it may soften by: its uncertainty
-PRESSURES: Final = 4  # knots of the oil's pressure; the last has no value: it is 1/b
-BACKWARDS: Final = 0.05  # of its largest flow that an edge may reverse: uncertainty
+SOFTENS: Final = 0.2  # of the compressibility's range: a rise with pressure within uncertainty
+PRESSURES: Final = 4  # knots of the oil's pressure; f is zero at the last
+BACKWARDS: Final = 0.05  # of an edge's largest flow: a reverse flow within its uncertainty
 EDGES: Final = ("pp", "pm", "mp", "mm")
 
 
@@ -120,14 +120,14 @@ class MeteringCurve(Effect):
         return tuple(Coefficient(name, "m^3/(s*Pa^0.5)", "fluid") for name in names)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the roots of the edge that is open times the curve's basis."""
+        """Return the curve's basis times the root of the pressure drop of the open edge."""
         i = self.joint
         u, cap, rod = signals.u[:, i], signals.p_cap[:, i], signals.p_rod[:, i]
         basis = spline(self.shape_of(rig, shape), np.abs(u))[:, 1:-1]
-        p_s, p_t, ahead, astern = signals.p_s, signals.p_tank, u > 0.0, u < 0.0
+        p_s, p_t, positive, negative = signals.p_s, signals.p_tank, u > 0.0, u < 0.0
         drops = {
-            "pp": ahead * root_of_drop(p_s - cap), "pm": -(astern * root_of_drop(cap - p_t)),
-            "mp": -(ahead * root_of_drop(rod - p_t)), "mm": astern * root_of_drop(p_s - rod),
+            "pp": positive * root_of_drop(p_s - cap), "pm": -(negative * root_of_drop(cap - p_t)),
+            "mp": -(positive * root_of_drop(rod - p_t)), "mm": negative * root_of_drop(p_s - rod),
         }  # fmt: skip
         out: Columns = {}
         for edge, drop in drops.items():
@@ -140,7 +140,7 @@ class MeteringCurve(Effect):
         return np.array([0.0, *(values[name] for name in self._names(edge)), 0.0])
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, then one curve an edge."""
+        """Return joint, then the curve of each edge."""
         knots = self.shape_of(rig, shape)
         curves = [packed(knots, self._values(values, edge)) for edge in EDGES]
         return np.concatenate(([self.joint], *curves))
@@ -153,13 +153,13 @@ class MeteringCurve(Effect):
         pp, pm, mp, mm = gain_names(self.joint + 1)
         unit = "m^3/(s*Pa^0.5)"
         out = []
-        for label, ahead, astern, gains, sign in (
+        for label, positive, negative, gains, sign in (
             ("cap edges over the spool", "pp", "pm", (pp, pm), 1.0),
             ("rod edges over the spool", "mp", "mm", (mp, mm), -1.0),
         ):
             weights = {gains[0]: sign * np.maximum(x, 0.0), gains[1]: sign * np.minimum(x, 0.0)}
-            weights |= zip(self._names(ahead), (sign * (x > 0.0) * basis.T), strict=True)
-            weights |= zip(self._names(astern), (-sign * (x < 0.0) * basis.T), strict=True)
+            weights |= zip(self._names(positive), (sign * (x > 0.0) * basis.T), strict=True)
+            weights |= zip(self._names(negative), (-sign * (x < 0.0) * basis.T), strict=True)
             out.append(Branch(label, x, weights, "V", unit))
         return tuple(out)
 
@@ -168,10 +168,10 @@ class MeteringCurve(Effect):
         knots = self.shape_of(rig, shape)
         at = shown(knots)
         for edge, gain in zip(EDGES, gain_names(self.joint + 1), strict=True):
-            own = spline(knots, at) @ self._values(values, edge)
-            whole = own + values.get(gain, 0.0) * at
-            least = -BACKWARDS * float(np.max(np.abs(whole)))
-            if np.min(whole) < least or np.min(whole - np.maximum.accumulate(whole)) < least:
+            curve = spline(knots, at) @ self._values(values, edge)
+            whole = curve + values.get(gain, 0.0) * at
+            lowest = -BACKWARDS * float(np.max(np.abs(whole)))
+            if np.min(whole) < lowest or np.min(whole - np.maximum.accumulate(whole)) < lowest:
                 return f"edge {gain} would close as the spool opens it, or pass oil backwards"
         return ""
 
@@ -231,7 +231,7 @@ class BulkModulusCurve(Effect):
         return tuple(f"softness_{k}" for k in range(1, PRESSURES))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return the additional softness at the knots [1/Pa]."""
+        """Return the additional compressibility at the knots [1/Pa]."""
         return tuple(Coefficient(name, "Pa^-1", "fluid") for name in self._names())
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -270,8 +270,8 @@ class BulkModulusCurve(Effect):
             return "the oil would not be compressible"
         # Air and hoses are softest at low pressure, and oil stiffens with pressure.
         rise = float(np.max(soft - np.minimum.accumulate(soft)))
-        falls = rise <= SOFTENS * float(np.ptp(soft))
-        return "" if falls else "the oil would be softer at higher pressure"
+        stiffens = rise <= SOFTENS * float(np.ptp(soft))
+        return "" if stiffens else "the oil would be softer at higher pressure"
 
 
 TERMS = (MeteringCurve, BulkModulusCurve)

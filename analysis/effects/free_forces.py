@@ -16,8 +16,8 @@ from analysis.effects.contact import NORMAL, contact_range, path_unit, slide
 from analysis.effects.curve import (
     LAST,
     curve_at,
-    freed,
     knot_shapes,
+    knot_values,
     packed,
     refuse_large,
     shortest_wave,
@@ -42,18 +42,18 @@ from rig.model.rig import Rig
 
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
 PLACES: Final = 6  # knots of s
-GROWS: Final = (-0.8, -0.3, 0.3, 0.8)  # of the friction at mid-stroke, at the end: first trials
-MOST_GROWTH: Final = 2.0  # of the same: friction vanishes half way from mid-stroke to an end
-ALIKE: Final = 0.03  # of gravity that a curve of s cannot fit: below, the records have one pose
-DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its uncertainty
-# Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
-# slope from the first to the last knot is the baseline's viscous friction there. Elsewhere that
-# slope goes with G^2, and the values stand for themselves.
+GROWS: Final = (-0.8, -0.3, 0.3, 0.8)  # starting growths up to the end, over friction at mid-stroke
+MOST_GROWTH: Final = 2.0  # in the same unit: friction vanishes half way to an end
+ALIKE: Final = 0.03  # share of gravity that no curve of s fits: below, the records have one pose
+DRIVES: Final = 0.1  # of the curve's largest force: negative friction within its uncertainty
+# Values at the knots of f per coefficient where G is 1: there a slope from the first to the last
+# knot is the baseline's viscous friction, and is left out. Elsewhere viscous friction goes with
+# G^2, and each knot has its own coefficient.
 LEVEL: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=np.float64)
 
 
 def _refuse_large_force(rig: Rig, joint: int, y: Array, what: str) -> str:
-    """Return that a curve (m,) exceeds half of the joint's force, in words ('' if not)."""
+    """Return the message for a curve y (m,) [N] above half of the joint's force ('' if not)."""
     return refuse_large(y, force_limit(rig, joint), what, force_unit(rig, joint))
 
 
@@ -85,8 +85,8 @@ class FrictionCurve(Friction):
     variable = "the piston's velocity"
     confounders = ("position_force",)
     separated_by = "slow and fast motion about several places of the stroke"
-    before = SPEEDS
-    after = 1
+    shapes_before = SPEEDS
+    shapes_after = 1
     kernel = _over_speed
 
     def knot_names(self) -> tuple[str, ...]:
@@ -119,14 +119,14 @@ class FrictionCurve(Friction):
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shapes with growths along the stroke from which a search begins.
 
-        Viscous friction and the slope of the curve, whose levers differ, imitate a growth: the
-        search from a small one may end there.
+        Viscous friction with the curve's slope, whose levers differ, imitates a growth: a search
+        from a small growth may end there.
         """
-        place = self._speed_place() + 1
-        if len(shape) > place:
+        growth_index = self._speed_index() + 1
+        if len(shape) > growth_index:
             return (tuple(shape),)
-        whole = (*shape, *(0.0,) * (place - len(shape)))
-        return tuple((*whole, growth) for growth in self.shapes(rig)[-1].grid)
+        padded = (*shape, *(0.0,) * (growth_index - len(shape)))
+        return tuple((*padded, growth) for growth in self.shapes(rig)[-1].grid)
 
     def _growth(self, shape: Sequence[float]) -> float:
         """Return the growth [1/m] of a shape, 0 where it has none."""
@@ -137,7 +137,7 @@ class FrictionCurve(Friction):
         return np.maximum(0.0, 1.0 + self._growth(shape) * (s - self._middle(rig)))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State between what shares of its value at mid-stroke the friction changes."""
+        """State the range of the friction along the stroke, over that at mid-stroke."""
         growth, i = self._growth(shape), self.joint
         places = [f(x.s[:, i]) for x in signals if x.excited[i] for f in (np.min, np.max)]
         if growth == 0.0 or not places:
@@ -166,51 +166,51 @@ class FrictionCurve(Friction):
         return shared, tuple(f"friction_{joint}_extending_{k}" for k in range(1, SPEEDS + 1))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return the values at the knots [N]: of f (electric: but for its slope), then of g."""
+        """Return the values at the knots [N]: of f (electric: without its slope), then of g."""
         unit = force_unit(rig, self.joint)
         return tuple(Coefficient(n, unit, "mechanical") for part in self._names(rig) for n in part)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G z and G |z| times the curves' bases."""
-        i, given = self.joint, self.shape_of(rig, shape)
-        z = self._along(rig, given, signals.s[:, i]) * self.contact(rig, signals, given)
-        basis = spline(given[:SPEEDS], np.abs(signals.sd[:, i]))
-        shared, own = self._names(rig)
+        i, shape = self.joint, self.shape_of(rig, shape)
+        z = self._along(rig, shape, signals.s[:, i]) * self.contact(rig, signals, shape)
+        basis = spline(shape[:SPEEDS], np.abs(signals.sd[:, i]))
+        shared, extending = self._names(rig)
         odd = (signals.G[:, i] * z)[:, None] * (basis @ self._shared(rig))
         even = (signals.G[:, i] * np.abs(z))[:, None] * basis
-        return self.row(dict(zip((*shared, *own), (*odd.T, *even.T), strict=True)))
+        return self.row(dict(zip((*shared, *extending), (*odd.T, *even.T), strict=True)))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, distance, transition speed, both curves, growth, middle of the stroke."""
-        given = self.shape_of(rig, shape)
-        shared, own = self._names(rig)
+        shape = self.shape_of(rig, shape)
+        shared, extending = self._names(rig)
         f = self._shared(rig) @ np.array([values[name] for name in shared])
-        g = np.array([values[name] for name in own])
-        distance, _, speed = self.contact_of(given)
-        knots = given[:SPEEDS]
-        along = self._growth(given), self._middle(rig)
+        g = np.array([values[name] for name in extending])
+        distance, _, speed = self.contact_of(shape)
+        knots = shape[:SPEEDS]
+        along = self._growth(shape), self._middle(rig)
         return np.array([self.joint, distance, speed, *packed(knots, f), *packed(knots, g), *along])
 
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
         """Return friction [N] over speed [m/s], the joint's Fv at mid-stroke included."""
-        knots, (shared, own) = shape[:SPEEDS], self._names(rig)
+        knots, (shared, extending) = shape[:SPEEDS], self._names(rig)
         v = np.concatenate((-shown(knots)[::-1], shown(knots)))
         basis, side = spline(knots, np.abs(v)), np.repeat([-1.0, 1.0], len(v) // 2)
         lever = float(rig.joints[self.joint].geometry(0.0)[1])
         weights = dict(zip(shared, (side[:, None] * (basis @ self._shared(rig))).T, strict=True))
-        weights |= dict(zip(own, basis.T, strict=True))
+        weights |= dict(zip(extending, basis.T, strict=True))
         weights[f"Fv{self.joint + 1}"] = v / lever**2
         unit = force_unit(rig, self.joint)
         return (Branch("friction over speed", v, weights, f"{path_unit(rig, self.joint)}/s", unit),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject driving friction, and more than half of the cylinder's force."""
+        """Reject negative friction, and more than half of the cylinder's force."""
         (line,) = self.branches(rig, self.shape_of(rig, shape))
         parts = {name: w * values.get(name, 0.0) for name, w in line.weights.items()}
         whole = np.asarray(sum(parts.values()))
-        own = np.asarray(sum(y for name, y in parts.items() if name != f"Fv{self.joint + 1}"))
+        curve = np.asarray(sum(y for name, y in parts.items() if name != f"Fv{self.joint + 1}"))
         against = whole * np.sign(line.x)
-        if np.min(against[line.x != 0.0]) < -DRIVES * np.max(np.abs(own)):
+        if np.min(against[line.x != 0.0]) < -DRIVES * np.max(np.abs(curve)):
             return "friction would drive the piston"
         return _refuse_large_force(rig, self.joint, against, "friction")
 
@@ -226,9 +226,9 @@ def _over_position(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-unty
 class PositionForce(Effect):
     """F = f(s) against extension: a force over the piston's position, f a curve (`curve`).
 
-    One of its values follows from the others, by weights (`gauge`) that come with the knots. Where
-    the records have one pose of the joints below, gravity is a force over position too, and the
-    curve is the remainder; elsewhere the highest divided difference is zero.
+    One value at a knot follows from the others, by weights (the gauge) that are fixed with the
+    knots. Where the joints below have one pose in all records, gravity is a force over position
+    too, and the curve is the remainder; elsewhere the highest divided difference is zero.
     """
 
     name = "position_force"
@@ -244,10 +244,10 @@ class PositionForce(Effect):
     where: str = "joint 1"
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the knots."""
-        joint, each = self.joint + 1, range(1, PLACES + 1)
-        knots = tuple(f"position_{joint}_knot_{k}" for k in each)
-        return (*knots, *(f"position_{joint}_gauge_{k}" for k in each))
+        """Name the knots, then the gauge's weights."""
+        joint, numbers = self.joint + 1, range(1, PLACES + 1)
+        knots = tuple(f"position_{joint}_knot_{k}" for k in numbers)
+        return (*knots, *(f"position_{joint}_gauge_{k}" for k in numbers))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return knots [m] and gauge [-]."""
@@ -260,30 +260,30 @@ class PositionForce(Effect):
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the piston's position, and the gauge of these records."""
-        place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
-        knots = spread_knots(place, (1.0 - LAST, 0.2, 0.4, 0.6, 0.8, LAST))
+        s = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
+        knots = spread_knots(s, (1.0 - LAST, 0.2, 0.4, 0.6, 0.8, LAST))
         if not len(knots):
             return ()
-        gauge = self._weight(rig, evidence, knots)
+        gauge = self._gravity_gauge(rig, evidence, knots)
         gauge = shortest_wave(knots) if gauge is None else gauge
         return ((*map(float, knots), *map(float, gauge)),)
 
-    def _weight(self, rig: Rig, evidence: Evidence, knots: Array) -> Array | None:
+    def _gravity_gauge(self, rig: Rig, evidence: Evidence, knots: Array) -> Array | None:
         """Return the gauge (K,) that assigns the joint's weight to gravity.
 
-        None where the records determine the weight by itself: a joint below moves too, or stands in
-        several poses, or there is no weight.
+        None where the records determine the weight without it (a joint below moves, or stands in
+        several poses), or there is no weight.
         """
         i = self.joint
         below = any(s.moving[:i].any() for s in evidence.signals)
         if below or rig.gravity == 0 or getattr(rig, "prismatic", False):
             return None
-        place = evidence.of_joint(i, lambda x: x.s[:, i])
+        s = evidence.of_joint(i, lambda x: x.s[:, i])
         lever = evidence.of_joint(i, lambda x: x.G[:, i])
-        basis = lever[:, None] * spline(tuple(knots), place)
+        basis = lever[:, None] * spline(tuple(knots), s)
         pull = evidence.of_joint(i, lambda x: np.sin(x.theta[:, i]))
-        like = np.linalg.lstsq(basis, pull, rcond=1e-9)[0]
-        if np.linalg.norm(pull - basis @ like) > ALIKE * np.linalg.norm(pull - np.mean(pull)):
+        fit = np.linalg.lstsq(basis, pull, rcond=1e-9)[0]
+        if np.linalg.norm(pull - basis @ fit) > ALIKE * np.linalg.norm(pull - np.mean(pull)):
             return None
         gauge = basis.T @ pull
         return np.asarray(gauge / np.linalg.norm(gauge))
@@ -293,10 +293,10 @@ class PositionForce(Effect):
 
     def _basis(self, shape: Sequence[float], x: Array) -> Array:
         """Return the curve (n, K - 1) per unit of every coefficient."""
-        return np.asarray(spline(shape[:PLACES], x) @ freed(np.array(shape[PLACES:])))
+        return np.asarray(spline(shape[:PLACES], x) @ knot_values(np.array(shape[PLACES:])))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return the values at the knots [N] but one, which follows from them."""
+        """Return the values at the knots [N] but the one that the gauge gives."""
         unit = force_unit(rig, self.joint)
         return tuple(Coefficient(name, unit, "mechanical") for name in self._names())
 
@@ -309,9 +309,10 @@ class PositionForce(Effect):
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, curve."""
-        given = self.shape_of(rig, shape)
-        y = freed(np.array(given[PLACES:])) @ np.array([values[name] for name in self._names()])
-        return np.array([self.joint, *packed(given[:PLACES], y)])
+        shape = self.shape_of(rig, shape)
+        free = np.array([values[name] for name in self._names()])
+        y = knot_values(np.array(shape[PLACES:])) @ free
+        return np.array([self.joint, *packed(shape[:PLACES], y)])
 
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
         """Return the force [N] over the position [m]."""

@@ -41,7 +41,7 @@ from rig.model.rig import Rig
 
 DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
 PLACES: Final = 9  # knots of the piston's position: wear is local
-BACKWARDS: Final = 0.05  # of its largest flow that a leak may reverse: its uncertainty
+BACKWARDS: Final = 0.05  # of a leak's largest flow: a reverse flow within its uncertainty
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class _FreeLeakage(Effect):
     where: str = "joint 1"
 
     def _refused(self, rig: Rig, flow: Array) -> str:
-        """Reject a flow (m,) [m^3/s] that pumps, or is more than half the pump's."""
+        """Return the message for a flow (m,) [m^3/s] that is reversed or above half the pump's."""
         if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
             return "the leak would pump"
         return refuse_large(flow, 0.5 * rig.supply.flow, "the leak", "m³/s")
@@ -108,7 +108,7 @@ class LeakageCurve(_FreeLeakage):
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots."""
-        return tuple(f"leak_{self.mark}_knot_{k}" for k in range(1, DROPS + 1))
+        return tuple(f"leak_{self.suffix}_knot_{k}" for k in range(1, DROPS + 1))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the knots [Pa]."""
@@ -120,7 +120,7 @@ class LeakageCurve(_FreeLeakage):
         return knot_points(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
 
     def _names(self) -> tuple[str, ...]:
-        return tuple(f"Q_leak_{self.mark}_{k}" for k in range(2, DROPS + 1))
+        return tuple(f"Q_leak_{self.suffix}_{k}" for k in range(2, DROPS + 1))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the flows at the knots [m^3/s]."""
@@ -130,12 +130,12 @@ class LeakageCurve(_FreeLeakage):
         """Return the curve's basis, out of the chamber that leaks and into the other."""
         drop = self.across(signals)
         basis = spline(self.shape_of(rig, shape), np.abs(drop))[:, 1:]
-        out = dict(zip(self._names(), (np.sign(drop) * basis.T), strict=True))
-        given = {name: -column for name, column in out.items()}
+        gained = dict(zip(self._names(), (np.sign(drop) * basis.T), strict=True))
+        lost = {name: -column for name, column in gained.items()}
         i = self.joint
         if self.side:
-            return {equation(f"flow_{self.side}", i): given}
-        return {equation("flow_cap", i): given, equation("flow_rod", i): out}
+            return {equation(f"flow_{self.side}", i): lost}
+        return {equation("flow_cap", i): lost, equation("flow_rod", i): gained}
 
     def _values(self, values: Mapping[str, float]) -> Array:
         return np.array([0.0, *(values[name] for name in self._names())])
@@ -153,7 +153,7 @@ class LeakageCurve(_FreeLeakage):
         return (Branch("leakage over pressure", at, weights, "Pa", "m^3/s"),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a leak that pumps, and one of more than half the pump's flow."""
+        """Reject a reversed leak, and more than half of the pump's flow."""
         knots = self.shape_of(rig, shape)
         return self._refused(rig, spline(knots, shown(knots)) @ self._values(values))
 
@@ -197,7 +197,7 @@ class LeakageAlongStroke(_FreeLeakage):
         return knot_shapes(self.shape_names(), "m", *rig.joints[self.joint].position_range)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return knots evenly spread over the piston's travel: wear may be where it is seldom."""
+        """Return knots evenly over the piston's travel: wear may be where it seldom is."""
         place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
         ends = np.quantile(place, (1.0 - LAST, LAST)) if len(place) else place
         return knot_points(ends, np.linspace(0.0, 1.0, PLACES).tolist())
@@ -233,7 +233,7 @@ class LeakageAlongStroke(_FreeLeakage):
         return (Branch("leakage over position", at, weights, "m", UNIT),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a leak that pumps, and one of more than half the pump's flow under load.
+        """Reject a reversed leak, and more than half of the pump's flow under load.
 
         The load is half of the supply's pressure: more across the piston hardly occurs.
         """

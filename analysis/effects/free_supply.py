@@ -25,12 +25,12 @@ from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, U, kernel
 from rig.model.rig import Rig
 
 FLOWS: Final = 3  # knots of the flow, the first at zero, without a drop
-LOOKS: Final = (0.05, 0.2)  # of the supply pressure, lost at the pump's flow, of first look
+STARTS: Final = (0.05, 0.2)  # starting drops at the pump's flow, of the supply pressure
 
 
 @kernel
-def _lost(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    # The flow through the line is what the open edges take at what is left of the pressure.
+def _line_drop(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # Bisection: the line's flow is what the open edges draw at the pressure after the drop.
     if phase == PREPARE:
         low, high = 0.0, 0.0
         for i in range(x.shape[1]):
@@ -40,13 +40,13 @@ def _lost(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
             high += gain * abs(u) * math.sqrt(max(bench[P_S] - p, 0.0))
         for _ in range(48):
             flow = 0.5 * (low + high)
-            port, taken = bench[P_S] - curve_at(flow, par, 0, 3), 0.0
+            port, drawn = bench[P_S] - curve_at(flow, par, 0, 3), 0.0
             for i in range(x.shape[1]):
                 u = x[U, i]
                 p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
                 gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
-                taken += gain * abs(u) * math.sqrt(max(port - p, 0.0))
-            if taken > flow:
+                drawn += gain * abs(u) * math.sqrt(max(port - p, 0.0))
+            if drawn > flow:
                 low = flow
             else:
                 high = flow
@@ -69,7 +69,7 @@ class SupplyCurve(PortEffect):
     quantity = "flow drawn"
     confounders = ("metering_curve", "tank_pressure")
     separated_by = "two amplitudes, one and both joints at once"
-    kernel = _lost
+    kernel = _line_drop
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the knots, then the drops at those above zero."""
@@ -80,7 +80,7 @@ class SupplyCurve(PortEffect):
         """Return the knots [m^3/s] and the drops [Pa]."""
         names, p = self.shape_names(), rig.supply.pressure
         drops = (
-            Shape(name, "Pa", 0.0, 0.9 * p, tuple(share * p for share in LOOKS), 0.0)
+            Shape(name, "Pa", 0.0, 0.9 * p, tuple(share * p for share in STARTS), 0.0)
             for name in names[FLOWS:]
         )
         return (*knot_shapes(names[:FLOWS], "m^3/s", 0.0, rig.supply.flow), *drops)
@@ -92,21 +92,21 @@ class SupplyCurve(PortEffect):
         if not len(knots):
             return ()
         p, share = rig.supply.pressure, knots[1:] / rig.supply.flow
-        return tuple((*map(float, knots), *map(float, look * p * share)) for look in LOOKS)
+        return tuple((*map(float, knots), *map(float, start * p * share)) for start in STARTS)
 
     def _drops(self, shape: Sequence[float]) -> Array:
         return np.array([0.0, *shape[FLOWS:]])
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the drop from the supply pressure."""
-        given = self.shape_of(rig, shape)
+        shape = self.shape_of(rig, shape)
         flow = port_flow(rig, signals, drawn=True)
-        return replace(signals, p_s=signals.p_s - spline(given[:FLOWS], flow) @ self._drops(given))
+        return replace(signals, p_s=signals.p_s - spline(shape[:FLOWS], flow) @ self._drops(shape))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return the curve, then C_pp and C_mm of each joint."""
-        given = self.shape_of(rig, shape)
-        curve = packed(given[:FLOWS], self._drops(given))
+        shape = self.shape_of(rig, shape)
+        curve = packed(shape[:FLOWS], self._drops(shape))
         return np.concatenate((curve, edge_gains(rig, values, (0, 3))))
 
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
@@ -118,8 +118,8 @@ class SupplyCurve(PortEffect):
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject drops at their bounds, and one that falls as the flow rises."""
-        given = self.shape_of(rig, shape)
-        drop = spline(given[:FLOWS], shown(given[:FLOWS])) @ self._drops(given)
+        shape = self.shape_of(rig, shape)
+        drop = spline(shape[:FLOWS], shown(shape[:FLOWS])) @ self._drops(shape)
         if np.min(np.diff(drop)) < -1e-3 * float(np.max(np.abs(drop))):
             return "the supply would lose less at more flow"
         return self.outside(rig, shape)

@@ -2,8 +2,8 @@
 
 Torque row of joint i (friction is on the load's side): ... + G F_f = G F. Every form is a level
 [N] times the state z of the seal's contact (`contact`), -1 <= z <= 1, which reverses within a
-presliding distance d of travel after each reversal (Dahl 1968; Jelali and Kroll 2003), the sooner
-the faster it is (stiffening k; of rubber: Ferry 1980):
+presliding distance d of travel after each reversal (Dahl 1968; Jelali and Kroll 2003), a shorter
+one at higher speed (stiffening k; of rubber: Ferry 1980):
 
     dz/ds = (1 + k |s'|) (sign(s') - z) / d
 
@@ -24,7 +24,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.effects.base import Array, Effect, Shape, out_of_range
 from analysis.effects.contact import (
     CAUCHY,
     FASTEST,
@@ -38,10 +38,10 @@ from analysis.effects.contact import (
     path_unit,
     presliding,
     slide,
+    stiffened_path,
     stiffening,
     tail,
     transition,
-    worked,
 )
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
@@ -57,10 +57,10 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-BREAKAWAY: Final = 0.1  # of the sliding level: less is the form of the contact, not a breakaway
-FALLEN: Final = 1 / 3  # of the breakaway, up to the records' top speed: less is one level's form
+BREAKAWAY: Final = 0.1  # of the sliding level: a smaller one is an error of the contact's form
+SMALLEST_FALL: Final = 1 / 3  # of the breakaway, up to the records' top speed: less is no Stribeck
 SLOWEST_FALL: Final = 0.5  # Stribeck over top speed: above it the fall is a line within 7 % rms
-SPEEDS: Final = 200  # points of the curve over speed in which a fall is looked for
+SPEEDS: Final = 200  # points of the curve over speed in which the fall is computed
 LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it is negligible: prevents division by zero
 GAUSSIAN, EXPONENTIAL = 2.0, 1.0  # exponents of the fall from breakaway
 
@@ -71,8 +71,8 @@ class Friction(Effect):
 
     Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen. A
     shape with a transition speed has no memory, and 0 for distance and stiffening; where the
-    contact is `tailed` it may state the tail of the spread. `before` and `after` count the shape
-    parameters before and after the contact's own.
+    contact is `tailed` it may state the tail of the spread. `shapes_before` and `shapes_after`
+    count the shape parameters before and after those of the contact.
     """
 
     mechanism = "friction_curve"
@@ -81,8 +81,8 @@ class Friction(Effect):
     quantity = "velocity"
     stiffens: ClassVar[bool] = False
     tailed: ClassVar[bool] = False
-    before: ClassVar[int] = 0
-    after: ClassVar[int] = 0
+    shapes_before: ClassVar[int] = 0
+    shapes_after: ClassVar[int] = 0
     where: str = "joint 1"
 
     def distance_names(self) -> tuple[str, ...]:
@@ -103,14 +103,14 @@ class Friction(Effect):
         """
         joint = self.joint + 1
         rate = (stiffening(f"stiffening_{joint}"),) if self.stiffens else ()
-        among = contact_range(rig, self.joint)
-        distances = (presliding(name, among) for name in self.distance_names())
+        limits = contact_range(rig, self.joint)
+        distances = (presliding(name, limits) for name in self.distance_names())
         spread = (tail(f"tail_{joint}"),) if self.tailed else ()
-        return (*distances, *rate, transition(f"transition_{joint}", among), *spread)
+        return (*distances, *rate, transition(f"transition_{joint}", limits), *spread)
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where the contact has a memory and can stiffen."""
-        if self.stiffens and self.remembers(shape) and len(shape) == self.before + 1:
+        if self.stiffens and self.remembers(shape) and len(shape) == self.shapes_before + 1:
             return ((*shape, STIFFENING),)
         return (tuple(shape),)
 
@@ -118,45 +118,45 @@ class Friction(Effect):
         """Return the contact without memory of a shape with one, else that of the other tail."""
         if not len(shape):
             return ()
-        place = self._speed_place()
+        place = self._speed_index()
         if not self.remembers(shape):
             other = () if self.tail_of(shape) == CAUCHY else (CAUCHY,)
             return ((*shape[: place + 1], *other),) if self.tailed else ()
-        none = (0.0,) * (place - self.before)
+        no_memory = (0.0,) * (place - self.shapes_before)
         speed = contact_range(rig, self.joint).speed
-        return ((*shape[: self.before], *none, speed, *shape[place + 1 :]),)
+        return ((*shape[: self.shapes_before], *no_memory, speed, *shape[place + 1 :]),)
 
-    def _speed_place(self) -> int:
-        """Return the place of the transition speed in a shape."""
-        return len(self.shape_names()) - self.after - 1 - self.tailed
+    def _speed_index(self) -> int:
+        """Return the index of the transition speed in a shape."""
+        return len(self.shape_names()) - self.shapes_after - 1 - self.tailed
 
     def tail_of(self, shape: Sequence[float]) -> float:
         """Return the tail of the spread of a contact without memory, `NORMAL` if not given."""
-        place = self._speed_place() + 1
+        place = self._speed_index() + 1
         return shape[place] if self.tailed and len(shape) > place else NORMAL
 
     def remembers(self, shape: Sequence[float]) -> bool:
         """Return whether the contact has memory: a presliding distance above 0."""
-        return len(shape) > self.before and shape[self.before] > 0.0
+        return len(shape) > self.shapes_before and shape[self.shapes_before] > 0.0
 
     def contact_of(self, shape: Sequence[float]) -> tuple[float, float, float]:
         """Return presliding distance [m], stiffening [s/m] and transition speed [m/s] of a shape.
 
         0, 0 and `TRANSITION` where they are not given.
         """
-        own = shape[self.before :]
-        rate = own[1] if self.stiffens and len(own) > 1 else 0.0
-        last = self._speed_place()
-        speed = shape[last] if len(shape) > last else TRANSITION
-        return (own[0] if len(own) else 0.0), rate, speed
+        contact = shape[self.shapes_before :]
+        rate = contact[1] if self.stiffens and len(contact) > 1 else 0.0
+        index = self._speed_index()
+        speed = shape[index] if len(shape) > index else TRANSITION
+        return (contact[0] if len(contact) else 0.0), rate, speed
 
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:
-        """Return the path (n,) [m] of the contact, with its stiffening."""
+        """Return the path s_w (n,) [m] of the contact (`stiffened_path`)."""
         i = self.joint
-        return worked(signals.s[:, i], signals.sd[:, i], self.contact_of(shape)[1])
+        return stiffened_path(signals.s[:, i], signals.sd[:, i], self.contact_of(shape)[1])
 
     def tolerance(self, shape: Sequence[float]) -> float:
-        """Return a fine tolerance without memory: with a coarser one, creep at rest is noise."""
+        """Return a finer tolerance without memory: with a coarser one, creep at rest is noise."""
         if self.remembers(shape):
             return self.rate_tolerance
         return 1e-3 * self.contact_of(shape)[2]
@@ -166,7 +166,7 @@ class Friction(Effect):
         return 1
 
     def fastest(self, shape: Sequence[float]) -> float:
-        """Return the bound of the contact's relaxation."""
+        """Return the bound of the contact's relaxation [1/s]."""
         return FASTEST
 
     def hidden_path(
@@ -217,7 +217,7 @@ def force_unit(rig: Rig, joint: int) -> str:
     return str(getattr(rig.joints[joint], "force_unit", "N"))
 
 
-FALLS: Final = 0.5  # of the level, up to the joint's speed limit: a level by Coulomb does not fall
+LARGEST_FALL: Final = 0.5  # of the level, up to the speed limit: Coulomb's level is constant
 
 
 @kernel
@@ -256,13 +256,13 @@ class CoulombFriction(Friction):
         return self.row({f"Fc{self.joint + 1}": signals.G[:, self.joint] * z})
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject friction that drives or falls with speed, and half of the cylinder's force."""
+        """Reject negative friction, a fall with speed, and more than half the cylinder's force."""
         name = f"Fc{self.joint + 1}"
         level, joint = values[name], rig.joints[self.joint]
         viscous = values.get(f"Fv{self.joint + 1}", 0.0) / float(joint.geometry(0.0)[1]) ** 2
-        if viscous * joint.limits.speed < -FALLS * abs(level):
+        if viscous * joint.limits.speed < -LARGEST_FALL * abs(level):
             return "viscous friction would be negative: this level falls with speed"
-        return beyond(name, level, "N", force_limit(rig, self.joint))
+        return out_of_range(name, level, "N", force_limit(rig, self.joint))
 
 
 @kernel
@@ -294,8 +294,8 @@ class StribeckFriction(Friction):
     confounders = ("coulomb_friction", "asymmetric_friction")
     includes = ("coulomb_friction",)  # at a high Stribeck speed
     beside = True
-    before = 1
-    after = 1
+    shapes_before = 1
+    shapes_after = 1
     separated_by = (
         "slow sweeps through zero velocity beside fast ones: it is gone above the Stribeck speed"
     )
@@ -315,15 +315,15 @@ class StribeckFriction(Friction):
 
         A shape without an exponent has n = 2.
         """
-        first, *_, last = self.shape_names()
+        stribeck_speed, *_, exponent_name = self.shape_names()
         speed = rig.joints[self.joint].limits.speed
         grid = (0.01 * speed, 0.03 * speed, 0.1 * speed)
         unit = f"{path_unit(rig, self.joint)}/s"
-        own = Shape(first, unit, 1e-3 * speed, 0.4 * speed, grid)
+        falling = Shape(stribeck_speed, unit, 1e-3 * speed, 0.4 * speed, grid)
         exponent = Shape(
-            last, "1", EXPONENTIAL, EXPONENTIAL, (EXPONENTIAL,), detail=True, fixed=True
+            exponent_name, "1", EXPONENTIAL, EXPONENTIAL, (EXPONENTIAL,), detail=True, fixed=True
         )
-        return (own, *super().shapes(rig), exponent)
+        return (falling, *super().shapes(rig), exponent)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the contact without memory, and the fall with the other exponent."""
@@ -364,50 +364,50 @@ class StribeckFriction(Friction):
         return np.array([self.joint, force, falling, distance, speed, self._exponent(shape)])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a breakaway below Coulomb's level, too much of it, and a speed at its bounds.
+        """Reject a negative, small or too large breakaway, and a Stribeck speed at its bounds.
 
-        One of less than `BREAKAWAY` of Coulomb's level beside it is a detail of the contact.
+        Below `BREAKAWAY` of Coulomb's level it is an error of the contact's form.
         """
         name = f"Fs{self.joint + 1}"
         force, level = values[name], values.get(f"Fc{self.joint + 1}", 0.0)
         if 0.0 < force < BREAKAWAY * level:
             return f"{name} = {force:.3g} N is {force / level:.1%} of the sliding level"
-        too_large = beyond(name, force, "N", force_limit(rig, self.joint))
+        too_large = out_of_range(name, force, "N", force_limit(rig, self.joint))
         return too_large or Effect.outside(self, rig, shape[:1])
 
     def not_shown(
         self, rig: Rig, values: Mapping[str, float], shape: Sequence[float],
         terms: Sequence[Used], signals: Sequence[Signals],
     ) -> str:  # fmt: skip
-        """Say so where the joint's dry friction hardly falls up to the records' top speed.
+        """Return the message where dry friction hardly falls up to the records' top speed.
 
-        Two contacts of different transition speeds give any smooth curve that only rises, and a
-        fall over most of the speeds is that of a level beside another viscous friction.
+        Two contacts of different transition speeds fit any smooth rising curve, and a fall over
+        most of the speed range equals a constant level with other viscous friction.
         """
         i, unit = self.joint, f"{path_unit(rig, self.joint)}/s"
         top = max((float(np.abs(s.sd[:, i]).max()) for s in signals if s.excited[i]), default=0.0)
         if shape[0] > SLOWEST_FALL * top:
             return (
                 f"Stribeck speed {shape[0]:.3g} {unit}, over {SLOWEST_FALL:.0%} of the records' "
-                f"top speed {top:.3g} {unit}: viscous friction makes up for such a fall"
+                f"top speed {top:.3g} {unit}: viscous friction fits such a fall as well"
             )
         v = np.linspace(0.0, top, SPEEDS + 1)[1:]
-        own = self.coefficients(rig)[0]
-        total = values[own.parameter] * self._level(rig, v, shape) * self.over_speed(v, shape)
+        breakaway = self.coefficients(rig)[0]
+        total = values[breakaway.parameter] * self._level(rig, v, shape) * self.over_speed(v, shape)
         for used in terms:
             other = used.term
             if not isinstance(other, Friction) or other == self or other.where != self.where:
                 continue
-            levels = [c for c in other.coefficients(rig) if c.unit == own.unit]
+            levels = [c for c in other.coefficients(rig) if c.unit == breakaway.unit]
             level = sum(values.get(c.parameter, 0.0) for c in levels) / max(len(levels), 1)
             total = total + level * other.over_speed(v, used.shape)
         fall = float(total.max() - total[-1])
-        if fall >= FALLEN * values[own.parameter]:
+        if fall >= SMALLEST_FALL * values[breakaway.parameter]:
             return ""
         return (
             f"up to {top:.3g} {unit}, the top speed of the records, dry friction falls by "
-            f"{fall:.3g} {own.unit}: that is no breakaway of {own.parameter} = "
-            f"{values[own.parameter]:.3g}"
+            f"{fall:.3g} {breakaway.unit}: that is no breakaway of {breakaway.parameter} = "
+            f"{values[breakaway.parameter]:.3g}"
         )
 
 

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from analysis.effects.base import Array, Shape, beyond
+from analysis.effects.base import Array, Shape, out_of_range
 from analysis.effects.contact import (
     FASTEST,
     NORMAL,
@@ -67,7 +67,7 @@ class AsymmetricFriction(Friction):
     da/ds = (1 - a)/d_ext, dr/ds = -r/d_ext; retracting, over the travel |s|, da = -a/d_ret,
     dr = (1 - r)/d_ret. Source: Jelali and Kroll 2003 (levels by direction).
     On an electric joint, which has no lever arm, it equals `coulomb_friction` of (F_ext + F_ret)/2
-    with a `torque_offset` of (F_ext - F_ret)/2 wherever it slides, and is named as those.
+    with a `torque_offset` of (F_ext - F_ret)/2 while it slides, and is reported as these two.
     """
 
     hydraulic = True
@@ -99,14 +99,14 @@ class AsymmetricFriction(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G a and -G r."""
         lever = signals.G[:, self.joint]
-        ahead, back = self._shares(rig, signals, shape)
-        return self.row(dict(zip(self._names(), (lever * ahead, -lever * back), strict=True)))
+        a, r = self._shares(rig, signals, shape)
+        return self.row(dict(zip(self._names(), (lever * a, -lever * r), strict=True)))
 
     def _shares(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> tuple[Array, Array]:
-        """Return the shares (n,) of the two levels along the measured path."""
+        """Return the shares a, r (n,) of the two levels along the measured path."""
         if self.remembers(shape):
-            ahead, back = contact_levels(self.path(signals, ()), shape[0], shape[1])
-            return ahead, back
+            a, r = contact_levels(self.path(signals, ()), shape[0], shape[1])
+            return a, r
         z = self.contact(rig, signals, shape)
         return np.maximum(z, 0.0), np.maximum(-z, 0.0)
 
@@ -114,9 +114,9 @@ class AsymmetricFriction(Friction):
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return the force over the sum of both levels, times the first distance (n,) [m]."""
-        ahead, back = self._shares(rig, signals, shape)
+        a, r = self._shares(rig, signals, shape)
         extending, retracting = (values[name] for name in self._names())
-        force = extending * ahead - retracting * back
+        force = extending * a - retracting * r
         return np.asarray(shape[0] * force / (extending + retracting))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
@@ -127,12 +127,12 @@ class AsymmetricFriction(Friction):
         return np.array([self.joint, *linear, *contact])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a driving direction, too much, and directions that do not differ."""
+        """Reject a negative or too large level, and levels that hardly differ."""
         limit = force_limit(rig, self.joint)
         levels = [values[name] for name in self._names()]
         least = LEAST_SHARE * max(map(abs, levels))
         for name, level in zip(self._names(), levels, strict=True):
-            too_large = beyond(name, level, "N", limit, least)
+            too_large = out_of_range(name, level, "N", limit, least)
             if too_large:
                 return too_large
         if self.simpler(rig, values):
@@ -141,14 +141,14 @@ class AsymmetricFriction(Friction):
 
     def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
         """Return Coulomb friction where the levels differ by less than `DIFFERENCE` of the mean."""
-        ahead, back = (values[name] for name in self._names())
-        equal = abs(ahead - back) < times * DIFFERENCE * 0.5 * (ahead + back)
+        extending, retracting = (values[name] for name in self._names())
+        equal = abs(extending - retracting) < times * DIFFERENCE * 0.5 * (extending + retracting)
         return "coulomb_friction" if equal else ""
 
     def distinct(self, intervals: Mapping[str, tuple[float, float]]) -> bool:
         """Return whether the intervals of both levels have no value in common."""
-        ahead, back = (intervals[name] for name in self._names())
-        return ahead[1] < back[0] or back[1] < ahead[0]
+        extending, retracting = (intervals[name] for name in self._names())
+        return extending[1] < retracting[0] or retracting[1] < extending[0]
 
 
 @kernel
@@ -185,7 +185,7 @@ class PressureDependentFriction(Friction):
     name = "pressure_dependent_friction"
     least = (5e-6,)  # [m^2]
     stiffens = True
-    after = 2
+    shapes_after = 2
     variable = "the chamber pressures, with the velocity's sign"
     confounders = ("coulomb_friction", "asymmetric_friction")
     separated_by = (
@@ -198,21 +198,21 @@ class PressureDependentFriction(Friction):
         return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the contact's numbers, the rod pressure's weight, and what the load leaves alone."""
+        """Name the contact's shapes, the rod pressure's weight and the constant distance."""
         joint = self.joint + 1
         return (*super().shape_names(), f"rod_weight_{joint}", f"constant_distance_{joint}")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the contact's shapes, the rod pressure's weight, and the constant distance.
 
-        A shape without the last two is of the sum and of the constant stiffness.
+        A shape without the last two is that of the sum, at a constant stiffness.
         """
         weight, constant = self.shape_names()[-2:]
-        known = (
+        fixed = (
             Shape(weight, "1", DIFFERENCE_LOAD, SUM, (DIFFERENCE_LOAD,), detail=True, fixed=True),
             Shape(constant, "1", 1.0, 1.0, (1.0,), detail=True, fixed=True),
         )
-        return (*super().shapes(rig), *known)
+        return (*super().shapes(rig), *fixed)
 
     def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
         """Return a contact with memory under the difference of the pressures."""
@@ -236,7 +236,7 @@ class PressureDependentFriction(Friction):
         return forms
 
     def comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
-        """Return whether both shapes are of the same load."""
+        """Return whether both shapes weight the rod pressure alike."""
         return self._weight(shape) == self._weight(other)
 
     def _weight(self, shape: Sequence[float]) -> float:
@@ -281,9 +281,10 @@ class PressureDependentFriction(Friction):
         return np.array([self.joint, k, *self.contact_of(shape), pressure, weight])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject friction that drives, and more than half of the cylinder's force."""
+        """Reject negative friction, and more than half of the cylinder's force."""
         name = f"k_friction_{self.joint + 1}"
-        return beyond(name, values[name], "m^2", 0.5 * rig.joints[self.joint].cylinder.cap_area)
+        half_area = 0.5 * rig.joints[self.joint].cylinder.cap_area
+        return out_of_range(name, values[name], "m^2", half_area)
 
 
 TERMS = (AsymmetricFriction, PressureDependentFriction)

@@ -21,7 +21,7 @@ from analysis.signals.conditioning import Signals
 from analysis.terms.base import PREPARE, U, kernel
 from rig.model.rig import Rig
 
-TAKEN_UP: Final = 5e-4  # [s] time constant of the play in simulation
+PLAY_TIME: Final = 5e-4  # [s] time constant of a play operator in simulation
 OPERATORS: Final = 8  # of play, where their widths spread
 # Widths of the operators over their mean where they spread most: the means of equal parts of an
 # exponential distribution, as of friction that builds up along the spool's travel (Dahl 1968).
@@ -38,7 +38,7 @@ def _play(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
         mean = 0.0
         for k in range(OPERATORS):
             pushed = min(max(z[k], u - par[2 + k]), u + par[2 + k])
-            dz[k] = (pushed - z[k]) / TAKEN_UP
+            dz[k] = (pushed - z[k]) / PLAY_TIME
             mean += pushed / OPERATORS
         x[U, i] = mean + par[1] * (mean - u)
 
@@ -77,7 +77,7 @@ class SpoolHysteresis(ValveEffect):
         )
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the width with reversals along some travel, from slow to steep."""
+        """Return the width with reversals that need travel, from slow to steep."""
         if len(shape) > 1:
             return (tuple(shape),)
         return tuple((shape[0], *start) for start in ((0.5, 0.0), (0.9, 1.0), (0.9, 2.5)))
@@ -88,7 +88,7 @@ class SpoolHysteresis(ValveEffect):
 
     def half_widths(self, rig: Rig, shape: Sequence[float]) -> Array:
         """Return half of each operator's width (m,) [V]."""
-        width, spread, steepness = self.whole(rig, shape)
+        width, spread, steepness = self.full_shape(rig, shape)
         return 0.5 * width / (1.0 + steepness) * (1.0 + spread * (WIDTHS - 1.0))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
@@ -98,7 +98,7 @@ class SpoolHysteresis(ValveEffect):
     def opening(self, rig: Rig, u: Array, shape: Sequence[float]) -> Array:
         """Return the opening (n,) [V] along the spool u (n,) [V]."""
         mean = self.operators(rig, u, shape).mean(axis=1)
-        return np.asarray(mean + self.whole(rig, shape)[2] * (mean - u))
+        return np.asarray(mean + self.full_shape(rig, shape)[2] * (mean - u))
 
     def operators(self, rig: Rig, u: Array, shape: Sequence[float]) -> Array:
         """Return the operators' outputs (n, m) [V] along the spool u (n,) [V]."""
@@ -113,11 +113,11 @@ class SpoolHysteresis(ValveEffect):
 
     def fastest(self, shape: Sequence[float]) -> float:
         """Return the rate at which the simulated play follows the spool."""
-        return 1.0 / TAKEN_UP
+        return 1.0 / PLAY_TIME
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, steepness, half of each operator's width [V]."""
-        steepness = self.whole(rig, shape)[2]
+        steepness = self.full_shape(rig, shape)[2]
         return np.array([self.joint, steepness, *self.half_widths(rig, shape)], dtype=np.float64)
 
 

@@ -30,7 +30,7 @@ from rig.model.rig import Rig
 
 TRANSITION: Final = "dp_laminar"
 SHARPNESS: Final = "sharpness"
-SUM: Final = 1.0  # the sharpness of a form that has none: the drops add
+SUM: Final = 1.0  # sharpness of a shape that states none: laminar and turbulent drop add
 
 
 @kernel
@@ -41,11 +41,11 @@ def _laminar(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-de
     for i in range(x.shape[1]):
         u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
         if u > 0.0:
-            out[FLOW_CAP, i] += par[2 + 4 * i] * lost_root(p_s - cap, t, n) * u
-            out[FLOW_ROD, i] -= par[4 + 4 * i] * lost_root(rod - p_t, t, n) * u
+            out[FLOW_CAP, i] += par[2 + 4 * i] * root_change(p_s - cap, t, n) * u
+            out[FLOW_ROD, i] -= par[4 + 4 * i] * root_change(rod - p_t, t, n) * u
         else:
-            out[FLOW_CAP, i] += par[3 + 4 * i] * lost_root(cap - p_t, t, n) * u
-            out[FLOW_ROD, i] -= par[5 + 4 * i] * lost_root(p_s - rod, t, n) * u
+            out[FLOW_CAP, i] += par[3 + 4 * i] * root_change(cap - p_t, t, n) * u
+            out[FLOW_ROD, i] -= par[5 + 4 * i] * root_change(p_s - rod, t, n) * u
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class LaminarOrifice(Effect):
 
     The drops of turbulent and of laminar flow add for n = 1 (Merritt 1967, chapter 3), and the
     larger one alone counts for a large n, the form's sharpness. Far above dp_t the flow is the
-    orifice's C u dp^(1/2), far below C u dp / dp_t^(1/2). The columns are what the orifices' lack,
-    under the orifices' own gains, which are too small without it.
+    orifice's C u dp^(1/2), far below C u dp / dp_t^(1/2). The columns are the difference from those
+    of the orifices, under the same gains; without it the gains are estimated too small.
     """
 
     name = "laminar_orifice"
@@ -86,18 +86,18 @@ class LaminarOrifice(Effect):
         )
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the opening times what the roots lose, under the orifices' own names."""
-        transition, sharpness = self.whole(rig, shape)
+        """Return the opening times the change of the roots, under the orifices' gains."""
+        transition, sharpness = self.full_shape(rig, shape)
 
-        def lost(drop: Array) -> Array:
+        def change(drop: Array) -> Array:
             share = share_of_root(np.maximum(np.abs(drop), 1.0), transition, sharpness or SUM)
             return np.asarray(root_of_drop(drop) * (share - 1.0))
 
-        return edge_columns(signals, lost)
+        return edge_columns(signals, change)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return dp_t, n, then the gains of each joint."""
-        transition, sharpness = self.whole(rig, shape)
+        transition, sharpness = self.full_shape(rig, shape)
         gains = (values[c.parameter] for c in self.coefficients(rig))
         return np.array([transition, sharpness or SUM, *gains])
 
@@ -106,9 +106,9 @@ class LaminarOrifice(Effect):
         out: dict[str, Array] = {}
         p_s, p_t = signals.p_s, signals.p_tank
         for i in signals.excited_joints:
-            ahead, cap, rod = signals.u[:, i] > 0.0, signals.p_cap[:, i], signals.p_rod[:, i]
-            out[equation("flow_cap", i)] = np.where(ahead, p_s - cap, cap - p_t)
-            out[equation("flow_rod", i)] = np.where(ahead, rod - p_t, p_s - rod)
+            positive, cap, rod = signals.u[:, i] > 0.0, signals.p_cap[:, i], signals.p_rod[:, i]
+            out[equation("flow_cap", i)] = np.where(positive, p_s - cap, cap - p_t)
+            out[equation("flow_rod", i)] = np.where(positive, rod - p_t, p_s - rod)
         return out
 
 
@@ -120,8 +120,8 @@ def share_of_root(size, transition, sharpness):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def lost_root(drop, transition, sharpness):  # type: ignore[no-untyped-def]
-    """Return what laminar flow takes from the signed root [Pa^0.5] of one drop [Pa]."""
+def root_change(drop, transition, sharpness):  # type: ignore[no-untyped-def]
+    """Return the change of the signed root [Pa^0.5] of one drop [Pa] by laminar flow."""
     return signed_root(drop) * (share_of_root(max(abs(drop), 1.0), transition, sharpness) - 1.0)
 
 

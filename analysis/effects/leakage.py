@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import Array, Effect, Shape, beyond, exponent
+from analysis.effects.base import Array, Effect, Shape, exponent, out_of_range
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -38,7 +38,7 @@ UNIT: Final = "m^3/(s*Pa)"
 EXPONENT_BOUNDS: Final = (0.4, 1.0)  # 0.5 of a sharp edge, 1 of a narrow gap
 EXPONENT_START: Final = 0.7  # where a search begins
 REFERENCE: Final = 1e6  # [Pa] where c is the flow over dp whatever the exponent
-FINITE: Final = 1e3  # [Pa] below it the flow is in proportion to dp
+LINEAR_BELOW: Final = 1e3  # [Pa] below it the flow is in proportion to dp
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class _Leakage(Effect):
 
     @property
     def _parameter(self) -> str:
-        return f"c_{self.mark}"
+        return f"c_{self.suffix}"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return c [m^3/(s Pa)]."""
@@ -64,9 +64,9 @@ class _Leakage(Effect):
         return (Shape(name, "", *EXPONENT_BOUNDS, (EXPONENT_START,), detail=True),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a leak that pumps, and one of more than half the pump at full pressure."""
-        most = float(flow_form(rig.supply.pressure, exponent(shape)))
-        return beyond(self._parameter, values[self._parameter], UNIT, 0.5 * rig.supply.flow / most)
+        """Reject a negative leak, and more than half the pump's flow at supply pressure."""
+        name, flow_per_c = self._parameter, float(flow_form(rig.supply.pressure, exponent(shape)))
+        return out_of_range(name, values[name], UNIT, 0.5 * rig.supply.flow / flow_per_c)
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the exponent and where c holds, of a leak that is not laminar."""
@@ -89,7 +89,7 @@ def flow_form(drop, n):  # type: ignore[no-untyped-def]
     """Return dp (|dp| / p_r)^(n - 1) [Pa] of pressure differences dp [Pa] (see the module)."""
     if n == 1.0:
         return drop
-    return drop * ((drop * drop + FINITE**2) / REFERENCE**2) ** (0.5 * (n - 1.0))
+    return drop * ((drop * drop + LINEAR_BELOW**2) / REFERENCE**2) ** (0.5 * (n - 1.0))
 
 
 @kernel
@@ -118,9 +118,9 @@ class InternalLeakage(_Leakage):
     kernel = _internal
 
     @property
-    def mark(self) -> str:
+    def suffix(self) -> str:
         """How its parameters' names end: `internal_1`."""
-        return f"internal_{super().mark}"
+        return f"internal_{super().suffix}"
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the flow per unit c, out of the cap side and into the rod side."""
@@ -171,9 +171,9 @@ class ExternalLeakage(_Leakage):
         return (self.side,) if self.side else ("cap", "rod")
 
     @property
-    def mark(self) -> str:
+    def suffix(self) -> str:
         """How its parameters' names end: `external_1`, `external_1_cap`."""
-        return f"external_{super().mark}"
+        return f"external_{super().suffix}"
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the flow per unit c out of each leaking chamber."""

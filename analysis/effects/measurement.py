@@ -1,4 +1,4 @@
-"""Effects of measurement: the channel that a sensor's error is in and what follows from it.
+"""Sensor effects: common parts, and the signals that depend on a channel.
 
 They transform the data, not the model: `prepare` undoes them in the signals, and the plant's
 equations hold between the corrected signals. `correct` does the same to sampled channels, so that a
@@ -43,23 +43,23 @@ class Sensor(SignalEffect):
 
     @property
     def shared(self) -> str:
-        """The kind of all channels that share it, as `pressure` or `piston`; none: ''."""
+        """The kind whose channels all have the error, as `pressure`; '' where it is one channel."""
         return self.where.removeprefix("bench").strip() if self.where.startswith("bench ") else ""
 
     @property
     def least_joints(self) -> int:
-        """Return how many joints must move; with one, all pistons are that joint's."""
+        """Return the least number of moving joints; with one, all pistons are that joint's."""
         return 2 if self.shared and self.shared != "pressure" else 1
 
     def each(self, rig: Rig) -> tuple[Sensor, ...]:
-        """Return the effect at every channel that shares it."""
+        """Return the effect at every channel of the kind `shared`."""
         sides = ("cap", "rod") if self.shared == "pressure" else (self.shared,)
         joints = range(1, len(rig.joints) + 1)
         return tuple(type(self)(f"joint {i} {side}") for i in joints for side in sides)
 
     @property
     def channel(self) -> str:
-        """The channel's name, or of several the kind."""
+        """The channel's name; of all channels of a kind, the kind."""
         if self.shared:
             return self.shared
         if self.where == "bench":
@@ -67,8 +67,8 @@ class Sensor(SignalEffect):
         return ch.channel(KINDS[self.side], self.joint + 1)
 
     @property
-    def mark(self) -> str:
-        """How its parameters' names end: the channel's name."""
+    def suffix(self) -> str:
+        """The end of its parameters' names: the channel's name."""
         return self.channel
 
     @classmethod
@@ -84,7 +84,7 @@ class Sensor(SignalEffect):
         return np.zeros(1)
 
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
-        """Return d^order/dt^order of the true quantity from that of the reading x (n,)."""
+        """Return the true derivative of an order (0, 1, 2) from that of the reading, x (n,)."""
         raise NotImplementedError
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
@@ -109,7 +109,7 @@ class Sensor(SignalEffect):
         return replace(signals, **new)
 
     def _moved(self, rig: Rig, signals: Signals, value: float) -> Signals:
-        """Return the signals with another piston: angles, Jacobian and volumes follow."""
+        """Return the signals with a corrected piston, and its angles, Jacobian and volumes."""
         i, linkage = self.joint, rig.joints[self.joint].linkage
         names = ("s", "sd", "q", "qd", "qdd", "G", "V_cap", "V_rod")
         new = {name: getattr(signals, name).copy() for name in names}
@@ -127,16 +127,16 @@ class Sensor(SignalEffect):
         new["qdd"][:, i] = (sdd - slope * (sd / G) ** 2) / G
         volumes = rig.chamber_volumes(i, s)
         # Other effects may have added to the volumes.
-        for field, now, before in zip(
+        for field, corrected, read in zip(
             ("V_cap", "V_rod"), volumes, rig.chamber_volumes(i, signals.s[:, i]), strict=True
         ):
-            new[field][:, i] += now - before
+            new[field][:, i] += corrected - read
         turn = np.zeros_like(signals.theta)
         turn[:, i:] = (q - signals.q[:, i])[:, None]
         return replace(signals, theta=signals.theta + turn, **new)
 
     def _turned(self, signals: Signals, value: float) -> Signals:
-        """Return the signals with another position of an electric joint."""
+        """Return the signals with the position of an electric joint corrected."""
         i, new = self.joint, {}
         for order, names in enumerate((("s", "q"), ("sd", "qd"), ("qdd",))):
             x = self.undone(getattr(signals, names[-1])[:, i], order, signals.rate, value)
@@ -165,7 +165,7 @@ class Sensor(SignalEffect):
         return names.get(self.shared or self.side, "pressure")
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
-        """Return the channel, in the rows in which it occurs first."""
+        """Return the channel [its unit] (n,), in the rows that use it directly."""
         if self.shared:
             parts = [channel.abscissa(rig, signals) for channel in self.each(rig)]
             return {name: x for channel in parts for name, x in channel.items()}

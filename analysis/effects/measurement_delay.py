@@ -22,18 +22,18 @@ from analysis.signals.conditioning import Signals
 from analysis.signals.filters import align
 from rig.model.rig import Rig
 
-MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
+MARGIN: Final = 16  # [samples] reach of the interpolation of a shift
 
 
 @dataclass(frozen=True)
-class Late(Sensor):
+class TimingError(Sensor):
     """Common parts of delays and lags, which may act on all channels of a kind."""
 
     hydraulic = False
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return every channel, then all of a kind, where these are several."""
+        """Return every channel, then all channels of a kind where there are several."""
         kinds: tuple[str, ...] = () if rig.electric else ("pressure",)
         if len(rig.joints) > 1:
             kinds = (*kinds, *(ELECTRIC if rig.electric else ("piston", "spool")))
@@ -45,10 +45,10 @@ class Late(Sensor):
         return (Shape(self.shape_names()[0], "s", 0.0, longest_lag(rig), grid, 0.0),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds, and a delay of an input within its path between samples."""
-        held = not {"spool", "drive"}.isdisjoint((self.side, self.shared))
-        bent = between_samples(rig, self.shape_of(rig, shape)[0]) if held else ""
-        return super().problem(rig, values, shape) or bent
+        """Reject a shape at its bounds, and an input's delay that sampling may cause."""
+        is_input = not {"spool", "drive"}.isdisjoint((self.side, self.shared))
+        artefact = between_samples(rig, self.shape_of(rig, shape)[0]) if is_input else ""
+        return super().problem(rig, values, shape) or artefact
 
     def plotted(self) -> str:
         """Name the rate of the channel's quantity."""
@@ -60,7 +60,7 @@ class Late(Sensor):
 
 
 @dataclass(frozen=True)
-class ChannelDelay(Late):
+class ChannelDelay(TimingError):
     """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
 
     name = "channel_delay"
@@ -78,15 +78,15 @@ class ChannelDelay(Late):
         return align(x, value * rate)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
-        """Advance the channel; the samples that come from beyond the record's end are invalid."""
-        lost = math.ceil(self.shape_of(rig, shape)[0] * signals.rate) + MARGIN
+        """Advance the channel; samples interpolated beyond the record's end become invalid."""
+        invalid = math.ceil(self.shape_of(rig, shape)[0] * signals.rate) + MARGIN
         valid = signals.valid.copy()
-        valid[len(valid) - lost :] = False
+        valid[len(valid) - invalid :] = False
         return super().prepare(rig, replace(signals, valid=valid), shape)
 
 
 @dataclass(frozen=True)
-class SensorLag(Late):
+class SensorLag(TimingError):
     """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter."""
 
     name = "sensor_lag"

@@ -44,22 +44,22 @@ class SensorCrosstalk(Sensor):
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the wrong area of the other chamber that has the same force."""
-        cylinder, other = rig.joints[self.joint].cylinder, self._other
+        cylinder, other = rig.joints[self.joint].cylinder, self._other_side
         areas = getattr(cylinder, f"{self.side}_area") / getattr(cylinder, f"{other}_area")
         return _same_force(other, 1.0 + self.shape_of(rig, shape)[0] * areas)
 
     @property
-    def _other(self) -> str:
+    def _other_side(self) -> str:
         """The other chamber of the cylinder."""
         return "rod" if self.side == "cap" else "cap"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the share of the other pressure that is seen [-], up to three tenths."""
+        """Return the share k of the other pressure in the reading [-], up to three tenths."""
         return (Shape(self.shape_names()[0], "", -0.3, 0.3, (-0.06, -0.015, 0.015, 0.06), 0.0),)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the other chamber's share from the pressure and its rate."""
-        share, i, other = self.shape_of(rig, shape)[0], self.joint, self._other
+        share, i, other = self.shape_of(rig, shape)[0], self.joint, self._other_side
         new = {}
         for field in ("p", "pd"):
             x = getattr(signals, f"{field}_{self.side}").copy()
@@ -72,7 +72,7 @@ class SensorCrosstalk(Sensor):
     ) -> dict[str, Array]:
         """Return the channels as a correct sensor would have sampled them, each (n,)."""
         out = dict(channels)
-        other = ch.channel(KINDS[self._other], self.joint + 1)
+        other = ch.channel(KINDS[self._other_side], self.joint + 1)
         if self.channel in out and other in out:
             out[self.channel] = out[self.channel] - self.shape_of(rig, shape)[0] * out[other]
         return out
@@ -131,10 +131,10 @@ class SensorGain(Sensor):
         if bend == 0.0:
             return new
         if self.where == "bench":
-            return replace(new, p_s=_straight(new.p_s, bend, supply))
+            return replace(new, p_s=_linearised(new.p_s, bend, supply))
         p, pd = getattr(new, f"p_{self.side}").copy(), getattr(new, f"pd_{self.side}").copy()
         i = self.joint
-        p[:, i] = _straight(p[:, i], bend, supply)
+        p[:, i] = _linearised(p[:, i], bend, supply)
         pd[:, i] /= 1.0 - bend + 4.0 * bend * p[:, i] / supply
         return replace(new, **{f"p_{self.side}": p, f"pd_{self.side}": pd})
 
@@ -144,12 +144,12 @@ class SensorGain(Sensor):
         """Return the channels as a correct sensor would have sampled them, each (n,)."""
         out = super().correct(rig, channels, rate, shape)
         if _bend(shape) and self.channel in out:
-            out[self.channel] = _straight(out[self.channel], _bend(shape), rig.supply.pressure)
+            out[self.channel] = _linearised(out[self.channel], _bend(shape), rig.supply.pressure)
         return out
 
 
 def _same_force(side: str, ratio: float) -> str:
-    """Say that an area `ratio` times that of the rig file has the force of a sensor's error."""
+    """Return the remark that an area `ratio` times the rig file's explains the same force."""
     change = f"{plain(100.0 * abs(ratio - 1.0), 2)} % {'larger' if ratio > 1.0 else 'smaller'}"
     return (
         f"a {side} area {change} than the rig file's has the same force, and flow gains take up "
@@ -230,10 +230,10 @@ def _bend(shape: Sequence[float]) -> float:
     return shape[1] if len(shape) > 1 else 0.0
 
 
-def _straight(y: Array, bend: float, supply: float) -> Array:
+def _linearised(y: Array, bend: float, supply: float) -> Array:
     """Return the pressure p (n,) [Pa] for which y (n,) [Pa] is p (1 + bend (2 p/p_S - 1)).
 
-    `supply` is p_S [Pa]. A value beyond the curve's turn, which is noise, is taken as its turn.
+    `supply` is p_S [Pa]. Beyond the parabola's vertex, which only noise reaches, it is the vertex.
     """
     root = np.sqrt(np.maximum((1.0 - bend) ** 2 + 8.0 * bend * y / supply, 0.0))
     return np.asarray(2.0 * y / (1.0 - bend + root))

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.constants import g as standard_gravity
 
-from analysis.effects.base import Array, Effect, Shape, SignalEffect, beyond
+from analysis.effects.base import Array, Effect, Shape, SignalEffect, out_of_range
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -69,9 +69,9 @@ class BaseInclination(SignalEffect):
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench, where gravity pulls at links whose base is not free already."""
-        free = getattr(rig, "inclination", 0.0) == UNKNOWN
-        return () if getattr(rig, "prismatic", False) or free or rig.gravity == 0 else ("bench",)
+        """Return the bench, where gravity acts and the rig does not estimate the inclination."""
+        unknown = getattr(rig, "inclination", 0.0) == UNKNOWN
+        return () if getattr(rig, "prismatic", False) or unknown or rig.gravity == 0 else ("bench",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return alpha [rad], up to 20 degrees either way."""
@@ -82,7 +82,7 @@ class BaseInclination(SignalEffect):
         return replace(signals, theta=signals.theta + self.shape_of(rig, shape)[0])
 
 
-LEAST_REACH: Final = 0.1  # of the joint's range: against a stiffer spring it cannot move so far
+LEAST_REACH: Final = 0.1  # of the joint's range that half its torque must move it: else too stiff
 RESTS: Final = 5  # rest angles to start from, evenly in the joint's range
 PRELOAD: Final = 8.0  # ranges of the joint: a long gas spring changes its force by a tenth over it
 
@@ -124,15 +124,15 @@ class JointSpring(Effect):
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the rest angle [rad], up to `PRELOAD` times the joint's range beyond its ends.
 
-        A preloaded spring rests outside the range. Far from the true angle a search ends at a
-        spring that pushes away, so that several are tried.
+        A preloaded spring rests outside the range. Several starts are tried: from far away a
+        search ends at a negative stiffness.
         """
         low, high = _reach(rig, self.joint)
         reach = high - low
         inside = map(float, np.linspace(low, high, RESTS + 2)[1:-1])
-        looks = (low - 0.5 * reach, *inside, high + 0.5 * reach)
+        starts = (low - 0.5 * reach, *inside, high + 0.5 * reach)
         ends = low - PRELOAD * reach, high + PRELOAD * reach
-        return (Shape(f"rest_{self.joint + 1}", "rad", *ends, looks),)
+        return (Shape(f"rest_{self.joint + 1}", "rad", *ends, starts),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q - rest."""
@@ -150,7 +150,7 @@ class JointSpring(Effect):
         name = f"k_spring_{self.joint + 1}"
         low, high = _reach(rig, self.joint)
         stiffest = torque_limit(rig, self.joint) / (LEAST_REACH * (high - low))
-        return beyond(name, values[name], "N*m/rad", stiffest) or self.outside(rig, shape)
+        return out_of_range(name, values[name], "N*m/rad", stiffest) or self.outside(rig, shape)
 
 
 def _reach(rig: Rig, joint: int) -> tuple[float, float]:
@@ -212,7 +212,7 @@ class TorqueOffset(Effect):
         """Reject more than half of the drive's torque."""
         name = self._name(rig)[0]
         limit = torque_limit(rig, self.joint)
-        return beyond(name, values[name], "N*m", limit, -limit)
+        return out_of_range(name, values[name], "N*m", limit, -limit)
 
 
 @kernel
@@ -284,7 +284,7 @@ class Payload(Effect):
         return (Coefficient("m_payload", "kg", "mechanical"),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the sum of inertia's and gravity's columns, weighted by `growth`; bare: none."""
+        """Return the columns of inertia and gravity summed by `growth`; none without payload."""
         if signals.loaded is False:
             return {}
         weights = growth(rig)
@@ -292,8 +292,8 @@ class Payload(Effect):
         for term in (Inertia(), Gravity()):
             for row, columns in term.columns(rig, signals, ()).items():
                 total = sum(weights[p] * column for p, column in columns.items())
-                here = out.setdefault(row, {"m_payload": np.zeros(len(signals.t))})
-                here["m_payload"] = here["m_payload"] + total
+                entry = out.setdefault(row, {"m_payload": np.zeros(len(signals.t))})
+                entry["m_payload"] = entry["m_payload"] + total
         return out
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
@@ -302,7 +302,7 @@ class Payload(Effect):
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a negative mass, and one that no joint can lift."""
-        return beyond("m_payload", values["m_payload"], "kg", heaviest_payload(rig))
+        return out_of_range("m_payload", values["m_payload"], "kg", heaviest_payload(rig))
 
 
 def heaviest_payload(rig: Rig) -> float:

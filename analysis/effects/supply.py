@@ -33,19 +33,18 @@ from rig.model.rig import Rig
 from rig.model.units import plain
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
-# [s] The longest lag of a line that loses all of the pressure at the pump's flow: as soft as an
-# accumulator.
+# [s] Longest lag of a line that loses all pressure at the pump's flow: that of an accumulator.
 LONGEST: Final = 2.0
 # Of the pump's flow: the steepest line searched loses all of the pressure at this flow.
 LEAST_FLOW: Final = 0.05
 BULK: Final = "b"  # the parameter's name
 BULK_MODULUS: Final = 1e9  # [Pa] with hoses and some air (Jelali and Kroll 2003, section 2.3)
-WHOLE: Final = 0.5  # of the pump's flow: records that reach it need no remark on the drop there
-# Share of the pump's flow at which a line becomes turbulent: below the least one no flow of a
-# record is laminar, and a line without one (0) is laminar throughout, as with `LAMINAR`.
+NEAR_PUMP: Final = 0.5  # of the pump's flow: records that reach it need no remark on the drop
+# Share r_t of the pump's flow at which a line becomes turbulent: below the least one no flow of a
+# record is laminar, and a line with r_t = 0 is laminar throughout, as with `LAMINAR`.
 LEAST_SHARE: Final = 1e-3
 LAMINAR: Final = 100.0
-NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
+NEGLIGIBLE: Final = 1e-4  # drop at the pump's whole flow, of the supply pressure
 
 
 @dataclass(frozen=True)
@@ -74,13 +73,13 @@ def line_drop(name: str, rig: Rig, shares: tuple[float, ...]) -> Shape:
     nominal, and may be many times the supply pressure.
     """
     p = rig.supply.pressure
-    nothing, first = NOTHING * p, tuple(share * p for share in shares)
-    return Shape(name, "Pa", nothing, 0.9 * p / LEAST_FLOW**2, first, neutral=nothing)
+    negligible, grid = NEGLIGIBLE * p, tuple(share * p for share in shares)
+    return Shape(name, "Pa", negligible, 0.9 * p / LEAST_FLOW**2, grid, neutral=negligible)
 
 
-def turning(name: str, first: tuple[float, ...]) -> Shape:
-    """Return the share of the pump's flow at which a line's flow becomes turbulent."""
-    return Shape(name, "", LEAST_SHARE, 3.0, first, resolution=True, saturates=True)
+def transition_share(name: str, grid: tuple[float, ...]) -> Shape:
+    """Return the shape r_t: share of the pump's flow at which a line becomes turbulent."""
+    return Shape(name, "", LEAST_SHARE, 3.0, grid, resolution=True, saturates=True)
 
 
 def packed_line(rig: Rig, dp: float, share: float) -> tuple[float, float]:
@@ -95,12 +94,12 @@ def turbulent_part(dp: float, share: float) -> float:
 
 
 def largest_flow(rig: Rig, signals: Sequence[Signals], drawn: bool) -> float:
-    """Return the largest flow [m^3/s] in records that all valves draw, or return to the tank."""
+    """Return the records' largest flow [m^3/s] from the supply (`drawn`), or to the tank."""
     return max((float(port_flow(rig, s, drawn).max()) for s in signals), default=0.0)
 
 
 def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
-    """Return the flow (n,) [m^3/s] that all valves draw from the supply, or return to the tank."""
+    """Return the flow (n,) [m^3/s] of all valves from the supply (`drawn`), or to the tank."""
     softness = 1.0 / bulk_modulus(rig)
     total = np.zeros(len(signals.t))
     for i, joint in enumerate(rig.joints):
@@ -167,7 +166,7 @@ class LineDrop(PortEffect):
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the drop at the largest flow of the records where that is not the pump's."""
         ratio, drop = self._at_largest_flow(rig, signals, shape)
-        if not 0.0 < ratio < WHOLE:
+        if not 0.0 < ratio < NEAR_PUMP:
             return ""
         pump = 6e4 * rig.supply.flow
         return (
@@ -179,7 +178,7 @@ class LineDrop(PortEffect):
     def extrapolated(
         self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
     ) -> Mapping[str, tuple[float, float]]:
-        """Return the range of the drop at the pump's whole flow, of which records show a part.
+        """Return the range of the drop at the pump's whole flow, which the records do not reach.
 
         Beyond their largest flow the line may be laminar throughout or turbulent throughout.
         """
@@ -234,7 +233,7 @@ class SupplySag(LineDrop):
         most = LONGEST * rig.supply.flow * BULK_MODULUS / rig.supply.pressure
         return (
             line_drop("dp_supply", rig, (0.05, 0.2)),
-            turning("laminar_share", (0.2, 1.2)),
+            transition_share("laminar_share", (0.2, 1.2)),
             Shape("V_supply", "m^3", 0.0, most, (0.002 * most, 0.04 * most), resolution=True),
         )
 
@@ -245,7 +244,7 @@ class SupplySag(LineDrop):
         turbulent = turbulent_part(dp, share)
         ratio = np.ascontiguousarray(port_flow(rig, signals, self.drawn) / rig.supply.flow)
         capacity = volume / (bulk_modulus(rig) * rig.supply.flow)
-        drop = _line(ratio, 1.0 / signals.rate, turbulent, share, capacity)
+        drop = _lagged_drop(ratio, 1.0 / signals.rate, turbulent, share, capacity)
         return replace(signals, p_s=signals.p_s - drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
@@ -294,25 +293,25 @@ class TankPressure(PortEffect):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""
-        constant, back = self.whole(rig, shape)
+        constant, back = self.full_shape(rig, shape)
         ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow if back else 0.0
         return replace(signals, p_tank=signals.p_tank + constant + back * ratio**2)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return p_t, p_back / Q_pump^2, then C_mp and C_pm of each joint."""
-        constant, back = self.whole(rig, shape)
+        constant, back = self.full_shape(rig, shape)
         return np.array([constant, back / rig.supply.flow**2, *edge_gains(rig, values, (2, 1))])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject pressures at their bounds, except a line's part of zero."""
-        constant, back = self.whole(rig, shape)
+        """Reject pressures at their bounds; the line's part may be zero."""
+        constant, back = self.full_shape(rig, shape)
         if constant <= 1e-3 * rig.supply.pressure:
             also = "" if back <= constant else ": this is return_line"
             return f"p_tank = {constant:.4g} Pa is negligible{also}"
-        inner = tuple(s.grid[-1] for s in self.shapes(rig))
-        kept = (v if v > 1e-3 * s.high else g for v, s, g in
-                zip((constant, back), self.shapes(rig), inner, strict=True))  # fmt: skip
-        return self.outside(rig, tuple(kept))
+        # A part of zero is replaced by a value within its bounds.
+        values_and_shapes = zip((constant, back), self.shapes(rig), strict=True)
+        checked = (v if v > 1e-3 * s.high else s.grid[-1] for v, s in values_and_shapes)
+        return self.outside(rig, tuple(checked))
 
 
 @kernel
@@ -348,7 +347,7 @@ class ReturnLine(LineDrop):
         """Return the drop at the pump's whole flow [Pa], and r_t."""
         return (
             line_drop("dp_return", rig, (0.03, 0.15)),
-            replace(turning("return_laminar", (0.5,)), detail=True),
+            replace(transition_share("return_laminar", (0.5,)), detail=True),
         )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
@@ -371,14 +370,14 @@ def edge_gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -
 
 
 def in_every_flow(signals: Signals, variable: Array) -> dict[str, Array]:
-    """Return a variable (n,) as that of every flow equation."""
+    """Return a variable (n,) for every flow equation."""
     kinds = ("flow_cap", "flow_rod")
     return {equation(kind, i): variable for i in range(signals.joints) for kind in kinds}
 
 
 @njit(cache=True, error_model="numpy")
 def drop_and_slope(Q, turbulent, turning):  # type: ignore[no-untyped-def]
-    """Return drop and slope of turbulent Q (Q^3 + turning^3)^(1/3) for a flow Q >= 0."""
+    """Return value and slope of turbulent Q (Q^3 + turning^3)^(1/3) for a flow Q >= 0."""
     inner = Q**3 + turning**3
     if inner <= 0.0:
         return 0.0, 0.0
@@ -387,20 +386,20 @@ def drop_and_slope(Q, turbulent, turning):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _line(ratio, step, turbulent, share, capacity):  # type: ignore[no-untyped-def]
+def _lagged_drop(ratio, step, turbulent, share, capacity):  # type: ignore[no-untyped-def]
     # Between two samples the demand is linear and the time constant is constant.
     drop = np.zeros_like(ratio)
-    through, slope = ratio[0], 0.0
+    flow, slope = ratio[0], 0.0
     for k in range(len(ratio)):
         if k and capacity > 0.0:
-            late = max(capacity * slope, 1e-9)
-            kept = math.exp(-step / late)
+            lag = max(capacity * slope, 1e-9)
+            decay = math.exp(-step / lag)
             rise = ratio[k] - ratio[k - 1]
-            through = ratio[k] - rise * (1 - kept) * late / step + kept * (through - ratio[k - 1])
+            flow = ratio[k] - rise * (1 - decay) * lag / step + decay * (flow - ratio[k - 1])
         else:
-            through = ratio[k]
-        lost, slope = drop_and_slope(through, turbulent, share)
-        drop[k] = max(lost, 0.0)
+            flow = ratio[k]
+        loss, slope = drop_and_slope(flow, turbulent, share)
+        drop[k] = max(loss, 0.0)
     return drop
 
 
@@ -408,23 +407,23 @@ def _line(ratio, step, turbulent, share, capacity):  # type: ignore[no-untyped-d
 def _valve_flow(x, level, sign, turbulent, turning, par, drawn):  # type: ignore[no-untyped-def]
     """Solve Q = sum C |u| sqrt(dp_i - drop(Q)) for the common flow Q [m^3/s], by Newton.
 
-    dp_i is the pressure drop of each open edge at Q = 0; the left grows and the right falls with Q.
+    dp_i is the pressure drop of each open edge at Q = 0. The right side falls as Q rises.
     """
     Q = 0.0
     for _ in range(NEWTON):
         drop, slope_drop = drop_and_slope(Q, turbulent, turning)
-        given, slope = 0.0, 0.0
+        flow, slope = 0.0, 0.0
         for i in range(x.shape[1]):
             u = x[U, i]
             ahead = (u > 0.0) == drawn  # the cap's edge is the open one
             p = x[P_CAP, i] if ahead else x[P_ROD, i]
             gain = par[2 + 2 * i] if u > 0.0 else par[3 + 2 * i]
-            left = sign * (level - p) - drop
-            if left > 0.0 and u != 0.0:
-                root = gain * abs(u) * math.sqrt(left)
-                given += root
-                slope -= 0.5 * root / left * slope_drop
-        step = (given - Q) / (1.0 - slope)
+            remaining = sign * (level - p) - drop
+            if remaining > 0.0 and u != 0.0:
+                root = gain * abs(u) * math.sqrt(remaining)
+                flow += root
+                slope -= 0.5 * root / remaining * slope_drop
+        step = (flow - Q) / (1.0 - slope)
         Q = max(Q + step, 0.0)
         if abs(step) < 1e-10:
             break

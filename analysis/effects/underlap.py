@@ -49,7 +49,7 @@ def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
 
 @dataclass(frozen=True)
 class UnderlapLeakage(ValveEffect):
-    """Edges open by w at the null: opening max(w + u, 0) ahead and max(w - u, 0) astern.
+    """Edges open by w at the null: opening max(w + u, 0) ahead (u > 0), max(w - u, 0) astern.
 
     Openings added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
     d- = max(w - u, 0) - max(-u, 0), edges rounded as those of `valve_deadband`, each times its own
@@ -79,14 +79,14 @@ class UnderlapLeakage(ValveEffect):
         """Return the underlap [V], up to half of the stroke, and the edges' form."""
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke, 0.1 * stroke)
-        own, r, c = self.shape_names()
-        return Shape(own, "V", 0.0, 0.5 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
+        lap, r, c = self.shape_names()
+        return Shape(lap, "V", 0.0, 0.5 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the additional openings times the roots, under the orifices' own names."""
         i = self.joint
         pp, pm, mp, mm = gain_names(i + 1)
-        u, (w, r, c) = signals.u[:, i], self.whole(rig, shape)
+        u, (w, r, c) = signals.u[:, i], self.full_shape(rig, shape)
         ahead = opened(u + w, r, c) - np.maximum(u, 0.0)
         astern = opened(w - u, r, c) - np.maximum(-u, 0.0)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
@@ -104,7 +104,7 @@ class UnderlapLeakage(ValveEffect):
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, gains, underlap, rounding, corner."""
         gains = [values[name] for name in gain_names(self.joint + 1)]
-        return np.array([self.joint, *gains, *self.whole(rig, shape)])
+        return np.array([self.joint, *gains, *self.full_shape(rig, shape)])
 
 
 TERMS = (UnderlapLeakage,)

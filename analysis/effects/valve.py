@@ -57,14 +57,14 @@ class ValveEffect(SignalEffect):
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, shape."""
-        return np.array([self.joint, *self.whole(rig, shape)], dtype=np.float64)
+        return np.array([self.joint, *self.full_shape(rig, shape)], dtype=np.float64)
 
 
 # Rounding r over overlap w at which a round edge's gain at the null, 1 - w / sqrt(w^2 + r^2), is
 # half of that far from it.
 MOST_ROUND: Final = 1.7
-# Gain at the null over that far from it, from which edges whose form the records determine do not
-# close there; the most rounded of the dead bands of odd seeds have 0.02.
+# Gain at the null over that far from it, above which edges with a corner do not close there; the
+# most rounded dead bands of the odd seeds have 0.02.
 OPEN_AT_NULL: Final = 0.1
 
 
@@ -78,7 +78,7 @@ def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
 
 @dataclass(frozen=True)
 class ValveDeadband(ValveEffect):
-    """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the edge beyond.
+    """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the overlap outside.
 
     An edge at x is open by (x + (|x|^n + r^n)^(1/n)) / 2, n = 2 + c: r the rounding, 0 for a sharp
     edge, c its corner, 0 where only clearance rounds it (see `edges`).
@@ -97,7 +97,7 @@ class ValveDeadband(ValveEffect):
     kernel = _deadband
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the edges [V], each up to four tenths of the spool's stroke, and their form."""
+        """Return the overlaps [V], up to four tenths of the spool's stroke, and the edges' form."""
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.003 * stroke, 0.01 * stroke, 0.05 * stroke, 0.2 * stroke)
         *edges, r, c = self.shape_names()
@@ -107,15 +107,15 @@ class ValveDeadband(ValveEffect):
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Remove the dead band from the spool's signal."""
         u = signals.u[:, self.joint]
-        return self.with_opening(signals, self.opening(u, *self.whole(rig, shape)))
+        return self.with_opening(signals, self.opening(u, *self.full_shape(rig, shape)))
 
     def opening(self, u: Array, ahead: float, astern: float, r: float, c: float) -> Array:
         """Return the opening (n,) [V] at the spool u (n,) [V], of overlaps and edge form."""
         return opened(u - ahead, r, c) - opened(-u - astern, r, c)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds, and edges of a known form that are open at the null."""
-        form = self.whole(rig, shape)
+        """Reject a shape at its bounds, and edges with a corner that are open at the null."""
+        form = self.full_shape(rig, shape)
         near = 1e-3 * max(form[:2])
         low, high = self.opening(np.array([-near, near]), *form)
         if form[3] > 0.0 and high - low > OPEN_AT_NULL * 2.0 * near:
@@ -178,8 +178,8 @@ class SpoolOffset(ValveEffect):
         return (("sensor_offset", f"joint {self.joint + 1} spool"),)
 
 
-QUICKEST: Final = 1e-4  # [s] time constant that the integrator can follow
-# Damping ratios of spools: with a larger one the quicker of two poles hardly shows.
+QUICKEST: Final = 1e-4  # [s] smallest time constant that the integrator can follow
+# Damping ratios [-] of spools: with a larger one the faster of the two poles hardly shows.
 DAMPING_BOUNDS: Final = (0.3, 1.5)
 DAMPING_START: Final = 0.8
 
@@ -205,10 +205,10 @@ class SpoolLag(ValveEffect):
     With a damping ratio zeta, a detail of the form, the lag is of second order: with the natural
     frequency w = 2 zeta / tau, so that tau remains the delay of slow motion, d2x/dt2 + 2 zeta w
     dx/dt + w^2 x = w^2 u (Merritt 1967, as data sheets of valves state it). x and dx/dt are hidden
-    states; the rows use the exact response to the sampled spool, linear between samples. The input
-    of a shape that is `held` is constant until the next sample, as a command recorded in place of
-    the spool is. Holding for T is (1 - exp(-s T)) / (s T) = 1 - s T / 2 + (s T)^2 / 6 - ...: it is
-    applied to x, of first order without the last of these.
+    states; the rows use the exact response to the sampled spool, linear between samples. With
+    `held` the input has a zero-order hold, as a command recorded in place of the spool has. A hold
+    of T is (1 - exp(-s T)) / (s T) = 1 - s T / 2 + (s T)^2 / 6 - ...: it is applied to x, for a
+    first-order lag up to s T / 2.
     """
 
     mechanism = "spool_dynamics"
@@ -235,15 +235,15 @@ class SpoolLag(ValveEffect):
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a damping ratio."""
-        tau, zeta, _ = self.whole(rig, shape)
+        tau, zeta, _ = self.full_shape(rig, shape)
         return ((tau, zeta or DAMPING_START, *shape[2:]),)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the lag of an input held between samples, or of one linear between them.
+        """Return the lag with the other kind of input: held or linear between samples.
 
-        A lag below a sample is too short for half a sample to be small beside it.
+        A hold, half a sample of delay, is tried only on lags of at least a sample.
         """
-        tau, zeta, held = self.whole(rig, shape)
+        tau, zeta, held = self.full_shape(rig, shape)
         if held:
             return ((tau, zeta) if zeta else (tau,),)
         return ((tau, zeta, 1.0),) if tau * rig.sample_rate >= 1.0 else ()
@@ -254,18 +254,18 @@ class SpoolLag(ValveEffect):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Delay the spool's signal by the lag, and by half a sample where the input is held."""
-        tau, zeta, held = self.whole(rig, shape)
+        tau, zeta, held = self.full_shape(rig, shape)
         x, rate = self.hidden_path(rig, signals, {}, shape).T
         if held:
             tau = max(tau, QUICKEST)
-            apart, bend = signals.u[:, self.joint] - x, 0.0
+            error, acceleration = signals.u[:, self.joint] - x, 0.0
             if zeta:
                 frequency = 2.0 * zeta / tau
-                bend = frequency * (frequency * apart - 2.0 * zeta * rate)
+                acceleration = frequency * (frequency * error - 2.0 * zeta * rate)
             else:
-                rate = apart / tau
+                rate = error / tau
             T = 1.0 / rig.sample_rate
-            x = x - T / 2.0 * rate + T**2 / 6.0 * bend
+            x = x - T / 2.0 * rate + T**2 / 6.0 * acceleration
         return self.with_opening(signals, x)
 
     def hidden_path(
@@ -273,7 +273,7 @@ class SpoolLag(ValveEffect):
     ) -> Array:
         """Return the opening [V] and its rate [V/s], (n, 2); the rate of a first order as 0."""
         u = np.ascontiguousarray(signals.u[:, self.joint])
-        tau, zeta, _ = self.whole(rig, shape)
+        tau, zeta, _ = self.full_shape(rig, shape)
         samples = tau * signals.rate
         if zeta:
             path: Array = second_order(u, samples, zeta) * (1.0, signals.rate)
@@ -281,14 +281,14 @@ class SpoolLag(ValveEffect):
         return np.column_stack((lagged(u, samples), np.zeros(len(u))))
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a shape at its bounds, and a lag that a path between samples may cause."""
+        """Reject a shape at its bounds, and a lag that sampling may cause (`between_samples`)."""
         return super().problem(rig, values, shape) or between_samples(
             rig, self.shape_of(rig, shape)[0]
         )
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """State natural frequency and damping ratio of a second order, and that input is held."""
-        tau, zeta, held = self.whole(rig, shape)
+        """State natural frequency and damping ratio of a second order, and a held input."""
+        tau, zeta, held = self.full_shape(rig, shape)
         remarks = []
         if zeta:
             remarks.append(
@@ -304,7 +304,7 @@ class SpoolLag(ValveEffect):
         return "; ".join(remarks)
 
     def fastest(self, shape: Sequence[float]) -> float:
-        """Return the rate [1/s] of the quickest pole, as simulated."""
+        """Return the rate [1/s] of the fastest pole, as simulated."""
         if not len(shape):
             return 0.0
         zeta = shape[1] if len(shape) > 1 else 0.0
@@ -312,8 +312,8 @@ class SpoolLag(ValveEffect):
         return max(1.0, 2.0 * zeta, quicker) / max(shape[0], QUICKEST)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, time constant that can be integrated, damping, time [s] of holding."""
-        tau, zeta, held = self.whole(rig, shape)
+        """Return joint, time constant [s] of at least `QUICKEST`, damping ratio, hold [s]."""
+        tau, zeta, held = self.full_shape(rig, shape)
         return np.array([self.joint, max(tau, QUICKEST), zeta, held / rig.sample_rate])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:

@@ -22,12 +22,12 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-DRIVING: Final = 0.1  # of the larger slope that the other may be below zero: its uncertainty
+DRIVING: Final = 0.1  # of the larger slope: a negative one within its uncertainty
 # Of the mean slope: slopes with a smaller difference count as equal. Dry friction beside them has a
 # form error of its own in each direction.
 DIFFERENCE: Final = 0.01
 BESIDE_DRY: Final = 0.1
-DRY: Final = ("Fc", "Fs", "F_ext_", "F_ret_", "k_friction_")  # its numbers, without the joint's
+DRY: Final = ("Fc", "Fs", "F_ext_", "F_ret_", "k_friction_")  # its parameters without the joint
 
 
 @kernel
@@ -84,14 +84,14 @@ class AsymmetricViscousFriction(Effect):
         """Return the whole slopes extending and retracting at mid-stroke [N s/m]."""
         lever = float(rig.joints[self.joint].geometry(0.0)[1])
         mean = values.get(f"Fv{self.joint + 1}", np.nan) / lever**2
-        own = [values[name] for name in self._names(rig)]
-        ahead, back = own if len(own) == 2 else (own[0], -own[0])
-        return mean + ahead, mean + back
+        linear = [values[name] for name in self._names(rig)]
+        extending, retracting = linear if len(linear) == 2 else (linear[0], -linear[0])
+        return mean + extending, mean + retracting
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, slopes extending and retracting."""
-        own = [values[name] for name in self._names(rig)]
-        return np.array([self.joint, own[0], own[1] if len(own) == 2 else -own[0]])
+        linear = [values[name] for name in self._names(rig)]
+        return np.array([self.joint, linear[0], linear[1] if len(linear) == 2 else -linear[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a slope that drives the joint, and slopes that count as equal."""
@@ -101,10 +101,10 @@ class AsymmetricViscousFriction(Effect):
                 return f"a slope of {slope:.3g} N s/m {way} would drive the joint"
         beside_dry = any(f"{name}{self.joint + 1}" in values for name in DRY)
         least = BESIDE_DRY if beside_dry else DIFFERENCE
-        # Equal slopes of the piston beside the joint's own are no asymmetry either: they follow the
-        # lever arm, and with it a friction that changes along the stroke.
-        both = [abs(values[name]) for name in self._names(rig)]
-        if abs(slopes[0] - slopes[1]) < least * max(0.5 * sum(slopes), min(both)):
+        # c_ext = c_ret is no asymmetry either: beside Fv q' it depends on the lever arm, as does a
+        # friction that changes along the stroke.
+        sizes = [abs(values[name]) for name in self._names(rig)]
+        if abs(slopes[0] - slopes[1]) < least * max(0.5 * sum(slopes), min(sizes)):
             return f"the slopes of the two directions differ by less than {100 * least:.0f} %"
         return ""
 

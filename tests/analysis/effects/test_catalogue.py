@@ -10,7 +10,12 @@ import pytest
 from scipy.signal import lsim
 
 from analysis.effects.base import SUPPLY, Effect, Evidence, ordered
-from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
+from analysis.effects.contact import (
+    contact_levels,
+    contact_state,
+    contact_under_load,
+    stiffened_path,
+)
 from analysis.effects.measurement import Sensor
 from analysis.effects.mechanics import growth
 from analysis.effects.valve import second_order
@@ -176,7 +181,7 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         rod_weight = sum(shape[3:4]) or 1.0
         load = np.abs(signals.p_cap[:, e.joint] + rod_weight * signals.p_rod[:, e.joint])
         stiffness = rig.supply.pressure / shape[0]
-        path = worked(s, signals.sd[:, e.joint], sum(shape[1:2]))
+        path = stiffened_path(s, signals.sd[:, e.joint], sum(shape[1:2]))
         return np.asarray(contact_under_load(path, load, stiffness) / stiffness)
     if e.name == "stribeck_friction":
         exponent = sum(shape[3:4]) or 2.0
@@ -184,7 +189,7 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         return np.asarray(contact_under_load(s, level, 1.0 / shape[1]) * shape[1])
     if e.family == "friction":
         distance, *stiffening = shape[4:5] if e.name == "friction_curve" else shape
-        path = worked(s, signals.sd[:, e.joint], sum(stiffening[:1]))
+        path = stiffened_path(s, signals.sd[:, e.joint], sum(stiffening[:1]))
         return np.asarray(distance * contact_state(path, distance))
     return np.zeros(len(signals.t))
 

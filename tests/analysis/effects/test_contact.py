@@ -15,7 +15,7 @@ from analysis.effects.contact import (
     contact_state,
     contact_under_load,
     memoryless,
-    worked,
+    stiffened_path,
 )
 from analysis.effects.friction import CoulombFriction, StribeckFriction
 from analysis.effects.friction_levels import AsymmetricFriction, PressureDependentFriction
@@ -46,7 +46,7 @@ def test_a_contact_along_the_worked_path_is_that_of_its_equation_in_time(stiffen
         return (1 + stiffening * abs(v)) * (v - abs(v) * z) / DISTANCE
 
     wanted = solve_ivp(rate, (0.0, t[-1]), [0.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=1e-3)
-    found = contact_state(worked(place(t), speed(t), stiffening), DISTANCE)
+    found = contact_state(stiffened_path(place(t), speed(t), stiffening), DISTANCE)
     assert found == pytest.approx(wanted.y[0], abs=3e-3)
 
 
@@ -56,7 +56,7 @@ def test_a_contact_that_stiffens_turns_over_sooner_the_faster_it_is_reversed() -
     for pace in (1.0, 4.0):
         t = np.arange(20_000) / 20_000 / pace
         s, v = place(pace * t), pace * speed(pace * t)
-        z = contact_state(worked(s, v, 250.0), DISTANCE)
+        z = contact_state(stiffened_path(s, v, 250.0), DISTANCE)
         turn = int(np.argmax(s))
         there = turn + int(np.argmax(z[turn:] < 0.0))
         needed.append(s[turn] - s[there])
@@ -146,7 +146,7 @@ def test_a_fall_over_most_of_the_speeds_is_no_breakaway(rig: Rig, multisine_run:
     for share, shown in ((0.2, True), (0.55, False), (0.8, False)):
         shape = (share * top, 0.0, 1e-4)
         said = effect.not_shown(rig, {"Fs2": 400.0}, shape, [Used(effect, shape)], signals)
-        assert ("viscous friction makes up" in said) != shown
+        assert ("viscous friction fits such a fall" in said) != shown
         curve = np.exp(-((v / shape[0]) ** 2))
         left = curve - lines @ np.linalg.lstsq(lines, curve)[0]
         assert (np.std(left) > 0.07) == shown
