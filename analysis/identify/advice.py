@@ -58,9 +58,9 @@ def fluid_help(rig: Rig, lacking: Determinacy) -> list[str]:
     """Return the steps, in words, that would determine the flow gains and the bulk modulus."""
     helps = []
     for joint in range(1, len(rig.joints) + 1):
-        if set(gain_names(joint)) & set(lacking.lost):
+        if set(gain_names(joint)) & set(lacking.undetermined):
             helps.append(f"excite joint {joint} in both directions")
-    if not helps and "b" in lacking.lost:
+    if not helps and "b" in lacking.undetermined:
         helps.append("excite any joint faster, with a multisine to 5 Hz and above")
     return helps
 

@@ -1,7 +1,7 @@
 """Rows of a long record, chunk by chunk, equal to those of the record as a whole.
 
 A row at sample c needs the samples within reach of the channel filter, the row filter and the
-alignment. A chunk contains the rows of the samples [first, last) and reads that many more on either
+alignment. A chunk contains the rows of the samples [start, stop) and reads that many more on either
 side, starting at a multiple of the decimation so that all chunks share one grid of rows. Which
 locked joints move and where the others stand is decided beforehand, for all chunks.
 """
@@ -29,8 +29,8 @@ class Source(Protocol):
     def head(self) -> RecordHead:
         """The record's description without samples."""
 
-    def read(self, first: int = 0, last: int | None = None) -> Record:
-        """Return the samples [first, last) as a record of their own."""
+    def read(self, start: int = 0, stop: int | None = None) -> Record:
+        """Return the samples [start, stop) as a record of their own."""
 
 
 class InMemory:
@@ -40,24 +40,24 @@ class InMemory:
         self.head = head_of(record)
         self._record = record
 
-    def read(self, first: int = 0, last: int | None = None) -> Record:
-        """Return the samples [first, last), without copying."""
-        if first == 0 and last is None:
+    def read(self, start: int = 0, stop: int | None = None) -> Record:
+        """Return the samples [start, stop), without copying."""
+        if start == 0 and stop is None:
             return self._record
-        part = slice(first, last)
+        part = slice(start, stop)
         return self.head.record({n: x[part] for n, x in self._record.channels.items()})
 
 
 @dataclass(frozen=True)
 class Locks:
-    """The bands (N,) [Hz] in which joints move, and positions (N,) [m], for a whole record."""
+    """A whole record's bands (N,) [Hz] of the joints' motion, and held positions (N,) [m]."""
 
     bands: Array
     held: Array
 
 
 def overlap(rig: Rig, rate: float, filtering: Filtering, bands: Array) -> int:
-    """Return the samples on either side that a row depends on, plus one grid step."""
+    """Return the number of samples on either side that a row depends on, plus one grid step."""
     rows = 0 if filtering.rows is None else filtering.rows.reach
     reach = filtering.channels.reach + rows + align_reach(rig, rate) + band_reach(rate, bands)
     return reach + filtering.step
@@ -73,18 +73,18 @@ def stretch_rows(
     terms: Sequence[Used],
     part: Record,
     offset: int,
-    own: tuple[int, int],
+    samples: tuple[int, int],
     filtering: Filtering,
     locks: Locks,
     families: Collection[str] = tuple(FAMILIES),
 ) -> dict[str, Rows]:
-    """Return the rows of the samples own[0] .. own[1] - 1 of a record from a part of it.
+    """Return the rows of the samples samples[0] .. samples[1] - 1 of a record from a part of it.
 
     `part` starts at the record's sample `offset`, a multiple of the filtering's step; times of the
     rows count from the record's start.
     """
     rate = part.sample_rate
-    within = ((own[0] - offset - 0.5) / rate, (own[1] - offset - 0.5) / rate)
+    within = ((samples[0] - offset - 0.5) / rate, (samples[1] - offset - 0.5) / rate)
     signals = condition(rig, part, filtering.channels, locks.bands, locks.held)
     stretch = record_rows(rig, terms, signals, filtering, families, within)
     if offset == 0:
@@ -100,11 +100,11 @@ def source_rows(
     bands: Array,
     stretch: int = REGRESSION.chunk_samples,
 ) -> Iterator[dict[str, Rows]]:
-    """Yield the rows of a record by chunks of `stretch` samples; together they are all its rows.
+    """Yield all rows of a record, in chunks of `stretch` samples.
 
     `bands` (N,) [Hz] is the decision for all repeats of the step (`analysis.signals.locks`). A term
-    that prepares signals may look back any time, and so does a filter of infinite length: then the
-    record is read at once.
+    that prepares signals may depend on all earlier samples, as does a filter of infinite length:
+    then the record is read at once.
     """
     n = source.head.samples
     parts = (source.read(a, min(a + stretch, n)) for a in range(0, n, stretch))
@@ -114,8 +114,8 @@ def source_rows(
         yield stretch_rows(rig, terms, source.read(), 0, (0, n), filtering, locks)
         return
     spare = overlap(rig, source.head.sample_rate, filtering, bands)
-    for first in range(0, n, stretch):
-        last = min(first + stretch, n)
-        offset = max(0, first - spare) // filtering.step * filtering.step
-        part = source.read(offset, min(last + spare, n))
-        yield stretch_rows(rig, terms, part, offset, (first, last), filtering, locks)
+    for start in range(0, n, stretch):
+        stop = min(start + stretch, n)
+        offset = max(0, start - spare) // filtering.step * filtering.step
+        part = source.read(offset, min(stop + spare, n))
+        yield stretch_rows(rig, terms, part, offset, (start, stop), filtering, locks)

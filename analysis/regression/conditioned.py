@@ -17,7 +17,7 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class ConditionedRecord:
-    """A conditioned record: its signals under the channel filter, its filters, its equations.
+    """A conditioned record: its filtered signals, its filters, the equations it is used for.
 
     `run` numbers the run; `families` are the families of rows that are used, by default all.
     """
@@ -38,8 +38,8 @@ class ConditionedRecord:
 
     def samples_at(self, time: Array) -> Indices:
         """Return the indices of the samples (m,) nearest to the times (m,) [s]."""
-        at = np.rint(time * self.record.sample_rate).astype(np.int64)
-        return np.asarray(at.clip(0, len(self.signals.t) - 1))
+        nearest = np.rint(time * self.record.sample_rate).astype(np.int64)
+        return np.asarray(nearest.clip(0, len(self.signals.t) - 1))
 
     @property
     def group(self) -> tuple[int, str]:

@@ -60,32 +60,32 @@ def minimise(X: Array, y: Array, feasible: Feasible) -> Minimum:
     F = np.tensordot(basis.T, feasible.forms / scale[:, None, None], axes=1)
     F = F / max(float(np.abs(F).max(initial=0.0)), 1e-300)
     x = least_squares(A, y)
-    free = x
-    if not _inside(x, G, F):
+    unconstrained = x
+    if not _is_inside(x, G, F):
         x = _follow(A, y, G, F, _interior(x, G, F))
     beta = basis @ x / scale
     rows, labels = list(feasible.equal), list(feasible.equal_labels)
-    for label, row, at, alone in zip(
-        feasible.positive_labels, feasible.positive, G @ x, G @ free, strict=True
+    for label, row, slack, violation in zip(
+        feasible.positive_labels, feasible.positive, G @ x, -(G @ unconstrained), strict=True
     ):
-        if at <= REGRESSION.active_share * abs(alone) and alone < 0:
+        if slack <= REGRESSION.active_share * abs(violation) and violation > 0:
             rows.append(row)
             labels.append(label)
-    if F.shape[1] and _least(free, F) < 0:
+    if F.shape[1] and (lowest := _smallest_eigenvalue(unconstrained, F)) < 0:
         values, vectors = np.linalg.eigh(np.tensordot(x, F, axes=1))
         for value, v in zip(values, vectors.T, strict=True):
-            if value <= REGRESSION.active_share * abs(_least(free, F)):
+            if value <= REGRESSION.active_share * abs(lowest):
                 rows.append(np.einsum("i,kij,j->k", v, feasible.forms, v))
                 labels.append(feasible.form_label)
     return Minimum(beta, np.array(rows).reshape(len(rows), len(scale)), tuple(labels))
 
 
-def _least(x: Array, F: Array) -> float:
+def _smallest_eigenvalue(x: Array, F: Array) -> float:
     return float(np.linalg.eigvalsh(np.tensordot(x, F, axes=1))[0])
 
 
-def _inside(x: Array, G: Array, F: Array, shift: Array | float = 0.0) -> bool:
-    return bool((G @ x + shift > 0).all()) and (not F.shape[1] or _least(x, F) > 0)
+def _is_inside(x: Array, G: Array, F: Array, shift: Array | float = 0.0) -> bool:
+    return bool((G @ x + shift > 0).all()) and (not F.shape[1] or _smallest_eigenvalue(x, F) > 0)
 
 
 def _barrier(
@@ -98,10 +98,10 @@ def _barrier(
     if F.shape[1]:
         P = np.tensordot(x, F, axes=1)
         inverse = np.linalg.inv(P)
-        turned = np.einsum("ij,kjl->kil", inverse, F)
+        inverse_forms = np.einsum("ij,kjl->kil", inverse, F)
         value -= float(np.linalg.slogdet(P)[1])
-        gradient = gradient - np.einsum("kii->k", turned)
-        hessian = hessian + np.einsum("kij,lji->kl", turned, turned)
+        gradient = gradient - np.einsum("kii->k", inverse_forms)
+        hessian = hessian + np.einsum("kij,lji->kl", inverse_forms, inverse_forms)
     return value, gradient, hessian
 
 
@@ -111,17 +111,17 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
     Raises InputError where the constraints leave no interior.
     """
     n = F.shape[1]
-    wide = np.vstack((np.column_stack((G, np.ones(len(G)))), np.zeros((1, len(x) + 1))))
-    wide[-1, -1] = 1.0  # with the constant below: s > -size, the cone alone has no lower end
+    G_slack = np.vstack((np.column_stack((G, np.ones(len(G)))), np.zeros((1, len(x) + 1))))
+    G_slack[-1, -1] = 1.0  # with `shifted`: s > -size, without which s has no lower bound
     size = max(float(np.linalg.norm(x)), 1.0)
-    wider = np.concatenate((F, np.eye(n)[None]))
+    F_slack = np.concatenate((F, np.eye(n)[None]))
     worst = float(np.min(G @ x, initial=0.0))
-    worst = min(worst, _least(x, F)) if n else worst
+    worst = min(worst, _smallest_eigenvalue(x, F)) if n else worst
     z = np.append(x, -2.0 * worst + size)
     target, t = np.zeros(len(z)), 1.0
     for _ in range(400):
         shifted = np.append(np.zeros(len(G)), size)
-        _, gradient, hessian = _barrier(z, wide, wider, shifted)
+        _, gradient, hessian = _barrier(z, G_slack, F_slack, shifted)
         target[:] = 0.0
         target[-1] = t / size
         # Staying near the unconstrained solution keeps the search bounded.
@@ -129,10 +129,10 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
         ridge = 1e-3 * np.diag(np.append(np.ones(len(x)), 0.0)) / size**2
         step = -np.linalg.solve(hessian + ridge, gradient + target + pull)
         length = 1.0
-        while length > 1e-12 and not _inside(z + length * step, wide, wider, shifted):
+        while length > 1e-12 and not _is_inside(z + length * step, G_slack, F_slack, shifted):
             length *= 0.5
         z = z + 0.9 * length * step
-        if z[-1] < 0 and _inside(z[:-1], G, F):
+        if z[-1] < 0 and _is_inside(z[:-1], G, F):
             return np.asarray(z[:-1])
         t *= 1.2
     raise InputError("the constraints leave no parameter set strictly inside them")
@@ -140,10 +140,10 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
 
 def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:
     """Follow the central path from x, strictly inside, to the minimum."""
-    many = len(G) + F.shape[1]
+    constraints = len(G) + F.shape[1]
     size = max(float(y @ y), 1e-300)
     H, g = A.T @ A, A.T @ y
-    t = many / size
+    t = constraints / size
     while True:
         for _ in range(REGRESSION.newton_steps):
             value, gradient, hessian = _barrier(x, G, F)
@@ -152,19 +152,19 @@ def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:
             decrement = -float(slope @ step)
             if decrement < 1e-10:
                 break
-            now = 0.5 * t * float(x @ H @ x - 2 * g @ x) + value
+            objective = 0.5 * t * float(x @ H @ x - 2 * g @ x) + value
             length = 1.0
             while length > 1e-14:
                 trial = x + length * step
-                if _inside(trial, G, F):
-                    later = 0.5 * t * float(trial @ H @ trial - 2 * g @ trial)
-                    later += _barrier(trial, G, F)[0]
-                    if later <= now - 0.1 * length * decrement:
+                if _is_inside(trial, G, F):
+                    trial_objective = 0.5 * t * float(trial @ H @ trial - 2 * g @ trial)
+                    trial_objective += _barrier(trial, G, F)[0]
+                    if trial_objective <= objective - 0.1 * length * decrement:
                         break
                 length *= 0.5
             else:
                 break  # rounding: the path cannot be followed more closely
             x = x + length * step
-        if many / t < REGRESSION.duality_gap * size:
+        if constraints / t < REGRESSION.duality_gap * size:
             return x
         t *= REGRESSION.path_factor

@@ -52,10 +52,10 @@ class Combination:
         words: list[str] = []
         for name, coefficient in self.parts:
             size = abs(coefficient)
-            whole = round(size)
+            rounded = round(size)
             figure = (
-                f"{whole}"
-                if whole and abs(size - whole) < REGRESSION.rounding_share
+                f"{rounded}"
+                if rounded and abs(size - rounded) < REGRESSION.rounding_share
                 else f"{size:.3g}"
             )
             sign = ("+ " if coefficient > 0 else "- ") if words else ""
@@ -67,16 +67,16 @@ class Combination:
 class Determinacy:
     """What rows determine of `names`: rank, condition number of the unit columns, base parameters.
 
-    `null` (m, k) are the undetermined directions, `lost` the parameters in them; `base` the
-    identifiable combinations of those, `known` the parameters that are identified individually.
+    `null` (m, k) are the undetermined directions, `undetermined` the parameters in them, `base` the
+    identifiable combinations of these; `identified` are the parameters identified individually.
     """
 
     names: tuple[str, ...]
     rank: int
     condition: float
     null: Array
-    known: tuple[str, ...]
-    lost: tuple[str, ...]
+    identified: tuple[str, ...]
+    undetermined: tuple[str, ...]
     base: tuple[Combination, ...]
 
     @property
@@ -92,28 +92,28 @@ def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> De
     """
     k = len(names)
     factors = factored(X)
-    scale, strong = factors.scale, factors.strong
-    noisy = _noisy(factors.Vt[strong], factors.sigma[strong], scale, noise)
+    scale, mask = factors.scale, factors.determined
+    noisy = _noise_directions(factors.Vt[mask], factors.sigma[mask], scale, noise)
     null = np.vstack((factors.null, noisy))
     if len(null):
         null = np.linalg.qr(null.T)[0].T
     members = np.linalg.norm(null, axis=0) > REGRESSION.null_share
-    lost = tuple(n for n, inside in zip(names, members, strict=True) if inside)
-    known = tuple(n for n in names if n not in lost)
+    undetermined = tuple(n for n, inside in zip(names, members, strict=True) if inside)
+    identified = tuple(n for n in names if n not in undetermined)
     base = _combinations(names, null, scale, np.any(X != 0.0, axis=0)) if len(null) else ()
     return Determinacy(
-        tuple(names), k - len(null), factors.condition, null / scale, known, lost,
-        tuple(c for c in base if any(name in lost for name, _ in c.parts)),
+        tuple(names), k - len(null), factors.condition, null / scale, identified, undetermined,
+        tuple(c for c in base if any(name in undetermined for name, _ in c.parts)),
     )  # fmt: skip
 
 
-def _noisy(Vt: Array, sigma: Array, scale: Array, noise: Array | None) -> Array:
-    """Return the directions (scaled) whose information is mostly noise."""
+def _noise_directions(Vt: Array, sigma: Array, scale: Array, noise: Array | None) -> Array:
+    """Return the scaled directions (l, k) whose information is mostly sensor noise."""
     if noise is None or not len(sigma):
         return np.zeros((0, len(scale)))
     white = Vt / sigma[:, None]
-    share, turn = np.linalg.eigh(white @ (noise / np.outer(scale, scale)) @ white.T)
-    projected = (turn.T @ white)[share > REGRESSION.noise_share]
+    shares, vectors = np.linalg.eigh(white @ (noise / np.outer(scale, scale)) @ white.T)
+    projected = (vectors.T @ white)[shares > REGRESSION.noise_share]
     return np.asarray(
         projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-300)
     )
@@ -127,43 +127,45 @@ def _combinations(
     order = qr(null, mode="r", pivoting=True)[1]
     dependent = np.sort(order[:m])
     independent = np.setdiff1d(np.arange(len(names)), dependent)
-    back = np.linalg.inv(null[:, dependent])
+    inverse = np.linalg.inv(null[:, dependent])
     out = []
     for i in independent:
         c = np.zeros(len(names))
-        c[i], c[dependent] = 1.0, -(back @ null[:, i])
+        c[i], c[dependent] = 1.0, -(inverse @ null[:, i])
         # The parameter of a column of zeros is undetermined by itself, and in no combination.
         c[(np.abs(c) < REGRESSION.negligible_share * np.abs(c).max()) | ~shown] = 0.0
         parts = [int(p) for p in np.flatnonzero(c)]
-        plain = c * scale
+        c *= scale
         if parts:
-            first = plain[parts[0]]
-            out.append(Combination(tuple((names[int(p)], float(plain[p] / first)) for p in parts)))
+            lead = c[parts[0]]
+            out.append(Combination(tuple((names[int(p)], float(c[p] / lead)) for p in parts)))
     return out
 
 
-def twin_channels(rig: Rig, names: Sequence[str], moved: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the channels `names`, each (n,), of a motion on the twin, supply and oil steady."""
+def twin_channels(rig: Rig, names: Sequence[str], motion: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the channels `names`, each (n,), of a motion on the twin; supply and oil constant."""
     channels: dict[str, Array] = {}
     for name in names:
         kind, joint = ch.kind_of(name)
         if joint is not None:
-            channels[name] = moved[kind][:, joint - 1]
+            channels[name] = motion[kind][:, joint - 1]
         else:
             steady = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
-            channels[name] = np.full(len(moved["piston"]), steady)
+            channels[name] = np.full(len(motion["piston"]), steady)
     return channels
 
 
-def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) -> dict[str, Array]:
+def predicted_rows(
+    rig: Rig, motion: Mapping[str, Array], locked: Sequence[int]
+) -> dict[str, Array]:
     """Return the triangle (k, k) of each family's rows of a motion on the twin.
 
-    `moved` is what `analysis.simulation.twin.simulate_commands` returns or a stretch of it, arrays
+    `motion` is what `analysis.simulation.twin.simulate_commands` returns or a part of it, arrays
     (n, N); `locked` the joints (1-based) that were held.
     """
     used = tuple(Used(term) for term in baseline_of(rig))
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
-    channels = twin_channels(rig, rig.channels, moved)
+    channels = twin_channels(rig, rig.channels, motion)
     record = Record("twin", "twin", tuple(locked), 1, rig.sample_rate, channels)
     filters = Filtering(channel_filter(rig.sample_rate), None, REGRESSION.sample_step)
     bands = np.array([0.0 if i + 1 in locked else np.inf for i in range(len(rig.joints))])
@@ -175,7 +177,7 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
 
 
 def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determinacy]:
-    """Return, by family, what the rows of these steps determine together."""
+    """Return, by family, what the stacked rows of these steps determine."""
     used = tuple(Used(term) for term in baseline_of(rig))
     out = {}
     for family in FAMILIES:

@@ -31,14 +31,14 @@ class ScaledFactors:
     Vt: Array
 
     @property
-    def strong(self) -> NDArray[np.bool_]:
-        """Return the directions (k,) that the rows determine."""
+    def determined(self) -> NDArray[np.bool_]:
+        """The mask (k,) of the directions that the rows determine."""
         return np.asarray(self.sigma > REGRESSION.rank_tolerance * max(self.sigma[0], 1e-300))
 
     @property
     def null(self) -> Array:
         """The directions (l, k), in scaled parameters, that the rows do not determine."""
-        return self.Vt[~self.strong]
+        return self.Vt[~self.determined]
 
     @property
     def condition(self) -> float:
@@ -48,9 +48,9 @@ class ScaledFactors:
     @property
     def inverse(self) -> Array:
         """The pseudo-inverse (k, m) of X over the directions that it determines."""
-        keep = self.strong
-        turned = self.Vt[keep].T / self.sigma[keep] / self.scale[:, None]
-        return np.asarray(turned @ self.U[:, keep].T)
+        determined = self.determined
+        directions = self.Vt[determined].T / self.sigma[determined] / self.scale[:, None]
+        return np.asarray(directions @ self.U[:, determined].T)
 
 
 def factored(X: Array) -> ScaledFactors:
@@ -65,12 +65,12 @@ def factored(X: Array) -> ScaledFactors:
 
 
 def least_squares(X: Array, y: Array) -> Array:
-    """Return the shortest beta (k,), in scaled columns, of least |y - X beta|; X (m, k), y (m,)."""
+    """Return the shortest beta (k,), in scaled columns, that minimises |y - X beta|."""
     return np.asarray(factored(X).inverse @ y)
 
 
 def shortest(X: Array, y: Array, rank: float) -> Array:
-    """Return beta (k,) or (k, n) of least |y - X beta| of X (m, k) and y (m,) or (m, n).
+    """Return beta (k,) or (k, n) that minimises |y - X beta|, X (m, k), y (m,) or (m, n).
 
     Directions of the scaled columns below `rank` times the largest singular value get no value.
     """
@@ -82,13 +82,13 @@ def shortest(X: Array, y: Array, rank: float) -> Array:
 def scaled_inverse(A: Array) -> Array:
     """Invert a matrix A (k, k) of normal or estimating equations, its diagonal scaled to 1.
 
-    Weak directions are kept, because an interval must include their large variance. Left out are
-    directions beyond double precision (`rounding_share`) and columns with a zero diagonal.
+    Weak directions are filled, because an interval must include their large variance. Left out are
+    directions beyond double precision (`rank_tolerance_normal`) and columns with a zero diagonal.
     """
     scale = np.sqrt(np.abs(np.diag(A)))
-    kept = scale > 0.0
-    size = np.outer(scale[kept], scale[kept])
+    filled = scale > 0.0
+    size = np.outer(scale[filled], scale[filled])
     inverse = np.zeros_like(A)
-    inner = np.linalg.pinv(A[np.ix_(kept, kept)] / size, REGRESSION.rank_tolerance_normal)
-    inverse[np.ix_(kept, kept)] = inner / size
+    inner = np.linalg.pinv(A[np.ix_(filled, filled)] / size, REGRESSION.rank_tolerance_normal)
+    inverse[np.ix_(filled, filled)] = inner / size
     return inverse

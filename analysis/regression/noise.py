@@ -1,8 +1,8 @@
 """Attenuation of least squares by sensor noise in the regressor, predicted from stated noise.
 
-Noise in the columns biases least squares (attenuation). The rig's stated noise is added to a record
-once more; the difference D of its rows [X y] is, to first order, distributed like the noise that is
-in the rows already. With N = D'D and A = X'X,
+Noise in the columns biases least squares (attenuation). The rig's stated noise is added to a
+record a second time; the difference D of its rows [X y] is, to first order, distributed like the
+noise that is in the rows already. With N = D'D and A = X'X,
  bias = - A^-1 (N_xx beta - n_xy),
 and the diagonal of A^-1 N_xx is the share of a column's own information that is noise: a parameter
 determined mostly by noise (the inertia of a joint that hardly moves in its lock) is not identified.
@@ -70,7 +70,7 @@ def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Reco
     def noise(sensor: AnySensor, x: Array) -> Array:
         return np.asarray(np.sqrt(sensor_variance(sensor)) * rng.standard_normal(len(x)))
 
-    return _disturbed(rig, record, noise)
+    return _with_errors(rig, record, noise)
 
 
 def with_added_rounding(
@@ -78,18 +78,18 @@ def with_added_rounding(
 ) -> Record:
     """Return the record with rounding errors that are the same in every repeat added.
 
-    They are those of the record's own motion, which the `smoother` frees of its rounding, with the
-    converters' steps moved at random: a slow signal has slow errors, which no filter takes out.
+    They are those of the record's motion, smoothed to remove its own rounding, with the converters'
+    steps shifted at random: a slow signal has slow errors, which no filter removes.
     """
 
     def error(sensor: AnySensor, x: Array) -> Array:
-        moved = rng.uniform() * converter_step(sensor)
-        return mean_rounding(sensor, smoother.apply(bridged(x)) + moved)
+        shift = rng.uniform() * converter_step(sensor)
+        return mean_rounding(sensor, smoother.apply(bridged(x)) + shift)
 
-    return _disturbed(rig, record, error)
+    return _with_errors(rig, record, error)
 
 
-def _disturbed(rig: Rig, record: Record, error: Callable[[AnySensor, Array], Array]) -> Record:
+def _with_errors(rig: Rig, record: Record, error: Callable[[AnySensor, Array], Array]) -> Record:
     channels = dict(record.channels)
     for name in rig.channels:
         if name in channels:
@@ -112,8 +112,8 @@ def record_moments(
     """
     if rng is None:
         rng = np.random.default_rng([0, zlib.crc32(conditioned.record.step.encode())])
-    again = conditioned.condition_alike(rig, with_added_noise(rig, conditioned.record, rng))
-    after = record_rows(rig, terms, again.signals, again.filtering)
+    noisy = conditioned.condition_alike(rig, with_added_noise(rig, conditioned.record, rng))
+    after = record_rows(rig, terms, noisy.signals, noisy.filtering)
     out: dict[str, Array] = {}
     for name, rows in before.items():
         D = _difference(rows, after[name])
@@ -123,6 +123,6 @@ def record_moments(
 
 
 def _difference(rows: Rows, other: Rows) -> Array:
-    """Return the change of [X y] in the rows that both have."""
+    """Return the change of [X y] (m, k+1) in the rows that both have."""
     a, b = in_common(rows, other)
     return np.column_stack((other.matrix[b] - rows.matrix[a], other.rhs[b] - rows.rhs[a]))

@@ -1,4 +1,4 @@
-"""Nonlinear least squares on reduced rows, for fewer parameters than linear unknowns.
+"""Nonlinear least squares on reduced rows: linear unknowns as functions of fewer parameters.
 
 Rows y = X x with x = h(p). Gauss and Newton's step from p0 is least squares of y - X c on X J,
 J = dh/dp at p0 and c = h(p0) - J p0; both follow from the triangle of [X y] by
@@ -55,14 +55,14 @@ def _reduce(
     names = linear.names
     places = [names.index(name) for name in reduction.linear]
     others = [i for i in range(len(names)) if i not in places]
-    new = (*(names[i] for i in others), *reduction.parameters)
+    reduced_names = (*(names[i] for i in others), *reduction.parameters)
     x = np.nan_to_num(linear.value)
     p = np.concatenate((x[others], reduction.start(x[places])))
     # The step needs only the sum over clusters; the scatter is computed at the end.
-    whole = [RowCluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
+    pooled = [RowCluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
     for _ in range(REGRESSION.rounds):
         change = _transform(reduction, places, others, p)
-        stepped = solve(new, _transformed(whole, change), None, False)
+        stepped = solve(reduced_names, _transformed(pooled, change), None, False)
         stepped_value = np.where(np.isfinite(stepped.value), stepped.value, p)
         step, p = np.abs(stepped_value - p).max(), stepped_value
         if step <= REGRESSION.tolerance * np.abs(p).max():
@@ -72,21 +72,23 @@ def _reduce(
             "%s: no convergence in %d rounds", " ".join(reduction.parameters), REGRESSION.rounds
         )
     change = _transform(reduction, places, others, p)
-    moved = _transformed(clusters, change)
+    transformed = _transformed(clusters, change)
     moment = None if noise is None else change.T @ noise @ change
-    return solve(new, moved, moment, reject_noise), moved, moment
+    return solve(reduced_names, transformed, moment, reject_noise), transformed, moment
 
 
 def _transform(
     reduction: ParameterReduction, places: Sequence[int], others: Sequence[int], p: Array
 ) -> Array:
-    """Return S (k+1, m+1) at p."""
-    k, kept = len(places) + len(others), len(others)
+    """Return S (k+1, m+1) at the parameters p (m,)."""
+    k, unchanged = len(places) + len(others), len(others)
     slope = np.zeros((k, len(p)))
-    slope[others, np.arange(kept)] = 1.0
-    slope[np.ix_(places, range(kept, len(p)))] = reduction.slope(p[kept:])
+    slope[others, np.arange(unchanged)] = 1.0
+    slope[np.ix_(places, range(unchanged, len(p)))] = reduction.slope(p[unchanged:])
     constant = np.zeros(k)
-    constant[places] = reduction.value(p[kept:]) - reduction.slope(p[kept:]) @ p[kept:]
+    constant[places] = (
+        reduction.value(p[unchanged:]) - reduction.slope(p[unchanged:]) @ p[unchanged:]
+    )
     S = np.zeros((k + 1, len(p) + 1))
     S[:k, :-1], S[:k, -1], S[k, -1] = slope, -constant, 1.0
     return S

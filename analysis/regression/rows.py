@@ -42,10 +42,10 @@ Line = tuple[int, float]  # joint (0-based) and frequency [Hz]
 class Filtering:
     """The filters of one record: `channels` before, `rows` (or none) after the rows are built.
 
-    Torque balances of joints `in_motion` (0-based) give no weight to samples at rest and the whole
-    to those above `full_weight` times the record's rms speed. From those of
-    the joints in `lines` (0-based, with a frequency [Hz]) the part at that frequency is removed:
-    one sine of free amplitude and phase is fitted to every record and subtracted.
+    Torque balances of joints `in_motion` (0-based) have weight 0 at rest and 1 above `full_weight`
+    times the record's rms speed. From those of the joints in `lines` (0-based, with a frequency
+    [Hz]) the part at that frequency is removed: a sine of free amplitude and phase is fitted to
+    every record and subtracted.
     """
 
     channels: Smoother
@@ -71,9 +71,9 @@ class Rows:
     time: Array
     masked: int
 
-    def at(self, kept: Mask) -> Rows:
-        """Return the rows where a mask (m,) holds."""
-        return replace(self, matrix=self.matrix[kept], rhs=self.rhs[kept], time=self.time[kept])
+    def at(self, mask: Mask) -> Rows:
+        """Return the rows where a mask (m,) is true."""
+        return replace(self, matrix=self.matrix[mask], rhs=self.rhs[mask], time=self.time[mask])
 
 
 def matrix_of(rows: Rows, names: tuple[str, ...]) -> Array:
@@ -81,17 +81,17 @@ def matrix_of(rows: Rows, names: tuple[str, ...]) -> Array:
     if rows.names[: len(names)] == names:
         return rows.matrix[:, : len(names)]
     out = np.zeros((len(rows.rhs), len(names)))
-    known = [k for k, name in enumerate(names) if name in rows.names]
-    out[:, known] = rows.matrix[:, [rows.names.index(names[k]) for k in known]]
+    present = [k for k, name in enumerate(names) if name in rows.names]
+    out[:, present] = rows.matrix[:, [rows.names.index(names[k]) for k in present]]
     return out
 
 
-def in_common(one: Rows, other: Rows) -> tuple[Indices | slice, Indices | slice]:
-    """Return where, in either set of rows, the instants are that both have."""
-    if np.array_equal(one.time, other.time):  # nearly always
+def in_common(rows: Rows, other: Rows) -> tuple[Indices | slice, Indices | slice]:
+    """Return, for each of two sets of rows, the indices of the instants that both have."""
+    if np.array_equal(rows.time, other.time):  # nearly always
         return slice(None), slice(None)
-    _, here, there = np.intersect1d(one.time, other.time, return_indices=True)
-    return here, there
+    _, indices, others = np.intersect1d(rows.time, other.time, return_indices=True)
+    return indices, others
 
 
 def default_filtering(record: Record) -> Filtering:
@@ -225,8 +225,8 @@ class TermPart:
 class RightPart:
     """An equation's filtered right side and its instants (m,) [s], before rows are dropped.
 
-    `sensors` (n,) states where its sensors are valid, `lost` (n,) where a sample never arrived,
-    `sines` (m, 2 l) are the sines and cosines of the l frequencies that are removed.
+    `sensors` (n,) states where its sensors are valid, `lost` (n,) where a sample never arrived;
+    `sines` (m, 2 l) are the sines and cosines of the l frequencies to be removed.
     """
 
     side: Array
@@ -277,8 +277,8 @@ def right_parts(
         i = int(number) - 1
         # Inertia couples the joints: a clipped piston of any joint affects every torque row.
         joints = slice(None) if family == "mechanical" else slice(i, i + 1)
-        whole = {"": right_side(rig, signals, kind, i)}
-        side = low_passed(weighted(whole, signals, name), filtering)[""]
+        raw = {"": right_side(rig, signals, kind, i)}
+        side = low_passed(weighted(raw, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
         if family == "fluid":  # below zero the oil cavitates, and the flow balance does not hold
@@ -290,9 +290,9 @@ def right_parts(
 
 
 def filtered_sines(signals: Signals, filtering: Filtering, name: str) -> Array:
-    """Return the sines and cosines (m, 2 l) that an equation's rows are without, filtered alike."""
-    at = [f for joint, f in filtering.lines if equation("torque", joint) == name]
-    angles = [2 * np.pi * f * signals.t for f in at]
+    """Return the sines and cosines (m, 2 l) removed from an equation's rows, as filtered."""
+    frequencies = [f for joint, f in filtering.lines if equation("torque", joint) == name]
+    angles = [2 * np.pi * f * signals.t for f in frequencies]
     waves = {f"{wave.__name__} {k}": wave(x) for k, x in enumerate(angles) for wave in WAVES}
     if not waves:
         return np.zeros((0, 0))
@@ -300,13 +300,13 @@ def filtered_sines(signals: Signals, filtering: Filtering, name: str) -> Array:
 
 
 def sines_at(rows: Rows, signals: Signals, filtering: Filtering) -> Array:
-    """Return the sines and cosines (m, 2 l) that rows are without, at their instants."""
+    """Return the sines and cosines (m, 2 l) removed from rows, at the rows' instants."""
     sines = filtered_sines(signals, filtering, rows.equation)
     return sines[places_of(rows, signals, filtering)] if sines.size else sines
 
 
 def without_sines(columns: Array, sines: Array) -> Array:
-    """Return columns (m, k) or (m,) without what the sines (m, l) can make of each."""
+    """Return columns (m, k) or (m,) less their least-squares fit by the sines (m, l)."""
     if not sines.size:
         return columns
     return np.asarray(columns - sines @ np.linalg.lstsq(sines, columns, rcond=None)[0])
@@ -319,15 +319,15 @@ def assembled(
     filtering: Filtering,
     within: tuple[float, float] = (-np.inf, np.inf),
 ) -> dict[str, Rows]:
-    """Put one family's rows together, without those that are masked."""
+    """Assemble one family's rows, by equation, without those that are masked."""
     out = {}
     for name, right in sides.items():
-        bad = ~right.sensors
+        invalid = ~right.sensors
         for part in parts:
             if name in part.valid:
-                bad = bad | ~part.valid[name]
+                invalid = invalid | ~part.valid[name]
         inside = (right.time >= within[0]) & (right.time < within[1])
-        dropped = _dropped(bad, right.lost, filtering, len(right.side))
+        dropped = _dropped(invalid, right.lost, filtering, len(right.side))
         kept = inside & ~dropped
         matrix = columns_at(names, parts, name, np.flatnonzero(kept))
         masked = int((inside & dropped).sum())
@@ -360,18 +360,18 @@ def low_passed(columns: Mapping[str, Array], filtering: Filtering) -> dict[str, 
 
 def instants(time: Array, filtering: Filtering, count: int) -> Array:
     """Return the instants of the first `count` filtered rows of samples at `time` (n,)."""
-    step, first = filtering.step, 0
+    step, start = filtering.step, 0
     if filtering.rows is not None:
-        first = -(-2 * filtering.rows.reach // step) * step - filtering.rows.reach
-    return _inside(time, filtering)[first + step * np.arange(count)]
+        start = -(-2 * filtering.rows.reach // step) * step - filtering.rows.reach
+    return _inside(time, filtering)[start + step * np.arange(count)]
 
 
 def places_of(rows: Rows, signals: Signals, filtering: Filtering) -> Indices:
-    """Return the numbers of rows (m,) among all filtered rows of their record."""
+    """Return the indices (m,) of rows among all filtered rows of their record."""
     if not len(rows.time):
         return np.zeros(0, dtype=np.int64)
-    since = rows.time - instants(signals.t, filtering, 1)
-    return np.asarray(np.rint(since * signals.rate / filtering.step), dtype=np.int64)
+    elapsed = rows.time - instants(signals.t, filtering, 1)
+    return np.asarray(np.rint(elapsed * signals.rate / filtering.step), dtype=np.int64)
 
 
 def _inside(x: NDArray[Any], filtering: Filtering) -> NDArray[Any]:
@@ -380,16 +380,16 @@ def _inside(x: NDArray[Any], filtering: Filtering) -> NDArray[Any]:
     return x[edges : len(x) - edges]
 
 
-def _dropped(bad: Mask, lost: Mask, filtering: Filtering, count: int) -> Mask:
+def _dropped(invalid: Mask, lost: Mask, filtering: Filtering, count: int) -> Mask:
     """Return which filtered rows (m,) have a masked sample within the filter's reach."""
-    bad, lost = _inside(bad, filtering), _inside(lost, filtering)
+    invalid, lost = _inside(invalid, filtering), _inside(lost, filtering)
     if filtering.rows is None:
-        return np.asarray((bad | lost)[:: filtering.step])
+        return np.asarray((invalid | lost)[:: filtering.step])
     dropped = np.zeros(count, dtype=bool)
     weights = np.abs(filtering.rows.taps[0]) / np.abs(filtering.rows.taps[0]).sum()
     # A lost sample is interpolated: not even the filter's tails may include it.
     for mask, taps, limit in (
-        (bad, weights, REGRESSION.masked_share),
+        (invalid, weights, REGRESSION.masked_share),
         (lost, np.ones(len(weights)), 0.5),
     ):
         if mask.any():

@@ -17,14 +17,14 @@ class RegressionSettings:
     row_cutoff_range: tuple[float, float] = (8.0, 30.0)
     lines_factor: float = 1.5
     # Of a slow machine the range begins at these ratios to the highest of at least
-    # `multisine_lines` lines, or to the bandwidth: above, noise is worth more than harmonics. A
+    # `multisine_lines` lines, or to the bandwidth: above, noise outweighs the harmonics. A
     # crane excited to 0.8 Hz has its inertias within 0.4 % at 3.2 Hz and not at 8 Hz; at 3 times
     # 2 Hz, friction by pressure resembled one of two levels. A record of fewer lines has its
     # information in the harmonics.
     slow_lines: float = 4.0
     slow_bandwidth: float = 3.0
     multisine_lines: int = 3
-    # An electric joint's rows need one derivative less of anything noisy, and its friction reverses
+    # An electric joint's rows need one derivative less of noisy signals, and its friction reverses
     # within milliseconds: a narrower filter attenuates the reversals (`python -m tests.studies
     # emps`).
     row_cutoff_electric: float = 30.0
@@ -49,8 +49,8 @@ class RegressionSettings:
     null_share: float = 0.05
     # Samples between rows used for identifiability: neighbouring rows are nearly equal.
     sample_step: int = 5
-    # Coefficients of a base parameter: left out below this share of the largest, written as a whole
-    # number within this share of it.
+    # Coefficients of a base parameter: left out below this share of the largest one; written as a
+    # whole number where they differ from it by less.
     negligible_share: float = 0.02
     rounding_share: float = 0.02
 

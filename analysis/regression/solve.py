@@ -107,15 +107,17 @@ class Accumulator:
         return self._R.copy()
 
     def fold(self, matrix: Array, rhs: Array) -> None:
-        """Add rows (m, k), (m,); raises ValueError if they do not fit."""
+        """Add rows (m, k), (m,); raises ValueError for other shapes."""
         if matrix.shape != (len(rhs), self._width - 1):
-            raise ValueError(f"rows {matrix.shape}, {rhs.shape} do not fit {self._width - 1}")
-        for first in range(0, len(rhs), self._block):
-            part = slice(first, first + self._block)
-            count = len(rhs[part])
+            raise ValueError(
+                f"rows {matrix.shape}, {rhs.shape} do not have {self._width - 1} columns"
+            )
+        for start in range(0, len(rhs), self._block):
+            block = slice(start, start + self._block)
+            count = len(rhs[block])
             space = self._stack(count)
-            space[self._width :, :-1] = matrix[part]
-            space[self._width :, -1] = rhs[part]
+            space[self._width :, :-1] = matrix[block]
+            space[self._width :, -1] = rhs[block]
             self._reduce(space)
         self.rows += len(rhs)
 
@@ -131,7 +133,7 @@ class Accumulator:
         self._R *= np.sqrt(factor)
 
     def _stack(self, count: int) -> Array:
-        """Return space (k+1 + count, k+1) in LAPACK's order with the triangle on top."""
+        """Return an array (k+1 + count, k+1) in LAPACK's order with the triangle on top."""
         if count != self._block:
             space = np.empty((self._width + count, self._width), order="F")
         else:
@@ -165,56 +167,56 @@ def solve(
     k = len(names)
     R = merge(c.triangle for c in clusters)
     X, y = R[:k, :k], R[:k, k]
-    inverse, condition, lost = _pseudo_inverse(names, X)
+    inverse, condition, undetermined = _pseudo_inverse(names, X)
     beta, bread = inverse @ y, inverse @ inverse.T
     covariance, dof = _clustered(beta, bread, clusters if scatter is None else scatter)
     noise_bias = np.full(k, np.nan)
     if noise is not None:
         noise_bias = -bread @ (noise[:k, :k] @ beta - noise[:k, k])
-        share = np.diag(bread @ noise[:k, :k])
-        for name, part in zip(names, share, strict=True):
-            if reject_noise and part > REGRESSION.noise_share:
-                lost.setdefault(name, MOSTLY_NOISE)
+        shares = np.diag(bread @ noise[:k, :k])
+        for name, share in zip(names, shares, strict=True):
+            if reject_noise and share > REGRESSION.noise_share:
+                undetermined.setdefault(name, MOSTLY_NOISE)
     rows = sum(c.rows for c in clusters)
     squares = np.sum((y - X @ beta) ** 2) + R[k, k] ** 2
     residual_rms = float(np.sqrt(squares / max(rows, 1)))
-    gone = np.array([name in lost for name in names])
-    beta[gone] = dof[gone] = np.nan
-    covariance[gone, :] = covariance[:, gone] = np.nan
+    missing = np.array([name in undetermined for name in names])
+    beta[missing] = dof[missing] = np.nan
+    covariance[missing, :] = covariance[:, missing] = np.nan
     return Solution(
-        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost,
-        R, np.zeros((0, 0)) if noise is None or not reject_noise else noise,
+        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias,
+        undetermined, R, np.zeros((0, 0)) if noise is None or not reject_noise else noise,
     )  # fmt: skip
 
 
 def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[str, str]]:
-    """Return the inverse of X (k, k) with unit columns, its condition number, parameters lost.
+    """Return the inverse of X (k, k), its condition number with unit columns, and reasons.
 
-    Columns that are zero, and directions below the rank tolerance, are left out of the inverse.
+    The reasons state, by name, why a parameter is undetermined. Columns of zeros, and directions
+    below the rank tolerance, are left out of the inverse.
     """
-    shown = np.any(X != 0.0, axis=0)
-    lost = {n: "no row contains it" for n, filled in zip(names, shown, strict=True) if not filled}
+    filled = np.flatnonzero(np.any(X != 0.0, axis=0))
+    reasons = {n: "no row contains it" for i, n in enumerate(names) if i not in filled}
     inverse = np.zeros_like(X)
-    kept = np.flatnonzero(shown)
-    if not len(kept):
-        return inverse, float("inf"), lost
-    factors = factored(X[:, kept])
-    lost |= _confounded([names[int(i)] for i in kept], factors.null)
-    inverse[kept] = factors.inverse
-    return inverse, factors.condition, lost
+    if not len(filled):
+        return inverse, float("inf"), reasons
+    factors = factored(X[:, filled])
+    reasons |= _confounded([names[int(i)] for i in filled], factors.null)
+    inverse[filled] = factors.inverse
+    return inverse, factors.condition, reasons
 
 
 def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
-    """State, for every parameter in a null direction, the parameters that it is confounded with."""
-    lost = {}
+    """Return, for each parameter in a null direction, a message that names the others in it."""
+    reasons = {}
     for direction in null:
         members = [
             n for n, v in zip(names, direction, strict=True) if abs(v) > REGRESSION.null_share
         ]
         for name in members:
             others = " ".join(m for m in members if m != name) or "nothing else"
-            lost[name] = f"only a combination with {others} shows in these records"
-    return lost
+            reasons[name] = f"only a combination with {others} shows in these records"
+    return reasons
 
 
 def scores(beta: Array, triangles: Array) -> Array:
@@ -254,24 +256,24 @@ def stratified(influence: Array, *labels: Indices) -> tuple[Array, Array] | None
 
 
 def numbered(*labels: Indices) -> tuple[Indices, Indices]:
-    """Number the combinations of labels (c,): the first place (g,) of each, the number (c,)."""
+    """Return the first member (g,) of each group of equal labels (c,), and the group (c,)."""
     code = np.zeros(len(labels[0]), dtype=np.int64)
     for label in labels:
-        values, place = np.unique(label, return_inverse=True)
-        code = code * len(values) + place
+        values, code_of_label = np.unique(label, return_inverse=True)
+        code = code * len(values) + code_of_label
     _, first, number = np.unique(code, return_index=True, return_inverse=True)
     return first, number
 
 
 def sums_of(values: Array, number: Indices) -> Array:
-    """Return the sums (g, ...) of values (c, ...) of equal number (c,), which is 0 .. g - 1."""
+    """Return the sums (g, ...) of values (c, ...) by group number (c,), 0 .. g - 1."""
     order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(number.max(initial=-1) + 1))
-    return np.asarray(np.add.reduceat(values[order], first, axis=0))
+    starts = np.searchsorted(number[order], np.arange(number.max(initial=-1) + 1))
+    return np.asarray(np.add.reduceat(values[order], starts, axis=0))
 
 
 def satterthwaite(variance: Array, squares: Array) -> Array:
-    """Return the degrees of freedom (k,) of a sum of variances, 1 where nothing scatters.
+    """Return the degrees of freedom (k,) of a sum of variances (k,), 1 where all are zero.
 
     `squares` (k,) sums each part's square over its own degrees of freedom.
     """

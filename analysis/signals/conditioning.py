@@ -103,7 +103,7 @@ def without_rests(signals: Signals, joints: Sequence[int], full_weight: float = 
 def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
     """Return the record's measured channels moved to the tick's instant, each (n,).
 
-    Channel k of the multiplexer is sampled k `skew` after the tick, and a sensor shows the world
+    Channel k of the multiplexer is sampled k `skew` after the tick, and a sensor's reading is
     `delay` late: x(t) = measured(t + delay - k skew). Lost samples (NaN) are bridged by a straight
     line first; `lost_samples` states where.
     """
@@ -144,7 +144,7 @@ def lost_samples(rig: Rig, record: Record) -> Mask:
 
 
 def is_used(rig: Rig, record: Record, name: str) -> bool:
-    """Return whether rows need a channel: of a locked joint they need its position only."""
+    """Return whether rows need a channel: of a locked joint, only its position."""
     kind, joint = ch.kind_of(name)
     return joint not in record.locked or kind == rig.position_kind
 
@@ -169,7 +169,7 @@ def condition(
     """Turn a record into signals through one zero-phase filter (default `channel_filter`).
 
     `bands` (N,) [Hz] is what `analysis.signals.locks.motion_bands` decided for all repeats of the
-    record's step; without it the record counts as the only repeat. `held` (N,) [m] overrides
+    record's step; without it the record counts as the only repeat. `held` (N,) [m] replaces
     `held_positions`, for a record that is a part of a longer one. Lost samples (NaN) are marked in
     `Signals.lost`. Raises InputError naming record and channel where one is missing or not finite.
     """
@@ -214,7 +214,7 @@ def condition(
         temperature=bench(ch.TEMPERATURE, oil),
         excited=excited,
         valid=_valid(rig, record, smoother.reach),
-        lost=_spread(
+        lost=_widened(
             lost_samples(rig, record), smoother.reach + align_reach(rig, record.sample_rate)
         ),
         bands=bands,
@@ -238,7 +238,7 @@ def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:
 
 
 def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
-    """Return, for each channel that reaches an end of its sensor's range, where it does (n,)."""
+    """Return the clipped samples (n,) of each channel that reaches an end of its sensor's range."""
     clipped = {}
     for name in rig.channels:
         if name in record.channels:
@@ -293,15 +293,15 @@ def _geometry(
 def _valid(rig: Rig, record: Record, reach: int) -> Mask:
     clipped = clipped_samples(rig, record)
     clipped.pop(ch.TEMPERATURE, None)
-    bad = _spread(_by_joint(rig, record, clipped), reach)
-    bad[:reach] = bad[record.samples - reach :] = True
-    return np.asarray(~bad)
+    invalid = _widened(_by_joint(rig, record, clipped), reach)
+    invalid[:reach] = invalid[record.samples - reach :] = True
+    return np.asarray(~invalid)
 
 
-def _spread(mask: Mask, reach: int) -> Mask:
+def _widened(mask: Mask, reach: int) -> Mask:
     """Return where (n, N) a mask is true anywhere within `reach` samples."""
     if not mask.any():
         return mask
-    wide = np.ones(2 * reach + 1)
-    whole = np.apply_along_axis(np.convolve, 0, mask.astype(np.float64), wide)
-    return np.asarray(whole[reach : reach + len(mask)] > 0.5)
+    window = np.ones(2 * reach + 1)
+    count = np.apply_along_axis(np.convolve, 0, mask.astype(np.float64), window)
+    return np.asarray(count[reach : reach + len(mask)] > 0.5)

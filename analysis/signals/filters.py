@@ -5,14 +5,13 @@ every channel through the same one: only then do the flow and torque balances st
 filtered signals (Sakai and Maeshima's causal 20-sample average delays by 9.5 ms).
 
 A smoother is a row of symmetric taps per derivative: y_k = (d/dt)^k (h * x). Filtering happens
-twice in the analysis, and for a reason. Products such as sqrt(p_s - p) u or cos(q2) q1'' do not
-commute with a filter, so the channels first pass a wide filter that loses nothing the bench can
-do (default 80 Hz), the rows are built from them point by point, and then WHOLE rows, columns and
-right-hand side alike, pass a second low-pass (`row_filter`, default 1.5 times the highest
-excited line): a linear equation that holds at every instant still holds after any linear filter.
-The row filter takes the noise out that differentiation has amplified, and allows honest
-decimation. `tests.studies.estimators.differentiation` prints the measured bias and scatter of each
-choice.
+twice in the analysis. Products such as sqrt(p_s - p) u or cos(q2) q1'' do not commute with a
+filter, so the channels first pass a filter wide enough for all motion of the bench (default 80 Hz),
+the rows are built from them point by point, and then WHOLE rows, columns and right-hand side alike,
+pass a second low-pass (`row_filter`, default 1.5 times the highest excited line): a linear equation
+that holds at every instant still holds after any linear filter. The row filter removes the noise
+that differentiation has amplified, and allows decimation without aliasing.
+`tests.studies.estimators.differentiation` prints the measured bias and scatter of each choice.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ class FirSmoother:
 
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the filtered (d/dt)^order of x (n, ...); raises InputError if x is too short."""
-        level = x[:1]  # filtered without it, so that rounding does not move a constant
+        level = x[:1]  # subtracted, so that rounding does not change a constant
         out = convolved(_extended(x - level, self.reach, self.name), self.taps[order])
         return out + level if order == 0 else out
 
@@ -128,18 +127,18 @@ def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
     t = np.arange(-reach, reach + 1) / rate
     h0 = _kernel(t, cutoff + 0.5 * transition, (reach + 1) / rate, beta)
     smoother = differenced(f"windowed sinc, {cutoff:g} Hz", h0, rate)
-    smoother.taps.setflags(write=False)  # everybody shares them
+    smoother.taps.setflags(write=False)  # the cache returns the same array to all callers
     return smoother
 
 
 def differenced(name: str, h0: Array, rate: float, order: int = 8) -> FirSmoother:
     """Return taps of a symmetric value filter followed by central differences of `order`."""
-    first, second = _DIFFERENCES[order]
-    wide = np.pad(h0, len(first) // 2)
-    # Convolution turns the antisymmetric stencil round.
-    h1 = np.convolve(h0, first[::-1]) * rate
-    h2 = np.convolve(h0, second) * rate**2
-    return FirSmoother(name, np.stack((wide / h0.sum(), h1 / h0.sum(), h2 / h0.sum())))
+    first_stencil, second_stencil = _DIFFERENCES[order]
+    padded = np.pad(h0, len(first_stencil) // 2)
+    # Convolution reverses the antisymmetric stencil.
+    h1 = np.convolve(h0, first_stencil[::-1]) * rate
+    h2 = np.convolve(h0, second_stencil) * rate**2
+    return FirSmoother(name, np.stack((padded / h0.sum(), h1 / h0.sum(), h2 / h0.sum())))
 
 
 def moving_average(rate: float) -> FirSmoother:
@@ -164,8 +163,8 @@ def butterworth(rate: float, cutoff: float) -> FirSmoother:
     impulse = np.zeros(2 * half + 1)
     impulse[half] = 1.0
     h0 = sosfiltfilt(butter(order, cutoff, fs=rate, output="sos"), impulse, padlen=0)
-    strong = np.flatnonzero(np.abs(h0) > 1e-6 * np.abs(h0).max())
-    half_kept = half - int(strong[0])
+    significant = np.flatnonzero(np.abs(h0) > 1e-6 * np.abs(h0).max())
+    half_kept = half - int(significant[0])
     h0 = h0[half - half_kept : half + half_kept + 1]
     return differenced(f"Butterworth, {cutoff:g} Hz", h0 / h0.sum(), rate)
 
@@ -197,7 +196,7 @@ def align(x: Array, shift: float) -> Array:
         return x
     taps = _interpolation(shift)
     level = x[:1]
-    # Convolution turns the taps round.
+    # Convolution reverses the taps.
     return level + convolved(_extended(x - level, len(taps) // 2, "alignment"), taps[::-1])
 
 

@@ -1,14 +1,14 @@
 """Which joints move, decided once for all repeats of a step, and where the others stand.
 
-A locked joint may move a little all the same. Measured on a finer plant, leaving out the motion of
+A locked joint may still move a little. Measured on a finer plant, leaving out the motion of
 a joint held by a closed valve made M2 47 % and Fv2 190 % too large, and that of an end-stop contact
 R12 1.5 %; with it the error is below 0.05 %. A locked joint counts as moving where its acceleration
 within one of `moving_bands` exceeds that of sensor noise alone, as stated or, if that is less, as
 the repeats measure it; any other is held at its mean, because noise in the place of an absent
 motion would make unidentifiable parameters look identified.
 
-A joint that is seen to move only within a narrow band is filtered to that band, since what its
-sensor shows beyond is noise. On a crane whose valves held the other joints, with a resonance at a
+A joint whose motion is visible only within a narrow band is filtered to that band, since its signal
+outside is noise. On a crane whose valves held the other joints, with a resonance at a
 few hertz and noise of the acceleration ten times the motion, a wide band alone left them out: R12
 was 7 % and R22 12 % off, and the torque error 2.9 times its noise.
 
@@ -55,26 +55,26 @@ def motion_bands(rig: Rig, repeats: Sequence[Record]) -> Array:
         if len(locked) < len(repeats):
             bands.append(np.inf)
             continue
-        # A repeat that was cut short decides nothing: what it cannot show is not absent.
+        # A repeat that was cut short is left out: it may end before the motion begins.
         longest = max(r.samples for r in locked)
         long = [r for r in locked if r.samples >= SIGNALS.deciding_share * longest]
         length = min(SIGNALS.deciding_samples, *(r.samples for r in long))
-        every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in long])
-        bands.append(_band(every, rate, noise))
+        positions = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in long])
+        bands.append(_band(positions, rate, noise))
     return np.array(bands)
 
 
-def _band(every: Array, rate: float, noise: float) -> float:
+def _band(positions: Array, rate: float, noise: float) -> float:
     """Return the band [Hz] in which a locked joint moves, of its positions (repeats, n) [m]."""
-    count = len(every)
-    # Repeats that were not synchronised after all would cancel in the mean.
-    if any(accelerates(x, rate, noise) for x in every):
+    count = len(positions)
+    # In the mean, the motions of repeats that are not synchronised would cancel.
+    if any(accelerates(x, rate, noise) for x in positions):
         return np.inf
     for k, band in enumerate(SIGNALS.moving_bands):
         filtering = row_filter(rate, band)
-        if every.shape[1] <= 4 * filtering.reach:
+        if positions.shape[1] <= 4 * filtering.reach:
             break
-        inner = _accelerations(every.T, filtering).T
+        inner = _accelerations(positions.T, filtering).T
         mean = inner.mean(axis=0)
         stated = noise * float(np.linalg.norm(filtering.taps[2]))
         limits = [(SIGNALS.common_ratio if k else SIGNALS.moving_ratio) * stated]
@@ -96,7 +96,7 @@ def accelerates(position: Array, rate: float, noise: float) -> bool:
 
 
 def _accelerations(positions: Array, band: FirSmoother) -> Array:
-    """Return accelerations within a band of positions (n, ...) off both ends."""
+    """Return the accelerations of positions (n, ...) within a band, without both ends."""
     return band.apply(bridged(positions), 2)[band.reach : -band.reach]
 
 

@@ -128,7 +128,7 @@ def _why(before: Verdicts, after: Verdicts) -> str:
     words = []
     for family, verdict in after.items():
         old = before[family]
-        new = [name for name in verdict.known if name not in old.known]
+        new = [name for name in verdict.identified if name not in old.identified]
         learned += new
         if not new and verdict.rank > old.rank:
             more = verdict.rank - old.rank

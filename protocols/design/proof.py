@@ -33,16 +33,16 @@ class Verdict(Protocol):
         """Condition number of the rows with unit columns."""
 
     @property
-    def known(self) -> tuple[str, ...]:
+    def identified(self) -> tuple[str, ...]:
         """Parameters determined individually."""
 
     @property
-    def lost(self) -> tuple[str, ...]:
+    def undetermined(self) -> tuple[str, ...]:
         """Parameters not determined individually."""
 
     @property
     def base(self) -> Sequence[ProofPart]:
-        """Combinations of lost parameters that are determined."""
+        """Combinations of undetermined parameters that are determined."""
 
     @property
     def complete(self) -> bool:
@@ -113,6 +113,6 @@ def _plain(verdict: Verdict) -> dict[str, Any]:
         "rank": verdict.rank,
         "condition_number": verdict.condition,
         "complete": verdict.complete,
-        "not_identifiable": list(verdict.lost),
+        "not_identifiable": list(verdict.undetermined),
         "base_parameters": [part.text for part in verdict.base],
     }

@@ -29,8 +29,8 @@ def test_columns_that_only_come_together_are_written_as_one_base_parameter() -> 
     found = determined(NAMES, np.column_stack((a, a, 1.56 * a, 1e-3 * b, 1e3 * c)))
     assert found.rank == 3
     assert not found.complete
-    assert found.known == ("W1", "Fv1")
-    assert found.lost == ("R11", "R22", "R12")
+    assert found.identified == ("W1", "Fv1")
+    assert found.undetermined == ("R11", "R22", "R12")
     assert [part.text for part in found.base] == ["R11 + R22 + 1.56 R12"]
 
 
@@ -55,9 +55,9 @@ def test_a_column_of_zeros_is_lost_alone() -> None:
     X = np.eye(5)
     X[:, 2] = 0.0
     found = determined(NAMES, X)
-    assert found.lost == ("R12",)
+    assert found.undetermined == ("R12",)
     assert found.base == ()
-    assert found.known == ("R11", "R22", "W1", "Fv1")
+    assert found.identified == ("R11", "R22", "W1", "Fv1")
 
 
 def test_a_direction_made_of_noise_is_not_determined() -> None:
@@ -65,7 +65,7 @@ def test_a_direction_made_of_noise_is_not_determined() -> None:
     X = np.column_stack((rng.normal(size=500), 0.1 * rng.normal(size=500)))
     noise = np.diag([0.0, 0.01 * 500])
     assert determined(("M1", "M2"), X).complete
-    assert determined(("M1", "M2"), X, noise).lost == ("M2",)
+    assert determined(("M1", "M2"), X, noise).undetermined == ("M2",)
 
 
 def test_one_step_of_three_names_what_is_open_and_the_steps_to_add(multisine_run: Run) -> None:

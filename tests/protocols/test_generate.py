@@ -81,7 +81,7 @@ def test_a_protocol_that_leaves_parameters_open_names_them_and_the_step_that_hel
     verdict = proof.verdicts["mechanical"]
     assert not proof.complete
     assert verdict.rank == 6
-    assert set(verdict.lost) == {"M1", "R12"}
+    assert set(verdict.undetermined) == {"M1", "R12"}
     # M1 + 2 R12 cos(q2) is what joint 1 feels; q2 is -105 degrees at the stroke's end.
     (base,) = verdict.base
     assert base.text.startswith("M1 - 0.51")

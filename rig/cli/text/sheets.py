@@ -139,7 +139,7 @@ def proof_text(proof: Proof) -> str:
             )
             continue
         lines.append(f"{family}: rank {verdict.rank} of {size}")
-        lines.append(f"  not determined: {' '.join(verdict.lost)}")
+        lines.append(f"  not determined: {' '.join(verdict.undetermined)}")
         lines += [f"  determined: {part.text}" for part in verdict.base]
     lines += [f"would help: {step}" for step in proof.help]
     return "\n".join(lines)
