@@ -37,8 +37,8 @@ def key_of(source: str) -> str:
     """Return the hash of a source and of everything that its compiled code depends on."""
     versions = [platform.python_version(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
     machine = [platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
-    whole = "\n".join((*versions, *machine, source))
-    return hashlib.sha256(whole.encode()).hexdigest()[:32]
+    text = "\n".join((*versions, *machine, source))
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 @functools.lru_cache(maxsize=256)
@@ -47,7 +47,7 @@ def stored(source: str) -> Any | None:
     folder = cache_folder() / "rates" / key_of(source)
     if not folder.is_dir():
         return None
-    if not _unharmed(folder, source):
+    if not _is_intact(folder, source):
         log.warning("%s: compiled code is damaged; it is deleted and compiled again", folder)
         shutil.rmtree(folder, ignore_errors=True)
         return None
@@ -111,7 +111,7 @@ def _checksum(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _unharmed(folder: Path, source: str) -> bool:
+def _is_intact(folder: Path, source: str) -> bool:
     try:
         expected = json.loads((folder / _CHECKSUMS).read_text(encoding="utf-8"))
         checksums = {str(p.relative_to(folder)): _checksum(p) for p in _files(folder)}

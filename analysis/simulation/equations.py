@@ -21,9 +21,8 @@ from numba.extending import intrinsic
 
 OK, LEFT_STROKE, NOT_FINITE, STEP_TOO_SMALL, BAD_INERTIA = range(5)
 
-# Columns of `geometry`, one row per joint.
-# GAIN is 0 of a hydraulic joint; of an
-# electric one it is the drive's, u being the drive and OFFSET the known turn of the joint's zero.
+# Columns of `geometry`, one row per joint. GAIN is the drive's gain of an electric joint, 0 of a
+# hydraulic one; OFFSET of an electric joint is the known angle of its zero.
 PIN_A, PIN_C, MID, OFFSET, AREA_CAP, AREA_ROD, DEAD_CAP, DEAD_ROD, STROKE, GAIN = range(10)
 COLUMNS: Final = 10
 
@@ -41,14 +40,14 @@ def call_rates(typing, address, t, y, dy, inputs, n, rate, locked, geometry, par
     signature = types.int64(types.int64, *numbers)
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        double, whole = ir.DoubleType(), ir.IntType(64)
+        double, int64 = ir.DoubleType(), ir.IntType(64)
         kinds = [context.get_value_type(kind) for kind in RATES_SIGNATURE.args]
         values = [
             builder.inttoptr(value, kind) if isinstance(kind, ir.PointerType) else value
             for value, kind in zip(args[1:], kinds, strict=True)
         ]
-        assert all(v.type in (double, whole) or isinstance(v.type, ir.PointerType) for v in values)
-        pointer = ir.FunctionType(whole, kinds).as_pointer()
+        assert all(v.type in (double, int64) or isinstance(v.type, ir.PointerType) for v in values)
+        pointer = ir.FunctionType(int64, kinds).as_pointer()
         return builder.call(builder.inttoptr(args[0], pointer), values)
 
     return signature, generate

@@ -69,14 +69,14 @@ def rates(t, y, dy, inputs, n, rate, locked, geometry, par, context, work):
 
 @dataclass(frozen=True)
 class GeneratedSource:
-    """The text, and the elements of `par` (by index) that it holds as fixed places."""
+    """The text, and the elements of `par` (by index) that it uses as constant array indices."""
 
     text: str
     places: Mapping[int, int]
 
 
 @functools.lru_cache(maxsize=256)
-def _remembered(
+def _cached_sources(
     terms: tuple[Term, ...], lengths: tuple[int, ...], hidden: tuple[int, ...],
     electric: tuple[bool, ...],
 ) -> list[GeneratedSource]:  # fmt: skip
@@ -88,15 +88,15 @@ def source_of(
     terms: Sequence[Used], packed: Sequence[Array], hidden: Sequence[int], electric: Sequence[bool]
 ) -> str:
     """Return the source of the terms' right-hand side (see `_generated`), cached per process."""
-    known = _remembered(
+    sources = _cached_sources(
         tuple(used.term for used in terms), tuple(map(len, packed)), tuple(hidden), tuple(electric)
     )
     par = np.concatenate(packed)
-    for source in known:
-        if all(par[k] == place for k, place in source.places.items()):
+    for source in sources:
+        if all(par[k] == value for k, value in source.places.items()):
             return source.text
-    known.append(_generated(terms, packed, hidden, electric))
-    return known[-1].text
+    sources.append(_generated(terms, packed, hidden, electric))
+    return sources[-1].text
 
 
 def _generated(
@@ -186,18 +186,18 @@ def _observe(body: _Lines, electric: Sequence[bool], sine_cosine: str) -> None:
         "angle = 0.0",
     )
 
-    def at(column: int) -> str:
+    def interpolated(column: int) -> str:
         return f"inputs[a + {column}] + w * (inputs[b + {column}] - inputs[a + {column}])"
 
     for i, drive in enumerate(electric):
         g = i * eq.COLUMNS
         body.add(
-            f"x{U}_{i} = {at(2 + i)}",
+            f"x{U}_{i} = {interpolated(2 + i)}",
             f"held{i} = locked[{i}] != 0",
             f"if held{i}:",
-            f"    x{Q}_{i} = {at(2 + N + i)}",
-            f"    x{QD}_{i} = {at(2 + 2 * N + i)}",
-            f"    qdd{i} = {at(2 + 3 * N + i)}",
+            f"    x{Q}_{i} = {interpolated(2 + N + i)}",
+            f"    x{QD}_{i} = {interpolated(2 + 2 * N + i)}",
+            f"    qdd{i} = {interpolated(2 + 3 * N + i)}",
             "else:",
             f"    x{Q}_{i} = y[{i}]",
             f"    x{QD}_{i} = y[{N + i}]",

@@ -85,8 +85,8 @@ def _interpolate(t, h, y, trial, k, rate, r, ys, filled):  # type: ignore[no-unt
         r[0, j] = trial[j] - y[j]
         r[1, j] = h * k[0, j] - r[0, j]
         r[2, j] = r[0, j] - h * k[6, j] - r[1, j]
-        first = h * D1 * k[0, j] + h * D3 * k[2, j] + h * D4 * k[3, j]
-        r[3, j] = first + h * D5 * k[4, j] + h * D6 * k[5, j] + h * D7 * k[6, j]
+        total = h * D1 * k[0, j] + h * D3 * k[2, j] + h * D4 * k[3, j]
+        r[3, j] = total + h * D5 * k[4, j] + h * D6 * k[5, j] + h * D7 * k[6, j]
     while filled < len(ys) and filled / rate <= t + h + 1e-12:
         a = min((filled / rate - t) / h, 1.0)
         b = 1.0 - a

@@ -54,9 +54,9 @@ from analysis.terms.sine_cosine import sine_cosine
 def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ignore[no-untyped-def]
     """Fill `bench` and `x` at time t; return False where a piston left its cylinder."""
     N = x.shape[1]
-    place = min(max(t * rate, 0.0), inputs.shape[0] - 1.0)
-    low = min(int(place), inputs.shape[0] - 2)
-    w = place - low
+    sample = min(max(t * rate, 0.0), inputs.shape[0] - 1.0)
+    low = min(int(sample), inputs.shape[0] - 2)
+    w = sample - low
     bench[TIME] = inputs[0, 2 + 4 * N] + t  # since the record began
     bench[P_S] = inputs[low, 0] + w * (inputs[low + 1, 0] - inputs[low, 0])
     bench[P_TANK] = 0.0
@@ -106,7 +106,7 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
 
 @njit(cache=True, error_model="numpy")
 def _impose(M, load, locked, q_dd):  # type: ignore[no-untyped-def]
-    """Replace the rows of locked joints by their given q'', moved to the others' loads."""
+    """Replace the rows of locked joints by their given q'', and its effect on others by loads."""
     for i in range(len(load)):
         if locked[i]:
             for j in range(len(load)):
@@ -214,7 +214,7 @@ def _rates(t, y_at, dy_at, inputs_at, n, rate, locked_at, geometry_at, par_at, c
 
 @functools.cache
 def compiled_rates() -> Any:
-    """Return the right-hand side, compiled (or read from numba's cache); `address` is its place."""
+    """Return the compiled right-hand side, or that of numba's cache; it has an `address`."""
     return cfunc(eq.RATES_SIGNATURE, cache=True, error_model="numpy")(_rates)
 
 
@@ -236,5 +236,5 @@ def context(
 
 
 def work_size(joints: int) -> int:
-    """Return how many numbers of workspace the right-hand side needs."""
+    """Return the length of the right-hand side's workspace."""
     return 4 + 17 * joints + joints * joints

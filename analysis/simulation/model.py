@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 FORMAT: Final = "bramah-model"
 VERSION: Final = 1
 _DIFFERENCES_LISTED: Final = 3  # of two rigs, in a message
-_MOST_BYTES: Final = 1 << 26  # nine joints with curves have far fewer
+_MOST_BYTES: Final = 1 << 26  # of a model file; nine joints with curves have far fewer
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _from_json(data: Mapping[str, Any]) -> Model:
     covariance = np.array([[_number(v) for v in row] for row in data["covariance"]])
     if covariance.shape != (len(parameters), len(parameters)):
         raise InputError(
-            f"covariance: {covariance.shape} does not fit {len(parameters)} parameters"
+            f"covariance: shape {covariance.shape}, expected that of {len(parameters)} parameters"
         )
     return Model(rig, terms, parameters, covariance, dict(data["provenance"]))
 
@@ -236,16 +236,16 @@ def rig_difference(rig: Rig, other: Rig) -> str:
         return f"name {rig.name!r} and {other.name!r}"
     if len(rig.joints) != len(other.joints):
         return f"{len(rig.joints)} and {len(other.joints)} joints"
-    first, second = _physical_values(rig), _physical_values(other)
-    differing = [key for key in {**first, **second} if first.get(key) != second.get(key)]
+    values, others = _physical_values(rig), _physical_values(other)
+    differing = [key for key in {**values, **others} if values.get(key) != others.get(key)]
     if not differing:
         return ""
     listed = ", ".join(
-        f"{key} {first.get(key, 'absent')} and {second.get(key, 'absent')}"
+        f"{key} {values.get(key, 'absent')} and {others.get(key, 'absent')}"
         for key in differing[:_DIFFERENCES_LISTED]
     )
-    more = len(differing) - _DIFFERENCES_LISTED
-    return f"{listed} (SI){f' and {more} more values' if more > 0 else ''}"
+    unlisted = len(differing) - _DIFFERENCES_LISTED
+    return f"{listed} (SI){f' and {unlisted} more values' if unlisted > 0 else ''}"
 
 
 def _physical_values(rig: Rig) -> dict[str, Any]:

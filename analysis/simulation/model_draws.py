@@ -61,10 +61,10 @@ def model_draws(model: Model, count: int, rng: np.random.Generator) -> list[Mode
     signs = rng.choice((-1.0, 1.0), size=(count, len(values)))
     exact = min(count, len(values))
     signs[:, :exact] = hadamard(count)[:, :exact] * rng.choice((-1.0, 1.0), size=exact)
-    return [_moved(model, values + scale * (root @ row)) for row in signs]
+    return [_with_values(model, values + scale * (root @ row)) for row in signs]
 
 
-def _moved(model: Model, values: Sequence[float] | Array) -> Model:
+def _with_values(model: Model, values: Sequence[float] | Array) -> Model:
     parameters = {
         name: replace(p, value=float(value))
         for (name, p), value in zip(model.parameters.items(), values, strict=True)
@@ -113,14 +113,14 @@ def far_from_nominal(rig: Rig, values: Mapping[str, float]) -> str:
 
     The factor, `SIMULATION.far_from_nominal`, is one of a wrong unit or of a wrong gain.
     """
-    most = SIMULATION.far_from_nominal
+    factor = SIMULATION.far_from_nominal
     ratio = {n: values[n] / rig.nominal[n] for n in rig.nominal if n in values and is_positive(n)}
-    far = [f"{n} {r:.2g}" for n, r in ratio.items() if r > most or 0.0 < r < 1.0 / most]
+    far = [f"{n} {r:.2g}" for n, r in ratio.items() if r > factor or 0.0 < r < 1.0 / factor]
     if not far:
         return ""
     return (
         f"{', '.join(far)} times the nominal value of the rig file, expected within a factor of "
-        f"{most:g}: is a channel in another unit, or is the nominal value wrong?"
+        f"{factor:g}: is a channel in another unit, or is the nominal value wrong?"
     )
 
 

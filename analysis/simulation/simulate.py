@@ -1,4 +1,4 @@
-"""Simulate the identified model: driven by a spool, locked joints held, failures reported."""
+"""Simulation of the identified model: driven by the spool, locked joints held."""
 
 from __future__ import annotations
 
@@ -293,34 +293,34 @@ def _output(geometry, inputs, locked, ys, filled, electric, q, qd, cap, rod, pis
     ys[filled:] = ys[filled - 1]
     count = 0
     for k in range(n):
-        beyond, p_s = False, inputs[k, 0]
+        is_outside, p_s = False, inputs[k, 0]
         for i in range(N):
             q[k, i], qd[k, i] = ys[k, i], ys[k, N + i]
             a, b = ys[k, 2 * N + i], ys[k, 3 * N + i]
             cap[k, i], rod[k, i] = a, b
-            beyond |= (not locked[i]) & ((a < 0.0) | (a > p_s) | (b < 0.0) | (b > p_s))
-        count += beyond & (k < filled)
+            is_outside |= (not locked[i]) & ((a < 0.0) | (a > p_s) | (b < 0.0) | (b > p_s))
+        count += is_outside & (k < filled)
     for i in range(N):
         if locked[i]:
             q[:, i], qd[:, i] = inputs[:, 2 + N + i], inputs[:, 2 + 2 * N + i]
         if electric:
             continue
-        place, slope = _linkage(q[:, i].copy(), geometry[i])
+        position, slope = _linkage(q[:, i].copy(), geometry[i])
         for k in range(n):
-            piston[k, i], speed[k, i] = place[k], slope[k] * qd[k, i]
+            piston[k, i], speed[k, i] = position[k], slope[k] * qd[k, i]
     return 0 if electric else count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _linkage(q, geometry):  # type: ignore[no-untyped-def]
-    """Return a piston's place and ds/dq at angles q (n,), several samples at once."""
+    """Return a piston's position [m] and ds/dq [m] at angles q (n,) [rad]."""
     a, c, mid = geometry[eq.PIN_A], geometry[eq.PIN_C], geometry[eq.MID]
-    place, slope = np.empty((2, len(q)))
+    position, slope = np.empty((2, len(q)))
     for k in range(len(q)):
         sine, cosine = sine_cosine(q[k] + geometry[eq.OFFSET])
         length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
-        place[k], slope[k] = length - mid, a * c * sine / length
-    return place, slope
+        position[k], slope[k] = length - mid, a * c * sine / length
+    return position, slope
 
 
 def state_at(signals: Signals, sample: int) -> State:
@@ -345,8 +345,8 @@ def hidden_paths(model: Model, signals: Signals) -> Array:
     corrected for sensor effects.
     """
     values, out = model.values, [np.zeros((len(signals.t), 0))]
-    last = max((k for k, u in enumerate(model.terms) if u.term.hidden(model.rig)), default=-1)
-    for used in model.terms[: last + 1]:
+    stateful = [k for k, u in enumerate(model.terms) if u.term.hidden(model.rig)]
+    for used in model.terms[: stateful[-1] + 1 if stateful else 0]:
         out.append(used.term.hidden_path(model.rig, signals, values, used.shape))
         if used.term.prepares:
             signals = used.term.prepare(model.rig, signals, used.shape)

@@ -37,7 +37,7 @@ def sine(rate: float, hertz: float) -> Wave:
 
 
 def lock_steps(joints: int) -> list[tuple[str, dict[int, float]]]:
-    """Return the lock-and-excite steps (name, 0-based locked joint -> place in half strokes).
+    """Return the lock-and-excite steps (name, 0-based locked joint -> position in half strokes).
 
     Joint k moves while all others stand: those below it at mid-stroke, the one above it at either
     end while those beyond are retracted, then each of those extended; as the paper's STEP1 to
@@ -79,11 +79,11 @@ def synthetic_run(
         fine = np.asarray(resample(wave[0], SIMULATION.oversampling * len(wave[0])))
         spool = rms * fine[np.arange(SIMULATION.oversampling * (lead + n)) % len(fine)]
         run = _centred(model, spool, locked)
-        clean = _channels(rig, run[0], run[1], lead)
+        noiseless = _channels(rig, run[0], run[1], lead)
         for repeat in range(1, repeats + 1):
             channels = {
                 name: x + noise * rig.sensors.of(ch.kind_of(name)[0]).noise * rng.standard_normal(n)
-                for name, x in clean.items()
+                for name, x in noiseless.items()
             }
             names = tuple(i + 1 for i in sorted(locked))
             records.append(
@@ -107,33 +107,33 @@ def _centred(
     """Simulate with the spool bias that keeps the moving joint's mean position constant."""
     rig = model.rig
     N, n, rate = len(rig.joints), len(spool), SIMULATION.oversampling * rig.sample_rate
-    place = np.array(
+    position = np.array(
         [locked.get(i, 0.0) * 0.5 * joint.cylinder.stroke for i, joint in enumerate(rig.joints)]
     )
-    state = holding_state(rig, model, place)
-    held = np.array([i in locked for i in range(N)])
-    free = np.flatnonzero(~held)
+    state = holding_state(rig, model, position)
+    is_locked = np.array([i in locked for i in range(N)])
+    moving = np.flatnonzero(~is_locked)
     t = np.arange(n) / rate
     bias, slope_of_bias = np.zeros(N), np.full(N, np.nan)
-    before: tuple[Array, Array] | None = None
+    previous: tuple[Array, Array] | None = None
     for attempt in range(SIMULATION.trim_rounds + 1):
-        u = np.where(held, 0.0, spool[:, None] + bias)
-        drive = constant_supply(rig, rate, u, held, state.q)
+        u = np.where(is_locked, 0.0, spool[:, None] + bias)
+        drive = constant_supply(rig, rate, u, is_locked, state.q)
         result = simulate(model, drive, state)
         drift = np.array([np.polyfit(t, result.piston[:, i], 1)[0] for i in range(N)])
         if attempt == SIMULATION.trim_rounds:
             break
-        if before is not None:
-            slope_of_bias = (drift - before[1]) / np.where(held, 1.0, bias - before[0])
-        guess = slope_of_bias if before is not None else np.full(N, 1.5)
-        before = (bias.copy(), drift)
-        bias[free] -= drift[free] / guess[free]
+        if previous is not None:
+            slope_of_bias = (drift - previous[1]) / np.where(is_locked, 1.0, bias - previous[0])
+        guess = slope_of_bias if previous is not None else np.full(N, 1.5)
+        previous = (bias.copy(), drift)
+        bias[moving] -= drift[moving] / guess[moving]
     return drive, result
 
 
 def _channels(rig: Rig, drive: DrivingInput, result: Simulation, lead: int) -> dict[str, Array]:
-    every = result.channels()
+    channels = result.channels()
     for i in range(len(rig.joints)):
-        every[ch.channel(ch.SPOOL, i + 1)] = drive.u[:, i]
-    every[ch.SUPPLY], every[ch.TEMPERATURE] = drive.p_s, drive.temperature
-    return {name: every[name][:: SIMULATION.oversampling][lead:] for name in rig.channels}
+        channels[ch.channel(ch.SPOOL, i + 1)] = drive.u[:, i]
+    channels[ch.SUPPLY], channels[ch.TEMPERATURE] = drive.p_s, drive.temperature
+    return {name: channels[name][:: SIMULATION.oversampling][lead:] for name in rig.channels}

@@ -61,10 +61,10 @@ def holding_state(rig: Rig, model: Model, piston: Array) -> State:
     N = len(rig.joints)
     q = np.array([float(j.linkage.angle(p)) for j, p in zip(rig.joints, piston, strict=True)])
     theta, values = np.cumsum(q), model.values
-    pull = np.array(
+    gravity = np.array(
         [values.get(f"W{i + 1}", 0.0) * rig.gravity * np.sin(theta[i]) for i in range(N)]
     )
-    torque = np.cumsum(pull[::-1])[::-1]
+    torque = np.cumsum(gravity[::-1])[::-1]
     cap, rod = np.empty(N), np.empty(N)
     for i, joint in enumerate(rig.joints):
         force = torque[i] / float(joint.linkage.jacobian(q[i]))
@@ -96,16 +96,16 @@ def simulate_commands(
     commands = np.asarray(commands, dtype=np.float64)
     if commands.ndim != 2 or commands.shape[1] != N or len(commands) < 2:
         raise InputError(f"commands of shape {commands.shape} do not fit a rig of {N} joints")
-    held = np.array([i in locked for i in range(N)])
-    place = np.array([locked.get(i, float(start[i])) for i in range(N)])
+    is_locked = np.array([i in locked for i in range(N)])
+    position = np.array([locked.get(i, float(start[i])) for i in range(N)])
     model = nominal_model(rig) if model is None else model
-    state = holding_state(rig, model, place)
+    state = holding_state(rig, model, position)
     n, rate = len(commands), rig.sample_rate
     spool = np.column_stack(
         [spool_response(j.valve, commands[:, i], rate) for i, j in enumerate(rig.joints)]
     )
-    spool[:, held] = 0.0
-    result = simulate(model, constant_supply(rig, rate, spool, held, state.q), state)
+    spool[:, is_locked] = 0.0
+    result = simulate(model, constant_supply(rig, rate, spool, is_locked, state.q), state)
     if result.failure:
         log.info("the twin stopped: %s", result.failure)
     return {

@@ -95,7 +95,7 @@ def validate_record(
     """
     model = as_loaded(model, record.loaded)
     smoother = default_filtering(record).channels
-    here = arrived(rig, record)
+    present = arrived(rig, record)
     signals = sensor_corrected(rig, model.terms, condition(rig, record, smoother, bands))
     # Sensors are corrected by the model's sensor effects before anything is compared.
     channels = aligned_channels(rig, record)
@@ -103,33 +103,33 @@ def validate_record(
     measured = compared(rig, channels, signals)
     ready, drive = compiled(model), drive_of(signals)
     hidden = hidden_paths(model, signals)
-    first_of_all = first_state(rig, record, signals, channels)
-    free = simulate(ready, drive, replace(first_of_all, hidden=hidden[0]))
-    simulated = free.channels()
+    initial = first_state(rig, record, signals, channels)
+    free_run = simulate(ready, drive, replace(initial, hidden=hidden[0]))
+    simulated = free_run.channels()
     windows = dict.fromkeys(measured, 0.0)
     count = 0
-    for first, length in _windows(record, smoother):
-        if not here[first : first + length].all():
+    for start, length in _windows(record, smoother):
+        if not present[start : start + length].all():
             continue
-        start = replace(state_at(signals, first), hidden=hidden[first])
-        short = simulate(ready, drive, start, first, length)
-        stretch = short.channels()
+        state = replace(state_at(signals, start), hidden=hidden[start])
+        window_run = simulate(ready, drive, state, start, length)
+        window_channels = window_run.channels()
         for name, y in measured.items():
-            error = stretch[name] - y[first : first + length]
-            windows[name] += np.nan if short.failure else float(error @ error)
+            error = window_channels[name] - y[start : start + length]
+            windows[name] += np.nan if window_run.failure else float(error @ error)
         count += length
     return RecordValidation(
         record.name,
         record.step,
-        {name: fit_percent(y[here], simulated[name][here]) for name, y in measured.items()},
+        {name: fit_percent(y[present], simulated[name][present]) for name, y in measured.items()},
         {
-            name: float(np.sqrt(np.mean((y - simulated[name])[here] ** 2)))
+            name: float(np.sqrt(np.mean((y - simulated[name])[present] ** 2)))
             for name, y in measured.items()
         },
         {name: float(np.sqrt(v / count)) if count else np.nan for name, v in windows.items()},
-        free.failure,
-        free.outside,
-        free,
+        free_run.failure,
+        free_run.outside,
+        free_run,
         measured,
         record.time,
         {name: rig.unit_of(name) for name in measured},
@@ -163,8 +163,8 @@ def compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[
 
 def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
     length = round(SIMULATION.window * record.sample_rate)
-    for first in range(smoother.reach, record.samples - smoother.reach - length + 1, length):
-        yield first, length
+    for start in range(smoother.reach, record.samples - smoother.reach - length + 1, length):
+        yield start, length
 
 
 def first_state(rig: Rig, record: Record, signals: Signals, channels: Mapping[str, Array]) -> State:

@@ -29,8 +29,8 @@ logger = logging.getLogger(__name__)
 
 VERSIONS: Final = (2, 3)
 COMPILER: Final = "ziglang"  # the package that brings a C compiler for every target
-SECONDS: Final = 900.0  # for one library; the first one compiles the target's C library as well
-_FIXED_DATE: Final = (1980, 1, 1, 0, 0, 0)  # the same model makes the same file
+SECONDS: Final = 900.0  # [s] for one library; the first one compiles the target's C library as well
+_FIXED_DATE: Final = (1980, 1, 1, 0, 0, 0)  # so that the same model makes the same file
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ def write_fmus(
         content = _content(model, identifier, about, version, targets, announce)
         files.append(folder / f"{name}-fmi{version}.fmu")
         with zipfile.ZipFile(files[-1], "w") as archive:
-            for place, data in content.items():
-                entry = zipfile.ZipInfo(place, _FIXED_DATE)
+            for path, data in content.items():
+                entry = zipfile.ZipInfo(path, _FIXED_DATE)
                 archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
     return files
 
@@ -100,13 +100,13 @@ def _content(
     targets: Sequence[Target],
     announce: Callable[[int, Target], None],
 ) -> dict[str, bytes]:
-    """Return the unit's files by place in the archive."""
+    """Return the unit's files by their paths in the archive."""
     variables = unit_variables(model)
     try:
-        bare = model_header(model, variables, "")
+        header = model_header(model, variables, "")
     except UntranslatableKernelError as error:
         raise InputError(f"the model cannot be exported as C: {error}") from error
-    digest = hashlib.sha256(f"{version} {identifier} {bare}".encode()).digest()
+    digest = hashlib.sha256(f"{version} {identifier} {header}".encode()).digest()
     token = f"{{{uuid.UUID(bytes=digest[:16])}}}"
     folder = resources.files("analysis.simulation.fmu") / "c"
     names = (f"fmi{version}.c", "bench_model.c", "variables.h")
@@ -121,9 +121,9 @@ def _content(
         content["sources/buildDescription.xml"] = build_description(identifier).encode()
     for target in targets:
         announce(version, target)
-        place = target.folders[VERSIONS.index(version)]
+        platform = target.folders[VERSIONS.index(version)]
         library = _compiled(sources, f"fmi{version}.c", target.name)
-        content[f"binaries/{place}/{identifier}.{target.ending}"] = library
+        content[f"binaries/{platform}/{identifier}.{target.ending}"] = library
     return content
 
 
@@ -137,12 +137,12 @@ def _compiled(sources: dict[str, str], main: str, target: str) -> bytes:
             "-fvisibility=hidden", "-target", target, "-o", "library", main, "-lm",
         ]  # fmt: skip
         try:
-            done = subprocess.run(
+            compilation = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False
             )
         except subprocess.TimeoutExpired as error:
             raise CompilationError(f"no library for {target} after {SECONDS:g} s") from error
         library = Path(folder, "library")
-        if done.returncode or not library.is_file():
-            raise CompilationError(f"no library for {target}: {done.stderr.strip()[-2000:]}")
+        if compilation.returncode or not library.is_file():
+            raise CompilationError(f"no library for {target}: {compilation.stderr.strip()[-2000:]}")
         return library.read_bytes()

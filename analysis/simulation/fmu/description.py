@@ -49,9 +49,9 @@ def description_2(name: str, about: str, token: str, step: float, unit: UnitVari
     outputs = SubElement(structure, "Outputs")
     initial = SubElement(structure, "InitialUnknowns")
     for v in unit.outputs:
-        at, start = index[v.name], index[f"{v.name}_start"]
-        SubElement(outputs, "Unknown", index=at, dependencies="")
-        SubElement(initial, "Unknown", index=at, dependencies=start)
+        reference, start = index[v.name], index[f"{v.name}_start"]
+        SubElement(outputs, "Unknown", index=reference, dependencies="")
+        SubElement(initial, "Unknown", index=reference, dependencies=start)
     return _text(root)
 
 
@@ -81,8 +81,8 @@ def description_3(name: str, about: str, token: str, step: float, unit: UnitVari
         SubElement(structure, "Output", valueReference=str(v.reference), dependencies="")
     starts = {v.name: str(v.reference) for v in unit.starts}
     for v in unit.outputs:
-        at, start = str(v.reference), starts[f"{v.name}_start"]
-        SubElement(structure, "InitialUnknown", valueReference=at, dependencies=start)
+        reference, start = str(v.reference), starts[f"{v.name}_start"]
+        SubElement(structure, "InitialUnknown", valueReference=reference, dependencies=start)
     return _text(root)
 
 

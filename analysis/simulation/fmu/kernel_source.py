@@ -64,12 +64,12 @@ class KernelLibrary:
 
         Raises UntranslatableKernelError.
         """
-        plain = getattr(function, "py_func", function)
-        key = (plain, tuple(kinds))
+        python_function = getattr(function, "py_func", function)
+        key = (python_function, tuple(kinds))
         if key not in self.functions:
-            wanted = name or f"f{len(self.functions)}_{plain.__name__.strip('_')}"
-            self.functions[key] = wanted
-            _Translation(plain, tuple(kinds), wanted, self).write()
+            c_name = name or f"f{len(self.functions)}_{python_function.__name__.strip('_')}"
+            self.functions[key] = c_name
+            _Translation(python_function, tuple(kinds), c_name, self).write()
         return self.functions[key]
 
     @property
@@ -169,11 +169,11 @@ class _Translation:
         if any(v.kind != INT for v in values):
             raise self._refusal(source, "a range of numbers that are no integers")
         texts = [v.text for v in values]
-        first, last = ("0", texts[0]) if len(texts) == 1 else (texts[0], texts[1])
+        begin, end = ("0", texts[0]) if len(texts) == 1 else (texts[0], texts[1])
         step = texts[2] if len(texts) == 3 else "1"
         down = step.strip("()").startswith("-")
         i = self._declare(name, INT)
-        head = f"for ({i} = {first}; {i} {'>' if down else '<'} {last}; {i} += {step})"
+        head = f"for ({i} = {begin}; {i} {'>' if down else '<'} {end}; {i} += {step})"
         self._nested(head, body)
 
     def _return(self, value: ast.expr | None) -> None:
@@ -207,19 +207,19 @@ class _Translation:
         if isinstance(value, ast.Tuple):
             values = [self._value(v) for v in value.elts]
         else:
-            whole = self._value(value)
+            result = self._value(value)
             self.temporaries += 1
-            kept = f"t{self.temporaries}"
-            self._line(f"struct tuple{whole.size} {kept} = {whole.text};")
-            values = [CValue(f"{kept}.v[{k}]", DOUBLE) for k in range(whole.size)]
+            temporary = f"t{self.temporaries}"
+            self._line(f"struct tuple{result.size} {temporary} = {result.text};")
+            values = [CValue(f"{temporary}.v[{k}]", DOUBLE) for k in range(result.size)]
         if len(values) != len(targets):
             raise self._refusal(value, f"{len(values)} values for {len(targets)} targets")
-        kept_values = []
+        copies = []
         for element in values:
             self.temporaries += 1
             self._line(f"{_C_TYPES[element.kind]} t{self.temporaries} = {element.text};")
-            kept_values.append(CValue(f"t{self.temporaries}", element.kind))
-        for target, element in zip(targets, kept_values, strict=True):
+            copies.append(CValue(f"t{self.temporaries}", element.kind))
+        for target, element in zip(targets, copies, strict=True):
             self._store(target, element)
 
     def _store(self, target: ast.expr, value: CValue) -> None:
@@ -234,8 +234,8 @@ class _Translation:
     def _declare(self, name: str, kind: str) -> str:
         if name in self.arguments:
             return _safe(name)
-        known = self.locals.get(name)
-        if known is None or (known == INT and kind == DOUBLE):
+        declared = self.locals.get(name)
+        if declared is None or (declared == INT and kind == DOUBLE):
             self.locals[name] = kind
         return _safe(name)
 
@@ -322,10 +322,10 @@ class _Translation:
         sign = _BINARY.get(type(operator))
         if sign is None:
             raise self._refusal(node, type(operator).__name__)
-        whole = left.kind == right.kind == INT
-        if sign == "/" and whole:
+        integers = left.kind == right.kind == INT
+        if sign == "/" and integers:
             return CValue(f"((double){left.text} / {right.text})", DOUBLE)
-        return CValue(f"({left.text} {sign} {right.text})", INT if whole else DOUBLE)
+        return CValue(f"({left.text} {sign} {right.text})", INT if integers else DOUBLE)
 
     def _compare(self, nodes: Sequence[ast.expr], operators: Sequence[ast.cmpop]) -> CValue:
         values = [self._value(n).text for n in nodes]

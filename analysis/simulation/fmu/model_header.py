@@ -34,11 +34,10 @@ def model_header(model: Model, variables: UnitVariables, token: str) -> str:
         par = used.term.pack(model.rig, model.values, used.shape)
         function = library.add(used.term.kernel.function, KERNEL_KINDS)
         state, hidden = hidden, hidden + used.term.hidden(model.rig)
-        when = "" if used.term.prepares else "if (phase == CONTRIBUTE) "
+        condition = "" if used.term.prepares else "if (phase == CONTRIBUTE) "
         packs.append(f"static double par{m}[] = {_braces(par)}; /* {used.term.name} */")
-        calls.append(
-            f"    {when}{function}(phase, bench, x, z + {state}, par{m}, out, M, dz + {state});"
-        )
+        arguments = f"phase, bench, x, z + {state}, par{m}, out, M, dz + {state}"
+        calls.append(f"    {condition}{function}({arguments});")
     sizes = {
         "N": joints,
         "HIDDEN": hidden,

@@ -30,7 +30,7 @@ class UnitVariable:
 
 @dataclass(frozen=True)
 class UnitVariables:
-    """All variables of a model's unit, grouped by what they are."""
+    """All variables of a model's unit, grouped by causality."""
 
     inputs: tuple[UnitVariable, ...]
     outputs: tuple[UnitVariable, ...]
@@ -71,9 +71,9 @@ def unit_variables(model: Model) -> UnitVariables:
     ]
     for i in joints:
         name = ch.channel(drive, i)
-        what = "drive signal" if electric else "spool position as measured"
+        quantity = "drive signal" if electric else "spool position as measured"
         inputs.append(
-            UnitVariable(name, INPUT + 1 + i, rig.unit_of(name), 0.0, f"joint {i}: {what}")
+            UnitVariable(name, INPUT + 1 + i, rig.unit_of(name), 0.0, f"joint {i}: {quantity}")
         )
     constants = tuple(
         UnitVariable(f"parameters.{name}", CONSTANT + k, p.unit, p.value, "identified parameter")
@@ -101,9 +101,9 @@ def unit_variables(model: Model) -> UnitVariables:
 def _names(rig: Rig, joint: int) -> list[tuple[str, str, str]]:
     """Return name, unit and description of a joint's four outputs (electric: two)."""
     if rig.electric:
-        at = ch.channel(ch.POSITION, joint)
-        unit = rig.unit_of(at)
-        return [(at, unit, "position"), (f"speed_{joint}", f"{unit}/s", "speed")]
+        position = ch.channel(ch.POSITION, joint)
+        unit = rig.unit_of(position)
+        return [(position, unit, "position"), (f"speed_{joint}", f"{unit}/s", "speed")]
     return [
         (ch.channel(ch.PISTON, joint), "m", "piston position"),
         (f"piston_speed_{joint}", "m/s", "piston speed"),
@@ -114,14 +114,14 @@ def _names(rig: Rig, joint: int) -> list[tuple[str, str, str]]:
 
 def _outputs(rig: Rig) -> Iterator[UnitVariable]:
     for i in range(1, len(rig.joints) + 1):
-        for k, (name, unit, what) in enumerate(_names(rig, i)):
-            yield UnitVariable(name, OUTPUT + 4 * (i - 1) + k, unit, 0.0, f"joint {i}: {what}")
+        for k, (name, unit, quantity) in enumerate(_names(rig, i)):
+            yield UnitVariable(name, OUTPUT + 4 * (i - 1) + k, unit, 0.0, f"joint {i}: {quantity}")
 
 
 def _starts(rig: Rig, supply: float) -> Iterator[UnitVariable]:
     for i in range(1, len(rig.joints) + 1):
         values = (0.0, 0.0, 0.5 * supply, 0.5 * supply)
-        for k, (name, unit, what) in enumerate(_names(rig, i)):
+        for k, (name, unit, quantity) in enumerate(_names(rig, i)):
             reference = START + 4 * (i - 1) + k
-            about = f"joint {i}: {what} at the start"
+            about = f"joint {i}: {quantity} at the start"
             yield UnitVariable(f"{name}_start", reference, unit, values[k], about)
