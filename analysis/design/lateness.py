@@ -73,14 +73,14 @@ def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Recor
     names, n = list(record.channels), record.samples
     ticks = np.arange(n, dtype=float)
     times = late_times(n, jitter * record.sample_rate, rng)
-    between = CubicSpline(ticks, np.column_stack([record.channels[name] for name in names]))
-    values = between(np.minimum(times, n - 1.0))
+    spline = CubicSpline(ticks, np.column_stack([record.channels[name] for name in names]))
+    values = spline(np.minimum(times, n - 1.0))
     out, resampler = np.full((n, len(names)), np.nan), Resampler()
     unmarked = np.zeros(len(names), dtype=np.bool_)
-    for at, row in zip(times, values, strict=True):
-        for made in resampler.add(float(at), row, unmarked):
-            if made.tick < n:
-                out[made.tick] = made.values
+    for time, row in zip(times, values, strict=True):
+        for sample in resampler.add(float(time), row, unmarked):
+            if sample.tick < n:
+                out[sample.tick] = sample.values
     # The driver's stream continues before and after a record; the twin's ends here.
     out[:1], out[-1:] = values[:1], values[-1:]
     return replace(record, channels={name: out[:, k] for k, name in enumerate(names)})
@@ -94,15 +94,15 @@ def lateness_cost(
     even = _bulk(rig, played, terms, {})
     if even is None:
         return None
-    shifts, lost = [], []
+    shifts, missing = [], []
     for _ in range(DESIGN.late_draws):
         late = {play.step.name: taken_late(play.record, jitter, rng) for play in played}
         bulk = _bulk(rig, played, terms, late)
         if bulk is not None:
             shifts.append(bulk / even - 1.0)
-        first = rig.channels[0]
-        lost += [float(np.isnan(record.channels[first]).mean()) for record in late.values()]
-    share = float(np.mean(lost))
+        channel = rig.channels[0]
+        missing += [float(np.isnan(record.channels[channel]).mean()) for record in late.values()]
+    share = float(np.mean(missing))
     if not shifts:
         return LatenessCost(jitter, math.nan, math.nan, share)
     repeats = min(max(play.step.repeats, 1) for play in played)
@@ -113,7 +113,7 @@ def lateness_cost(
 def _bulk(
     rig: Rig, played: Sequence[Played], terms: Sequence[Used], late: Mapping[str, Record]
 ) -> float | None:
-    """Return b [Pa] by least squares over one record a step, weighted by its repeats."""
+    """Return b [Pa] by least squares over one record per step, weighted by its repeats."""
     exact = ideal(rig)
     names = parameters_of(rig, terms, "fluid")
     if BULK not in names:
@@ -122,17 +122,17 @@ def _bulk(
     for play in played:
         record = late.get(play.step.name, play.record)
         (built,) = build_rows(exact, [Run(exact, (record,), source="twin")], terms)
-        mine = [r for name, r in built.rows.items() if family_of(name) == "fluid"]
+        fluid_rows = [r for name, r in built.rows.items() if family_of(name) == "fluid"]
         weight = math.sqrt(max(play.step.repeats, 1))
-        X = np.concatenate([r.matrix for r in mine])
-        triangles.append(weight * triangle(X, np.concatenate([r.rhs for r in mine])))
+        X = np.concatenate([r.matrix for r in fluid_rows])
+        triangles.append(weight * triangle(X, np.concatenate([r.rhs for r in fluid_rows])))
     R = merge(triangles)
     k = len(names)
     scale = np.sqrt((R[:k, :k] ** 2).sum(axis=0))
-    kept = scale > 0.0
-    if not kept[names.index(BULK)]:
+    filled = scale > 0.0
+    if not filled[names.index(BULK)]:
         return None
     beta = np.zeros(k)
-    beta[kept] = np.linalg.lstsq(R[:, :k][:, kept] / scale[kept], R[:, k])[0] / scale[kept]
+    beta[filled] = np.linalg.lstsq(R[:, :k][:, filled] / scale[filled], R[:, k])[0] / scale[filled]
     inverse = beta[names.index(BULK)]
     return float(1.0 / inverse) if inverse > 0.0 else None

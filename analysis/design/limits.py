@@ -1,4 +1,4 @@
-"""The share of each limit that an excitation uses, with a linear forecast for another one.
+"""The share of each limit that an excitation uses, and a linear forecast for other spectra.
 
 A share of 1 is at the limit. Limits are those of the rig file and, more strictly than in `check`,
 those of usable records: chamber pressures between tank and supply, flow within the pump's. The
@@ -23,7 +23,7 @@ Spectrum = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Bound:
-    """One signal (n,) of a joint and the range it may fill, about its mean."""
+    """One signal (n,) of a joint and the range [SI] that it must stay within."""
 
     name: str
     joint: int
@@ -54,8 +54,8 @@ def bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> list[Bound]
         out.append(Bound("pump flow", j, speed, least, most))
     if len(step.waves) > 1:
         # The flow is positive; with its mirror image appended its mean is zero like the others'.
-        both = np.append(demand, -demand)
-        out.append(Bound("pump flow", -1, both, -rig.supply.flow, rig.supply.flow))
+        mirrored = np.append(demand, -demand)
+        out.append(Bound("pump flow", -1, mirrored, -rig.supply.flow, rig.supply.flow))
     for j, tolerance in step.yields.items():
         piston, allowed = motion["piston"][:, j], DESIGN.lock_share * tolerance
         out.append(Bound("closed lock", j, piston - piston.mean(), -allowed, allowed))
@@ -97,17 +97,17 @@ def _under_loop(piston: Array, command: Array, loop: float, rate: float) -> Arra
     """
     n = len(piston)
     w = 2 * np.pi * np.fft.rfftfreq(n, 1.0 / rate)
-    wave, place = np.fft.rfft(command), np.fft.rfft(piston)
-    speed = 1j * w * place
+    wave, position = np.fft.rfft(command), np.fft.rfft(piston)
+    speed = 1j * w * position
     gain = np.real(np.vdot(wave[1:], speed[1:])) / np.real(np.vdot(wave[1:], wave[1:]))
-    return np.fft.irfft(place * 1j * w / (1j * w + max(gain, 0.0) * loop + 1e-12), n)
+    return np.fft.irfft(position * 1j * w / (1j * w + max(gain, 0.0) * loop + 1e-12), n)
 
 
-def used(rig: Rig, played: Played) -> tuple[float, str]:
+def tightest_limit(rig: Rig, played: Played) -> tuple[float, str]:
     """Return the largest share of any limit, and that limit's name."""
     worst = max(bounds(rig, played.step, played.motion), key=lambda b: b.share)
-    place = "bench" if worst.joint < 0 else f"joint {worst.joint + 1}"
-    return worst.share, f"{played.step.name} {place} {worst.name}"
+    where = "bench" if worst.joint < 0 else f"joint {worst.joint + 1}"
+    return worst.share, f"{played.step.name} {where} {worst.name}"
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class LimitForecast:
         )
 
     def flattened(self, spectrum: Spectrum, rounds: int) -> tuple[Spectrum, float]:
-        """Return the spectrum with phases of lower worst share, and that share.
+        """Return the spectrum with the phases of the lowest largest share found, and that share.
 
         The worst signal is clipped and the phases of the result are used: time-frequency swapping
         (Van der Ouderaa, Schoukens and Renneboog 1988), for whichever signal is worst.
@@ -152,10 +152,10 @@ class LimitForecast:
                 best, lowest = spectrum, float(shares[worst])
             level = DESIGN.peak_clip * shares[worst]
             clipped = np.clip(motion[worst], -level * self.low[worst], level * self.high[worst])
-            remaining_lines = np.fft.rfft(clipped)[self.lines]
+            swapped = np.fft.rfft(clipped)[self.lines]
             response = self.responses[worst]
             response = np.where(np.abs(response) > 0, response, 1.0)
-            spectrum = size * np.exp(1j * np.angle(remaining_lines / response))
+            spectrum = size * np.exp(1j * np.angle(swapped / response))
         return best, lowest
 
 
@@ -163,14 +163,14 @@ def forecast_of(rig: Rig, played: Played, joint: int, lines: NDArray[np.int64]) 
     """Measure the responses at the lines that are excited and interpolate them to the others."""
     n = played.step.period
     command = np.fft.rfft(played.motion["command"][-n:, joint])
-    strong = lines[np.abs(command[lines]) > 1e-6 * np.abs(command[lines]).max()]
+    excited = lines[np.abs(command[lines]) > 1e-6 * np.abs(command[lines]).max()]
     responses, low, high = [], [], []
     for bound in bounds(rig, played.step, played.motion):
         if bound.joint < 0 or not bound.low < bound.signal.mean() < bound.high:
             continue
-        response = np.fft.rfft(bound.signal[-n:])[strong] / command[strong]
+        response = np.fft.rfft(bound.signal[-n:])[excited] / command[excited]
         responses.append(
-            np.interp(lines, strong, response.real) + 1j * np.interp(lines, strong, response.imag)
+            np.interp(lines, excited, response.real) + 1j * np.interp(lines, excited, response.imag)
         )
         low.append(bound.signal.mean() - bound.low)
         high.append(bound.high - bound.signal.mean())

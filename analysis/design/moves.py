@@ -19,7 +19,7 @@ KINDS = ("shape", "bump", "lines", "phases")
 
 @dataclass(frozen=True)
 class Tone:
-    """Lines that one joint of one step may use, with the amplitude and phase of each [V].
+    """Lines that one joint of one step may use, with their complex amplitudes [V].
 
     `empty` lines stay empty; `spectrum` (lines,) is zero where a line is not used.
     """
@@ -41,27 +41,28 @@ def mutated(tone: Tone, early: bool, rng: np.random.Generator) -> tuple[Spectrum
     `early` in a search, large changes are more frequent.
     """
     size, level = np.abs(tone.spectrum), envelope(tone)
-    many = len(tone.lines)
+    count = len(tone.lines)
     kind = rng.choice(KINDS, p=DESIGN.early_moves if early else DESIGN.late_moves)
     x = np.log(tone.lines / tone.lines[0])
     if kind == "phases":
         spread = rng.uniform(0.1, np.pi)
-        turn = np.exp(1j * spread * rng.uniform(-1, 1, many))
-        return np.asarray(tone.spectrum * turn), 2
+        rotation = np.exp(1j * spread * rng.uniform(-1, 1, count))
+        return np.asarray(tone.spectrum * rotation), 2
     if kind == "bump":
         middle, width = rng.uniform(x[0], x[-1]), rng.uniform(0.08, 0.6)
         height = 0.7 * rng.standard_normal()
         size = size * np.exp(height * np.exp(-0.5 * ((x - middle) / width) ** 2))
     elif kind == "lines":
-        some = rng.random(many) < rng.uniform(0.03, 0.3)
-        size = np.where(some, np.where(size > 0, 0.0, level), size)
+        toggled = rng.random(count) < rng.uniform(0.03, 0.3)
+        size = np.where(toggled, np.where(size > 0, 0.0, level), size)
     else:
         size = reshaped(tone, rng)
     if np.count_nonzero(size) < DESIGN.least_lines:
         return tone.spectrum, 1
-    fresh = np.exp(2j * np.pi * rng.random(many))
-    turn = np.where(np.abs(tone.spectrum) > 0, np.exp(1j * np.angle(tone.spectrum)), fresh)
-    return np.asarray(size * turn), 4 if kind == "shape" else 3
+    random_phases = np.exp(2j * np.pi * rng.random(count))
+    old_phases = np.exp(1j * np.angle(tone.spectrum))
+    rotation = np.where(np.abs(tone.spectrum) > 0, old_phases, random_phases)
+    return np.asarray(size * rotation), 4 if kind == "shape" else 3
 
 
 def tilted(tone: Tone, tilt: float, rng: np.random.Generator) -> tuple[Spectrum, int]:
@@ -75,9 +76,9 @@ def reshaped(tone: Tone, rng: np.random.Generator) -> Array:
     """Return amplitudes (lines,) f^-tilt in a random band above the lowest lines, which stay."""
     size = np.abs(tone.spectrum)
     lowest = np.flatnonzero(size > 0)[: DESIGN.anchors]
-    many, first = len(size), int(lowest[-1]) + 1
-    low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (many - first) + first
-    inside = (np.arange(many) >= low) & (np.arange(many) < high)
+    count, first = len(size), int(lowest[-1]) + 1
+    low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (count - first) + first
+    inside = (np.arange(count) >= low) & (np.arange(count) < high)
     shape = tone.lines.astype(np.float64) ** -rng.uniform(*DESIGN.tilts) * inside
     power = np.linalg.norm(shape)
     if power == 0:
@@ -91,17 +92,17 @@ def reshaped(tone: Tone, rng: np.random.Generator) -> Array:
 def tone_of(joint: int, wave: Array, empty: Sequence[int]) -> Tone:
     """Return the tone of one period of a command (n,), with the lines it may take."""
     spectrum = np.fft.rfft(wave) * (2.0 / len(wave))
-    own = np.flatnonzero(np.abs(spectrum) > 1e-6 * np.abs(spectrum).max())
-    stride = int(np.gcd.reduce(np.diff(own))) if len(own) > 1 else 1
-    first = max(own[0] - stride * int((1 - DESIGN.lowest_line) * own[0] / stride), 1)
-    last = (
-        own[-1] + stride * int((DESIGN.highest_line - 1) * own[-1] / stride)
-        if len(own) > 1
-        else own[-1]
+    in_use = np.flatnonzero(np.abs(spectrum) > 1e-6 * np.abs(spectrum).max())
+    stride = int(np.gcd.reduce(np.diff(in_use))) if len(in_use) > 1 else 1
+    lowest = max(in_use[0] - stride * int((1 - DESIGN.lowest_line) * in_use[0] / stride), 1)
+    highest = (
+        in_use[-1] + stride * int((DESIGN.highest_line - 1) * in_use[-1] / stride)
+        if len(in_use) > 1
+        else in_use[-1]
     )
-    lines = np.setdiff1d(np.arange(first, last + 1, stride), np.array(empty, dtype=np.int64))
-    lines = np.union1d(lines, own)
-    values = np.where(np.isin(lines, own), spectrum[lines], 0.0)
+    lines = np.setdiff1d(np.arange(lowest, highest + 1, stride), np.array(empty, dtype=np.int64))
+    lines = np.union1d(lines, in_use)
+    values = np.where(np.isin(lines, in_use), spectrum[lines], 0.0)
     return Tone(joint, lines.astype(np.int64), values, tuple(empty))
 
 

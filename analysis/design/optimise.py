@@ -5,8 +5,8 @@ one joint's spectrum in one step: a smooth bump of its amplitudes, another band,
 or added, a new tilt, or its phases. Phases are then changed until the forecast peaks are low, and
 the whole is scaled to reach the tightest limit. It is judged by the predicted covariance on the
 twin (`predict`), with rows and noise as in the identification, and accepted if the criterion falls
-and no other parameter becomes too poor (`kept_error`). The information of the other steps is
-reused, so a trial costs one step's simulation. Criteria, of the covariance relative to the nominal
+and every error stays within its limit (`kept_error`). The information of the other steps is reused,
+so a trial costs one step's simulation. Criteria, of the covariance relative to the nominal
 parameters (Pintelon and Schoukens, ch. 5; Pronzato and Pazman, Design of Experiments in Nonlinear
 Models, ch. 5): D log det, E the largest eigenvalue, or one parameter's variance.
 """
@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.design.limits import forecast_of, used
+from analysis.design.limits import forecast_of, tightest_limit
 from analysis.design.moves import Tone, mutated, tilted, tone_of, with_tones
 from analysis.design.predict import StepInformation, coefficients, covariance, information
 from analysis.design.settings import DESIGN
@@ -78,24 +78,24 @@ def improve(
     unknown criterion and where no step has a multisine.
     """
     search = _Search(rig, criterion, rng)
-    candidates = [search.first(step, empty) for step in steps]
-    free = [
+    candidates = [search.start(step, empty) for step in steps]
+    tones = [
         (s, j) for s, c in enumerate(candidates) for j, t in c.tones.items() if len(t.chosen) > 1
     ]
-    if not free:
+    if not tones:
         raise InputError("no step has a multisine to improve; start from lock-and-excite-multisine")
     search.begin([c.information for c in candidates])
     before = search.errors([c.information for c in candidates])
     shares = {c.information.step: (c.share, c.limit) for c in candidates}
     plays, accepted, children = 0, 0, 0
-    for s in dict.fromkeys(s for s, _ in free):
+    for s in dict.fromkeys(s for s, _ in tones):
         candidates[s], cost = search.fitted(candidates[s])
         plays += cost
     best = search.value([c.information for c in candidates])
     search.allow([c.information for c in candidates])
-    shapes = [(s, joint, tilt) for tilt in DESIGN.first_tilts for s, joint in free]
+    shapes = [(s, joint, tilt) for tilt in DESIGN.first_tilts for s, joint in tones]
     while plays < budget:
-        s, joint, tilt = shapes.pop(0) if shapes else (*free[int(rng.integers(len(free)))], None)
+        s, joint, tilt = shapes.pop(0) if shapes else (*tones[int(rng.integers(len(tones)))], None)
         child, cost = search.child(candidates[s], joint, tilt, plays < DESIGN.early_share * budget)
         plays, children = plays + cost, children + 1
         if child is None:
@@ -113,7 +113,7 @@ def improve(
 
 
 class _Search:
-    """Shared by all children: rig, model, criterion, random stream, errors at the start."""
+    """What all children share: rig, model, criterion, random generator, limits of the errors."""
 
     def __init__(self, rig: Rig, criterion: str, rng: np.random.Generator) -> None:
         self.rig, self.criterion, self.rng = rig, criterion, rng
@@ -129,22 +129,26 @@ class _Search:
         self.gains: dict[str, Mapping[int, float]] = {}
 
     def begin(self, steps: Sequence[StepInformation]) -> None:
-        """Store the first errors; raise InputError if a wanted parameter is undetermined."""
+        """Set the errors' limits; raises InputError where the criterion is undetermined."""
         errors = self.errors(steps)
-        lost = [n for n, e in errors.items() if not math.isfinite(e)]
-        wanted = lost if self.criterion in ("D", "E") else [n for n in lost if n == self.criterion]
-        if wanted:
+        undetermined = [n for n, e in errors.items() if not math.isfinite(e)]
+        if self.criterion not in ("D", "E"):
+            undetermined = [n for n in undetermined if n == self.criterion]
+        if undetermined:
             raise InputError(
-                f"the steps do not determine {' '.join(wanted)}; no excitation helps: "
+                f"the steps do not determine {' '.join(undetermined)}; no excitation helps: "
                 "add a step that excites the joint concerned"
             )
-        known = {n: e for n, e in errors.items() if math.isfinite(e)}
-        aim = {"D": float(np.exp(np.mean(np.log(list(known.values()))))), "E": max(known.values())}
-        about = aim.get(self.criterion, known.get(self.criterion, 0.0))
-        self.allowed = {n: max(DESIGN.kept_error * e, about) for n, e in known.items()}
+        finite = {n: e for n, e in errors.items() if math.isfinite(e)}
+        means = {
+            "D": float(np.exp(np.mean(np.log(list(finite.values()))))),
+            "E": max(finite.values()),
+        }
+        start = means.get(self.criterion, finite.get(self.criterion, 0.0))
+        self.allowed = {n: max(DESIGN.kept_error * e, start) for n, e in finite.items()}
 
     def allow(self, steps: Sequence[StepInformation]) -> None:
-        """Raise the allowed errors to those of the first steps, scaled down to keep the limits."""
+        """Raise the allowed errors to those of these steps, as scaled down to the limits."""
         for name, error in self.errors(steps).items():
             if name in self.allowed:
                 self.allowed[name] = max(self.allowed[name], 1.001 * error)
@@ -164,7 +168,7 @@ class _Search:
         return out
 
     def value(self, steps: Sequence[StepInformation]) -> float:
-        """Return the criterion, smaller is better; infinite where a parameter became too poor."""
+        """Return the criterion, smaller is better; infinite where an error exceeds its limit."""
         covariances = self.relative(steps)
         errors = self.errors(steps)
         if any(not errors[n] <= limit for n, limit in self.allowed.items()):
@@ -180,11 +184,11 @@ class _Search:
         if self.criterion == "D":
             size = sum(len(names) for names in self.names.values())
             return f"D: {100 * math.exp(0.5 * value / size):.4f} % geometric mean"
-        what = "worst direction" if self.criterion == "E" else self.criterion
-        return f"{what}: {100 * math.sqrt(value):.4f} %"
+        target = "worst direction" if self.criterion == "E" else self.criterion
+        return f"{target}: {100 * math.sqrt(value):.4f} %"
 
-    def first(self, step: TwinStep, empty: Mapping[tuple[str, int], tuple[int, ...]]) -> Candidate:
-        """Simulate the protocol's own step and determine its tones."""
+    def start(self, step: TwinStep, empty: Mapping[tuple[str, int], tuple[int, ...]]) -> Candidate:
+        """Simulate the step as the protocol states it and determine its tones."""
         tones = {
             j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()
         }
@@ -196,7 +200,7 @@ class _Search:
         """Simulate a step; raises InputError where the twin cannot."""
         simulated = play(self.rig, step)
         step_information = information(self.rig, simulated, self.terms)
-        return Candidate(tones, simulated, step_information, *used(self.rig, simulated))
+        return Candidate(tones, simulated, step_information, *tightest_limit(self.rig, simulated))
 
     def fitted(self, candidate: Candidate) -> tuple[Candidate, int]:
         """Scale a step that exceeds a limit down until it keeps them all."""
@@ -226,8 +230,8 @@ class _Search:
         )
         base, fitting = parent, None
         for cost in range(1, plays + 1):
-            known = forecast_of(self.rig, base.simulated, joint, tone.lines)
-            spectrum, share = known.flattened(spectrum, DESIGN.phase_rounds)
+            forecast = forecast_of(self.rig, base.simulated, joint, tone.lines)
+            spectrum, share = forecast.flattened(spectrum, DESIGN.phase_rounds)
             spectrum = spectrum * min(DESIGN.fill / share, DESIGN.largest_scaling)
             tones = {**parent.tones, joint: replace(tone, spectrum=spectrum)}
             try:
@@ -247,11 +251,11 @@ class _Search:
     def centrable(self, candidate: Candidate) -> bool:
         """Return whether the pistons' gains are about the same as at the start.
 
-        The bench trims its biases by that gain; excited only near its resonance a joint shows none,
-        and could not be kept within its stroke.
+        The bench trims its biases by that gain. A joint that is excited only near its resonance
+        shows none, and could not be kept within its stroke.
         """
         simulated = candidate.simulated
-        first = self.gains[simulated.step.name]
+        reference = self.gains[simulated.step.name]
         return all(
-            abs(math.log(k / first[j])) < DESIGN.gain_band for j, k in simulated.gains.items()
+            abs(math.log(k / reference[j])) < DESIGN.gain_band for j, k in simulated.gains.items()
         )

@@ -87,8 +87,8 @@ class Prediction:
     @property
     def worst(self) -> str:
         """The identifiable parameter with the largest relative standard error."""
-        known = {n: p.std for n, p in self.parameters.items() if math.isfinite(p.std)}
-        return max(known, key=lambda n: known[n]) if known else ""
+        finite_std = {n: p.std for n, p in self.parameters.items() if math.isfinite(p.std)}
+        return max(finite_std, key=lambda n: finite_std[n]) if finite_std else ""
 
 
 def predict(
@@ -135,19 +135,19 @@ def information(
     (built,) = build_rows(exact, [run], terms)
     rows = built.rows
     scores = score_covariance(exact, terms, signals, filters, rows, coefficients(rig, terms))
-    share = {}
+    noise_moments = {}
     if moments:
-        share = record_moments(
+        noise_moments = record_moments(
             exact, terms, built.conditioned, rows, np.random.default_rng(DESIGN.seed)
         )
     matrix, triangles, count = {}, {}, {}
     for family in FAMILIES:
-        mine = [r for name, r in rows.items() if family_of(name) == family]
-        X = np.concatenate([r.matrix for r in mine])
-        y = np.concatenate([r.rhs for r in mine])
+        family_rows = [r for name, r in rows.items() if family_of(name) == family]
+        X = np.concatenate([r.matrix for r in family_rows])
+        y = np.concatenate([r.rhs for r in family_rows])
         matrix[family], triangles[family], count[family] = X.T @ X, triangle(X, y), len(y)
     return StepInformation(
-        played.step.name, played.step.repeats, matrix, scores, share, triangles, count,
+        played.step.name, played.step.repeats, matrix, scores, noise_moments, triangles, count,
         _oil(rig, terms, rows), sum(r.masked for r in rows.values()),
     )  # fmt: skip
 
@@ -178,16 +178,16 @@ def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -
             for s in steps
             for r in range(max(s.repeats, 2))
         ]
-        share = None
+        noise_moments = None
         if all(s.moments for s in steps):
             parts = [max(s.repeats, 2) * s.moments[family] for s in steps]
-            share = np.sum(parts, axis=0)
-        solved = solve(names, clusters, share)
+            noise_moments = np.sum(parts, axis=0)
+        solved = solve(names, clusters, noise_moments)
         scale = np.array([nominal[name] for name in names])
-        kept = np.array([name not in solved.unidentifiable for name in names])
-        cov, dof = covariance(steps, family, kept)
+        mask = np.array([name not in solved.unidentifiable for name in names])
+        cov, dof = covariance(steps, family, mask)
         std = np.sqrt(np.diag(cov)) / np.abs(scale)
-        oil = _oil_scatter(rig, steps, kept) / np.abs(scale) if family == "fluid" else 0.0 * scale
+        oil = _oil_scatter(rig, steps, mask) / np.abs(scale) if family == "fluid" else 0.0 * scale
         half = half_width(std, dof)
         for i, name in enumerate(names):
             note = solved.unidentifiable.get(name, "")
@@ -195,7 +195,7 @@ def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -
             parameters[name] = ParameterPrediction(
                 value, units[name], float(std[i]), float(half[i]), float(oil[i]), note
             )
-        condition[family], rank[family] = solved.condition_number, (int(kept.sum()), len(names))
+        condition[family], rank[family] = solved.condition_number, (int(mask.sum()), len(names))
         covariances[family], order[family] = cov / np.outer(scale, scale), names
     rows = sum(sum(s.rows.values()) * s.repeats for s in steps)
     masked = sum(s.masked * s.repeats for s in steps)
@@ -205,38 +205,38 @@ def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -
 
 
 def covariance(
-    steps: Sequence[StepInformation], family: str, kept: NDArray[np.bool_] | None = None
+    steps: Sequence[StepInformation], family: str, mask: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
     """Return cov beta (k, k) of one family and Satterthwaite's degrees of freedom (k,).
 
-    Entries outside `kept` are NaN; columns without rows count as outside.
+    Entries outside `mask` are NaN; columns without rows count as outside.
     """
     A = np.sum([s.repeats * s.matrix[family] for s in steps], axis=0)
-    kept = np.diag(A) > 0 if kept is None else kept & (np.diag(A) > 0)
-    inverse = scaled_inverse(A[np.ix_(kept, kept)])
-    parts = [inverse @ s.scores[family][np.ix_(kept, kept)] @ inverse for s in steps]
+    mask = np.diag(A) > 0 if mask is None else mask & (np.diag(A) > 0)
+    inverse = scaled_inverse(A[np.ix_(mask, mask)])
+    parts = [inverse @ s.scores[family][np.ix_(mask, mask)] @ inverse for s in steps]
     total = np.full(A.shape, np.nan)
     inner = np.sum([s.repeats * part for s, part in zip(steps, parts, strict=True)], axis=0)
-    total[np.ix_(kept, kept)] = inner
+    total[np.ix_(mask, mask)] = inner
     dof = np.full(len(A), np.nan)
-    squares = np.zeros(int(kept.sum()))
+    squares = np.zeros(int(mask.sum()))
     for s, part in zip(steps, parts, strict=True):
         # identify divides the only repeat of a step into segments.
-        free = (s.repeats if s.repeats > 1 else IDENTIFY.record_segments) - 1
-        squares += (s.repeats * np.diag(part)) ** 2 / free
-    dof[kept] = np.diag(inner) ** 2 / squares
+        dof_step = (s.repeats if s.repeats > 1 else IDENTIFY.record_segments) - 1
+        squares += (s.repeats * np.diag(part)) ** 2 / dof_step
+    dof[mask] = np.diag(inner) ** 2 / squares
     return total, dof
 
 
-def _oil_scatter(rig: Rig, steps: Sequence[StepInformation], kept: NDArray[np.bool_]) -> Array:
+def _oil_scatter(rig: Rig, steps: Sequence[StepInformation], mask: NDArray[np.bool_]) -> Array:
     """Return the scatter (k,) of the coefficients if 1/b differs from step to step with the oil."""
     A = np.sum([s.repeats * s.matrix["fluid"] for s in steps], axis=0)
-    kept = kept & (np.diag(A) > 0)
-    inverse = scaled_inverse(A[np.ix_(kept, kept)])
+    mask = mask & (np.diag(A) > 0)
+    inverse = scaled_inverse(A[np.ix_(mask, mask)])
     spread = DESIGN.bulk_fall * rig.oil.temperature_band / math.sqrt(2.0)
-    shifts = np.array([inverse @ (s.repeats * s.oil[kept]) for s in steps])
+    shifts = np.array([inverse @ (s.repeats * s.oil[mask]) for s in steps])
     out = np.full(len(A), np.nan)
-    out[kept] = spread * np.sqrt(np.sum(shifts**2, axis=0))
+    out[mask] = spread * np.sqrt(np.sum(shifts**2, axis=0))
     return out
 
 

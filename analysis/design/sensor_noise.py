@@ -65,7 +65,7 @@ def inputs_of(rig: Rig) -> tuple[Input, ...]:
     return tuple(i for i in inputs if i.channel in rig.channels)
 
 
-def moved(rig: Rig, signals: Signals, derivative: Input, by: float) -> Signals:
+def shifted(rig: Rig, signals: Signals, derivative: Input, by: float) -> Signals:
     """Return the signals with one input shifted by `by` at every instant (n,)."""
     if derivative.joint is None:
         return replace(signals, **{derivative.field: getattr(signals, derivative.field) + by})
@@ -123,36 +123,36 @@ def score_covariance(
     if not isinstance(channels, FirSmoother):
         raise InputError(f"noise cannot be propagated through the filter {channels.name!r}")
     n = len(signals.t)
-    back = {name: _backwards(r, filtering, n, signals.rate) for name, r in rows.items()}
+    weights_of = {name: _sample_weights(r, filtering, n, signals.rate) for name, r in rows.items()}
     out = {family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()}
     by_channel: dict[str, list[Input]] = {}
     for derivative in inputs_of(rig):
         by_channel.setdefault(derivative.channel, []).append(derivative)
-    for channel, parts in by_channel.items():
+    for channel, derivatives in by_channel.items():
         variance = sensor_variance(rig.sensors.of(ch.kind_of(channel)[0]))
-        carried: dict[str, Array] = {}
-        for derivative in parts:
+        influence: dict[str, Array] = {}
+        for derivative in derivatives:
             taps = channels.taps[derivative.order]
-            by = DESIGN.noise_step * float(np.sqrt(variance) * np.linalg.norm(taps))
-            high = residuals(rig, terms, moved(rig, signals, derivative, by), beta)
-            low = residuals(rig, terms, moved(rig, signals, derivative, -by), beta)
-            for name, weights in back.items():
-                slope = (high[name] - low[name]) / (2.0 * by)
+            step = DESIGN.noise_step * float(np.sqrt(variance) * np.linalg.norm(taps))
+            high = residuals(rig, terms, shifted(rig, signals, derivative, step), beta)
+            low = residuals(rig, terms, shifted(rig, signals, derivative, -step), beta)
+            for name, weights in weights_of.items():
+                slope = (high[name] - low[name]) / (2.0 * step)
                 if slope.any():
                     family = family_of(name)
                     part = _transposed(slope[:, None] * weights, taps)
-                    carried[family] = carried[family] + part if family in carried else part
-        for family, B in carried.items():
+                    influence[family] = influence[family] + part if family in influence else part
+        for family, B in influence.items():
             out[family] += variance * (B.T @ B)
     return out
 
 
-def _backwards(rows: Rows, filtering: Filtering, n: int, rate: float) -> Array:
+def _sample_weights(rows: Rows, filtering: Filtering, n: int, rate: float) -> Array:
     """Return (D H_rows)' X (n, k): the weight of each instant's residual in the scores."""
     places = np.rint(rows.time * rate).astype(int)
-    spread = np.zeros((n, rows.matrix.shape[1]))
-    spread[places] = rows.matrix
-    return spread if filtering.rows is None else _transposed(spread, filtering.rows.taps[0])
+    upsampled = np.zeros((n, rows.matrix.shape[1]))
+    upsampled[places] = rows.matrix
+    return upsampled if filtering.rows is None else _transposed(upsampled, filtering.rows.taps[0])
 
 
 def _transposed(weights: Array, taps: Array) -> Array:

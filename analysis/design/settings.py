@@ -43,7 +43,7 @@ class DesignSettings:
     phase_rounds: int = 40  # of the search for phases, for each candidate
     gain_band: float = 0.2  # of the logarithm of a piston's gain, needed to centre it
 
-    # Relative fall of a mineral oil's bulk modulus per kelvin, about 0.4 to 0.6 % (Merritt,
+    # Relative fall of a mineral oil's bulk modulus [1/K], about 0.4 to 0.6 % (Merritt,
     # Hydraulic Control Systems, ch. 2); the swing of `oil.temperature_band` is taken as a sine's.
     bulk_fall: float = 0.005
     seed: int = 0  # of the noise whose share in the rows is judged

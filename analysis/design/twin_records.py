@@ -69,7 +69,7 @@ class TwinStep:
 
 @dataclass(frozen=True)
 class Played:
-    """The twin's simulation of a step: noise-free `record`, the step with found biases, motion.
+    """The twin's simulation of a step: noise-free `record`, the step with trimmed biases, motion.
 
     `motion` holds the twin's signals within the record, (samples, N) each, by the names of
     `twin.simulate_commands`, and `command` [V]; `gains` [m/(s V)] are the excited pistons' gains
@@ -100,12 +100,12 @@ def play(rig: Rig, step: TwinStep) -> Played:
     """
     for attempt in range(DESIGN.trims):
         commands, start, lead = _commands(rig, step)
-        moved = simulate_commands(rig, commands, start, _held_positions(rig, step))
-        exists = moved["valid"] > 0
-        good = len(exists) if exists.all() else int(np.argmin(exists))
-        step, steady, gains = _trimmed(rig, step, commands, moved["piston"], lead, good)
-        if good == len(exists) and (steady or attempt == DESIGN.trims - 1):
-            motion = {name: values[lead:] for name, values in moved.items()}
+        simulated = simulate_commands(rig, commands, start, _held_positions(rig, step))
+        valid = simulated["valid"] > 0
+        count = len(valid) if valid.all() else int(np.argmin(valid))
+        step, steady, gains = _trimmed(rig, step, commands, simulated["piston"], lead, count)
+        if count == len(valid) and (steady or attempt == DESIGN.trims - 1):
+            motion = {name: values[lead:] for name, values in simulated.items()}
             motion["command"] = commands[lead:]
             return Played(step, _record(rig, step, motion), motion, gains)
     raise InputError(
@@ -139,13 +139,13 @@ def _commands(rig: Rig, step: TwinStep) -> tuple[Array, Array, int]:
 
 
 def _trimmed(
-    rig: Rig, step: TwinStep, commands: Array, piston: Array, lead: int, good: int
+    rig: Rig, step: TwinStep, commands: Array, piston: Array, lead: int, count: int
 ) -> tuple[TwinStep, bool, dict[int, float]]:
-    """Return the step with better biases and starts, whether it was steady, and the gains."""
+    """Return the step with corrected biases and starts, whether it was steady, and the gains."""
     rate, gains = rig.sample_rate, {}
-    biases, starts, steady = dict(step.biases), dict(step.strokes), good == len(piston)
+    biases, starts, steady = dict(step.biases), dict(step.strokes), count == len(piston)
     for joint in step.waves:
-        span = slice(lead if good > lead + rate else 0, good)
+        span = slice(lead if count > lead + rate else 0, count)
         v, s = commands[span, joint], piston[span, joint]
         # An open-loop piston integrates its valve: s = c + d t + k int(v - mean v).
         basis = np.column_stack(
@@ -159,12 +159,12 @@ def _trimmed(
                 "the nominal parameters of the rig"
             )
         gains[joint] = float(gain)
-        off = float(s.mean()) - step.centres.get(joint, 0.0)
-        calm = abs(drift) * step.samples / rate < DESIGN.drift and abs(off) < 4 * DESIGN.drift
-        if not calm:
+        offset = float(s.mean()) - step.centres.get(joint, 0.0)
+        centred = abs(drift) * step.samples / rate < DESIGN.drift and abs(offset) < 4 * DESIGN.drift
+        if not centred:
             biases[joint] = float(v.mean() - drift / gain)
             centre = starts.get(joint, step.centres.get(joint, 0.0))
-            starts[joint] = float(np.clip(centre - off, *rig.joints[joint].limits.piston))
+            starts[joint] = float(np.clip(centre - offset, *rig.joints[joint].limits.piston))
             steady = False
     return replace(step, biases=biases, strokes=starts), steady, gains
 

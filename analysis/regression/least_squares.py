@@ -82,7 +82,7 @@ def shortest(X: Array, y: Array, rank: float) -> Array:
 def scaled_inverse(A: Array) -> Array:
     """Invert a matrix A (k, k) of normal or estimating equations, its diagonal scaled to 1.
 
-    Weak directions are filled, because an interval must include their large variance. Left out are
+    Weak directions are kept, because an interval must include their large variance. Left out are
     directions beyond double precision (`rank_tolerance_normal`) and columns with a zero diagonal.
     """
     scale = np.sqrt(np.abs(np.diag(A)))

@@ -22,7 +22,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def display_unit(si: str) -> DisplayUnit:
-    """Return the display unit of an SI unit as pint writes it; an unknown one is shown as it is."""
+    """Return the display unit of an SI unit as pint writes it; an unknown one unchanged."""
     shown = units.display_unit(si, units.RESULTS)
     return replace(shown, text=typeset(shown.text))
 
@@ -51,7 +51,7 @@ def significant(value: float | None, digits: int = 3, scale: float = 1.0) -> str
 
 
 def percent(value: float | None, digits: int = 2, *, signed: bool = False) -> str:
-    """Write a percentage without its sign of percent; with `signed` a plus is written out."""
+    """Write a percentage without the % sign; with `signed`, a plus is written out."""
     text = significant(value, digits)
     return f"+{text}" if signed and value is not None and value > 0 and text != DASH else text
 
@@ -79,10 +79,10 @@ def decimals(value: float, half_width: float) -> int:
     least, most = 2 - leading, REPORT.most_digits - 1 - leading
     if not math.isfinite(half_width) or half_width <= 0:
         return max(least, 0)
-    place = math.floor(math.log10(half_width))
+    exponent = math.floor(math.log10(half_width))
     # Two digits of an interval that begins with 1 or 2, where rounding to one would be coarse.
-    wanted = -place + (1 if half_width / 10.0**place < 3 else 0)
-    return max(min(max(wanted, least), most), 0)
+    needed = -exponent + (1 if half_width / 10.0**exponent < 3 else 0)
+    return max(min(max(needed, least), most), 0)
 
 
 def fixed(value: float | None, places: int, scale: float = 1.0) -> str:

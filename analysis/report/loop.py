@@ -29,7 +29,7 @@ def render(
     """Return the report as HTML text: `train[k]` are the records of round k."""
     last = rounds[-1]
     context = body(holdout, last.result, provenance)
-    more = {
+    loop_context = {
         "stopped": stopped,
         "count": fm.count(len(rounds), "round"),
         "worth": separations(rounds),
@@ -37,7 +37,7 @@ def render(
             _round(r, train[k] if k < len(train) else None, r is last) for k, r in enumerate(rounds)
         ],
     }
-    return page(TEMPLATE, {**context, **more})
+    return page(TEMPLATE, {**context, **loop_context})
 
 
 def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
@@ -92,8 +92,8 @@ def separations(rounds: Sequence[Round]) -> Markup | None:
         note(axes, 0.02, 0.98, "pale predicted, blue achieved", INK, ha="left")
         axes = canvas.add_subplot(1, 2, 2)
         numbers = [r.number for r in rounds]
-        before = [r.result.worst(r.result.before) for r in rounds]
-        axes.plot(numbers, before, "o-", color=GREY)
+        without_effects = [r.result.worst(r.result.before) for r in rounds]
+        axes.plot(numbers, without_effects, "o-", color=GREY)
         axes.plot(numbers, [r.residual for r in rounds], "o-", color=BLUE)
         axes.axhline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xticks(numbers)

@@ -35,7 +35,7 @@ class NightEstimate:
 
 @dataclass(frozen=True)
 class NightItem:
-    """One item as the page shows it; times are aware, None where an item did not reach that point.
+    """One item as the page shows it; times have a zone, None where an item did not get so far.
 
     Counts and the `seconds` of all samples, by the device's clock, are -1 where unknown: the host's
     clock may be set during a night. `unidentified` states why nothing was identified.
@@ -60,7 +60,7 @@ class NightItem:
 
 @dataclass(frozen=True)
 class Night:
-    """A whole run of a queue: items in the order they started, the queue's notes, its place."""
+    """A whole run of a queue: items in the order they started, notes, folder and host."""
 
     queue: str
     host: str
@@ -75,7 +75,7 @@ def render(night: Night) -> str:
     counts = Counter(item.state for item in night.items)
     ended = [item for item in night.items if item.ended is not None]
     context = {
-        "title": f"The night of {_first(night):%d %B %Y}",
+        "title": f"The night of {_begin(night):%d %B %Y}",
         "queue": night.queue,
         "host": night.host,
         "made": _clock(night.made, date=True),
@@ -96,7 +96,7 @@ def render(night: Night) -> str:
     return page(TEMPLATE, context)
 
 
-def _first(night: Night) -> datetime:
+def _begin(night: Night) -> datetime:
     return min((item.started for item in night.items if item.started), default=night.made)
 
 
@@ -110,9 +110,9 @@ def _lead(night: Night, counts: Mapping[str, int]) -> str:
     total = len(night.items)
     done = counts.get("done", 0)
     trips = counts.get("tripped", 0)
-    first = f"{done} of {fm.count(total, 'item')} completed"
+    completed = f"{done} of {fm.count(total, 'item')} completed"
     others = [f"{number} {state}" for state, number in counts.items() if state != "done"]
-    text = f"{first}; {', '.join(others)}." if others else f"{first}."
+    text = f"{completed}; {', '.join(others)}." if others else f"{completed}."
     if trips:
         text += " The bench stays tripped until a person has examined it and cleared the trip."
     return text + (f" The queue is {night.paused}." if night.paused else "")
@@ -122,11 +122,11 @@ def _tiles(night: Night, counts: Mapping[str, int]) -> list[dict[str, Any]]:
     runs = [item for item in night.items if item.samples >= 0]
     lost = sum(item.lost_samples for item in runs)
     seconds = sum(max(0.0, item.seconds) for item in night.items)
-    bad = sum(n for state, n in counts.items() if state not in ("done", "queued", "cancelled"))
+    failed = sum(n for state, n in counts.items() if state not in ("done", "queued", "cancelled"))
     return [
         {"number": str(counts.get("done", 0)), "label": "items done", "warn": False,
          "detail": f"of {len(night.items)}"},
-        {"number": str(bad), "label": "ended otherwise", "warn": bad > 0,
+        {"number": str(failed), "label": "ended otherwise", "warn": failed > 0,
          "detail": "the table says why"},
         {"number": str(counts.get("queued", 0)), "label": "items still queued", "warn": False,
          "detail": ""},
@@ -198,21 +198,21 @@ def _drift(rig: str, items: Sequence[NightItem]) -> dict[str, Any]:
 
 
 def change(values: Sequence[NightEstimate]) -> tuple[float, float]:
-    """Return the last minus the first estimate, and that over its 95 % error (0: unknown).
+    """Return the last minus the first estimate, and its ratio to its 95 % error (0: unknown).
 
     The errors of two runs are independent: their squares add.
     """
     first, last = values[0], values[-1]
-    moved = last.value - first.value
+    difference = last.value - first.value
     error = math.hypot(first.half, last.half)
-    return moved, moved / error if error > 0.0 and math.isfinite(error) else 0.0
+    return difference, difference / error if error > 0.0 and math.isfinite(error) else 0.0
 
 
 def _drift_row(name: str, items: Sequence[NightItem]) -> dict[str, Any]:
     values = [item.parameters[name] for item in items if name in item.parameters]
     unit = fm.display_unit(values[0].unit)
-    moved, share = change(values)
-    percent = 100.0 * moved / abs(values[0].value) if values[0].value else math.nan
+    difference, share = change(values)
+    percent = 100.0 * difference / abs(values[0].value) if values[0].value else math.nan
     several = len(values) > 1
     return {
         "name": name,

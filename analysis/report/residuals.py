@@ -57,7 +57,7 @@ class Residual:
 def coefficients(
     identification: Identification, per_record: Sequence[RecordRows]
 ) -> dict[str, Array]:
-    """Return the rows' coefficients (k,) per family, with values for unidentified parameters.
+    """Return the rows' coefficients (k,) by family, finite for unidentified parameters as well.
 
     Where only a combination is determined, the shortest coefficients that fit the rows are used:
     the residual does not depend on the choice.
@@ -101,25 +101,26 @@ def _residual(run: int, step: str, name: str, rows: Sequence[Rows], beta: Array)
         common = np.intersect1d(common, r.time)
     if len(common) < 2:
         return None
-    picked = [np.isin(r.time, common) for r in rows]
-    side = np.array([r.rhs[p] for r, p in zip(rows, picked, strict=True)])
-    each = np.array([(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, picked, strict=True)])
+    masks = [np.isin(r.time, common) for r in rows]
+    side = np.array([r.rhs[p] for r, p in zip(rows, masks, strict=True)])
+    by_repeat = np.array([(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, masks, strict=True)])
     n = len(rows)
-    band = each.std(axis=0, ddof=1) if n > 1 else np.full(len(common), np.nan)
+    band = by_repeat.std(axis=0, ddof=1) if n > 1 else np.full(len(common), np.nan)
     scatter = float(np.sqrt(np.mean(band**2)))
-    mean = each.mean(axis=0)
+    mean = by_repeat.mean(axis=0)
     systematic = float(np.mean(mean**2)) - (scatter**2 / n if n > 1 else 0.0)
-    frequency, whole = _density(common, mean)
+    frequency, spectrum = _density(common, mean)
     noise = (
-        np.sqrt(np.mean([_density(common, r - mean)[1] ** 2 for r in each], axis=0) * n / (n - 1))
+        np.sqrt(np.mean([_density(common, r - mean)[1] ** 2 for r in by_repeat], axis=0)
+                * n / (n - 1))
         if n > 1 else np.full(len(frequency), np.nan)
     )  # fmt: skip
     kind, joint = name.rsplit("_", 1)
     return Residual(
         run, step, name, int(joint), "N*m" if kind == "torque" else "m^3/s", n,
         sum(len(r.rhs) for r in rows), sum(r.masked for r in rows), common, side.mean(axis=0),
-        mean, band, _rms(side), _rms(each), float(np.sqrt(max(systematic, 0.0))), scatter,
-        frequency, whole, noise,
+        mean, band, _rms(side), _rms(by_repeat), float(np.sqrt(max(systematic, 0.0))), scatter,
+        frequency, spectrum, noise,
     )  # fmt: skip
 
 
@@ -134,9 +135,9 @@ def _density(t: Array, x: Array) -> tuple[Array, Array]:
     share of rows present, which is right on average for a stationary residual.
     """
     step = float(np.median(np.diff(t)))
-    place = np.rint((t - t[0]) / step).astype(int)
-    filled = np.zeros(int(place[-1]) + 1)
-    filled[place] = x
+    index = np.rint((t - t[0]) / step).astype(int)
+    filled = np.zeros(int(index[-1]) + 1)
+    filled[index] = x
     share = len(x) / len(filled)
     length = min(len(filled), max(8, round(REPORT.spectrum_seconds / step)))
     frequency, power = welch(filled, 1.0 / step, nperseg=length, detrend=False)
@@ -145,7 +146,7 @@ def _density(t: Array, x: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Scatter:
-    """A parameter identified from each repeat alone: lowest, mean, highest, RSD [%], how many."""
+    """A parameter identified from each repeat: lowest, mean, highest, RSD [%], number."""
 
     low: float
     mean: float
@@ -157,17 +158,17 @@ class Scatter:
 def per_repeat(
     identification: Identification, per_record: Sequence[RecordRows]
 ) -> dict[str, Scatter]:
-    """Identify from every repeat alone, as the paper's Table III does; {} below two repeats."""
-    rounds: dict[int, list[RecordRows]] = {}
+    """Identify from each repeat separately (paper, Table III); {} with fewer than two repeats."""
+    by_repeat: dict[int, list[RecordRows]] = {}
     for record in per_record:
-        rounds.setdefault(record.record.repeat, []).append(record)
+        by_repeat.setdefault(record.record.repeat, []).append(record)
     steps = {record.group for record in per_record}
-    whole = [m for m in rounds.values() if {record.group for record in m} == steps]
-    if len(whole) < 2:
+    complete = [m for m in by_repeat.values() if {record.group for record in m} == steps]
+    if len(complete) < 2:
         return {}
     model = identification.model
     by_equation: dict[str, list[float]] = {}
-    for members in whole:
+    for members in complete:
         for family, solution in identification.solutions.items():
             alone = _solve_repeat(members, family, solution.names)
             for name, value in inverted(model.rig, model.terms, alone).items():

@@ -64,7 +64,7 @@ def _free_run(result: Trace, channel: str) -> tuple[str, ...]:
 
 
 def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
-    """Return per effect, else per clue, the residual against its variable and in time."""
+    """Return, per effect and per clue, the residual against its variable and in time."""
     lines = trace_plots.held_out(rig, holdout, result)
     out: list[dict[str, Any]] = []
 
@@ -73,11 +73,11 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         drawn = _pair(rig, lines[equation], result, effect, variable, equation, key, timed)
         out.append({"heading": heading, "equation": equation, **drawn})
 
-    known = {(u.term.name, u.term.where) for u in result.model_before.terms}
+    baseline = {(u.term.name, u.term.where) for u in result.model_before.terms}
     effects = [
         u.term
         for u in result.model_after.terms
-        if isinstance(u.term, Effect) and (u.term.name, u.term.where) not in known
+        if isinstance(u.term, Effect) and (u.term.name, u.term.where) not in baseline
     ]
     for k, effect in enumerate(effects):
         equation = trace_plots.equation_of(effect, rig, result, lines)
@@ -96,19 +96,19 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
 
 
 def _pair(
-    rig: Rig, here: Sequence[trace_plots.ResidualSeries], result: Trace, effect: Effect | None,
+    rig: Rig, lines: Sequence[trace_plots.ResidualSeries], result: Trace, effect: Effect | None,
     variable: str, equation: str, key: str, timed: bool,
 ) -> dict[str, Any]:  # fmt: skip
     unit = unit_of_equation(rig, equation)
     noise, changed = result.noise_floor[equation], result.changed
     label, scale = trace_plots.axis(rig, variable)
-    x = scale * trace_plots.abscissae(rig, here, effect, variable, equation, result.model_after)
-    longest = max(here, key=lambda line: float((line.before**2).mean()))
+    x = scale * trace_plots.abscissae(rig, lines, effect, variable, equation, result.model_after)
+    largest = max(lines, key=lambda line: float((line.before**2).mean()))
     return {
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
-        "against": trace_plots.against(x, here, noise, unit, label, f"{key}x", changed),
-        "time": trace_plots.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
-        "record": longest.conditioned.record.name,
+        "against": trace_plots.against(x, lines, noise, unit, label, f"{key}x", changed),
+        "time": trace_plots.in_time(largest, noise, unit, f"{key}t", changed) if timed else None,
+        "record": largest.conditioned.record.name,
     }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.design.predict import Prediction, predict, to_json
-from analysis.design.sensor_noise import moved
+from analysis.design.sensor_noise import shifted
 from analysis.design.twin_records import Played, ideal, play
 from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.identify.stacked_rows import build_rows
@@ -111,9 +111,9 @@ def test_a_shifted_piston_moves_everything_that_follows_from_it(
     from analysis.design.sensor_noise import Input
 
     by = 1e-4
-    shifted = {**record.channels, "piston_1": record.channels["piston_1"] + by}
-    other = condition(ideal(rig), replace(record, channels=shifted), filters.channels, bands)
-    changed = moved(rig, signals, Input("piston_1", 0, "s", 0), by)
+    channels = {**record.channels, "piston_1": record.channels["piston_1"] + by}
+    other = condition(ideal(rig), replace(record, channels=channels), filters.channels, bands)
+    changed = shifted(rig, signals, Input("piston_1", 0, "s", 0), by)
     inner = slice(200, -200)
     for name in ("s", "sd", "q", "qd", "qdd", "G", "theta", "V_cap", "V_rod", "p_cap"):
         ours, theirs = getattr(changed, name)[inner], getattr(other, name)[inner]

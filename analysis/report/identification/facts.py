@@ -35,7 +35,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class CheckLine:
-    """All statements of one check: ok if every one is; the gravest first, the others in `more`."""
+    """All statements of one check, ok if all are: one not ok first, the others in `more`."""
 
     name: str
     ok: bool
@@ -51,17 +51,17 @@ def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
     out = []
     for name, members in by_name.items():
         ordered = sorted(members, key=lambda c: c.ok)
-        bad = sum(not c.ok for c in members)
+        failed = sum(not c.ok for c in members)
         detail = ordered[0].detail
         if len(members) > 1:
-            detail += f" ({bad} of {len(members)} such statements are not ok)" if bad else ""
+            detail += f" ({failed} of {len(members)} such statements are not ok)" if failed else ""
         more = tuple(f"{'ok' if c.ok else 'not ok'}: {c.detail}" for c in ordered[1:])
-        out.append(CheckLine(name, not bad, detail, more))
+        out.append(CheckLine(name, not failed, detail, more))
     return sorted(out, key=lambda line: line.ok)
 
 
 def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
-    """State where a simulated bench's true parameters are not those of rigid bodies, '' otherwise.
+    """State which true parameters of a simulated bench contradict rigid bodies ('' if none).
 
     Rigid bodies have R_ij = l_i W_j.
     """
@@ -100,11 +100,11 @@ def minutes(seconds: float) -> str:
 
 def shared_records(runs: Sequence[Run], others: Sequence[Run]) -> int:
     """Count records of `others` whose samples were also used in `runs`."""
-    used = {_print(record) for record in records_of(runs)}
-    return sum(_print(record) in used for record in records_of(others))
+    used = {_fingerprint(record) for record in records_of(runs)}
+    return sum(_fingerprint(record) in used for record in records_of(others))
 
 
-def _print(record: Record) -> tuple[tuple[str, bytes], ...]:
+def _fingerprint(record: Record) -> tuple[tuple[str, bytes], ...]:
     return tuple(
         (name, np.ascontiguousarray(samples).tobytes())
         for name, samples in sorted(record.channels.items())
@@ -138,13 +138,13 @@ def sentences(
         return [first, "The model has not been validated: no validation records were given."]
     worst = worst_fit(validation)
     shared = shared_records(runs, validation_runs)
-    fresh = (
+    usage = (
         "never used for the fit" if not shared
         else f"of which {shared} had also been used for the fit"
     )  # fmt: skip
     second = (
         f"Driven by the measured spool alone, the model was then compared with "
-        f"{fm.count(len(validation), 'record')} {fresh}"
+        f"{fm.count(len(validation), 'record')} {usage}"
     )
     if worst is None:
         return [first, f"{second}; no channel gave a FIT."]
@@ -193,10 +193,10 @@ def tiles(
         out.append(Tile(f"{table4.above} of {table4.compared}", "FIT cells above the paper",
                         "Table IV", table4.above < table4.compared))  # fmt: skip
     lines = check_lines(identification.checks)
-    bad = sum(not line.ok for line in lines)
-    good = len(lines) - bad
-    which = "the others are named below" if bad else "all of them"
-    out.append(Tile(f"{good} of {good + bad}", "checks ok", which, bool(bad)))
+    not_ok = sum(not line.ok for line in lines)
+    ok = len(lines) - not_ok
+    others = "the others are named below" if not_ok else "all of them"
+    out.append(Tile(f"{ok} of {ok + not_ok}", "checks ok", others, bool(not_ok)))
     return out
 
 
@@ -228,7 +228,7 @@ def _parameter_row(
     shown = estimate.identified
     error = 100 * (estimate.value / true - 1) if true and shown else None
     has_interval = shown and math.isfinite(low)
-    held = ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH
+    covered = ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH
     return {
         "name": name,
         "meaning": fm.meaning(name, len(rig.joints)),
@@ -242,7 +242,7 @@ def _parameter_row(
         "nominal": fm.significant(rig.nominal.get(name), digits, unit.scale),
         "truth": fm.significant(true, digits, unit.scale),
         "error": fm.column_percent(error, signed=True),
-        "covered": held,
+        "covered": covered,
         "paper": fm.significant(mean, digits, unit.scale),
         "note": estimate.note if shown else f"not identifiable: {estimate.note or 'no value'}",
     }

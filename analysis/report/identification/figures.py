@@ -75,20 +75,20 @@ def arm(rig: Rig) -> ReportFigure | None:
 
 def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
     """Return one figure per step and excited joint, of the step's first repeat."""
-    drawn = record_plots.electric_excitation if rig.electric else record_plots.excitation
-    wanted = [
+    draw = record_plots.electric_excitation if rig.electric else record_plots.excitation
+    selected = [
         (step, joint) for step in steps(rig, runs) for joint in step.excited
         if ch.channel(rig.drive_kind, joint) in step.records[0].channels
     ]  # fmt: skip
     figures = [
         ReportFigure(
-            drawn(rig, step.records[0], joint, f"exc{n}"),
+            draw(rig, step.records[0], joint, f"exc{n}"),
             f"{step.name}, joint {joint}",
             f"record {step.records[0].name}",
         )
-        for n, (step, joint) in enumerate(wanted[: REPORT.most_figures])
+        for n, (step, joint) in enumerate(selected[: REPORT.most_figures])
     ]
-    return Gallery(tuple(figures), len(wanted) - len(figures))
+    return Gallery(tuple(figures), len(selected) - len(figures))
 
 
 EQUATIONS = {
@@ -117,26 +117,26 @@ def equation_text(residual: Residual) -> str:
 
 def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence[Run]) -> Gallery:
     """Return measured against simulated for each kind of record and joint, first repeats only."""
-    first: dict[str, tuple[RecordValidation, Record | None]] = {}
+    first_repeats: dict[str, tuple[RecordValidation, Record | None]] = {}
     for result, record in paired(validation, runs):
-        first.setdefault(result.step, (result, record))
-    wanted = [
+        first_repeats.setdefault(result.step, (result, record))
+    selected = [
         (result, record, joint)
-        for result, record in first.values() for joint in joints_of(result)
+        for result, record in first_repeats.values() for joint in joints_of(result)
     ]  # fmt: skip
     figures = []
-    for n, (result, record, joint) in enumerate(wanted[: REPORT.most_figures]):
-        part = record_plots.shown_part(result)
-        seconds = (part.stop - part.start) / result.simulation.rate
-        whole = len(result.time) / result.simulation.rate
-        text = f"last {seconds:.3g} s of {whole:.3g} s, free run from the first sample"
-        if part.start == 0:
-            text = f"all {whole:.3g} s, free run from the first sample"
+    for n, (result, record, joint) in enumerate(selected[: REPORT.most_figures]):
+        window = record_plots.shown_part(result)
+        seconds = (window.stop - window.start) / result.simulation.rate
+        total = len(result.time) / result.simulation.rate
+        text = f"last {seconds:.3g} s of {total:.3g} s, free run from the first sample"
+        if window.start == 0:
+            text = f"all {total:.3g} s, free run from the first sample"
         if result.failure:
             text += f"; {result.failure}"
         svg = record_plots.comparison(rig, result, record, joint, f"val{n}")
         figures.append(ReportFigure(svg, f"{result.record}, joint {joint}", text))
-    return Gallery(tuple(figures), len(wanted) - len(figures))
+    return Gallery(tuple(figures), len(selected) - len(figures))
 
 
 def paired(

@@ -60,18 +60,18 @@ def joint_constants(rig: Rig) -> list[tuple[str, list[str]]]:
     """Return (quantity and unit, one value per joint)."""
 
     if isinstance(rig, ElectricRig):
-        each = rig.joints
+        joints = rig.joints
         return [
-            ("name", [j.name for j in each]),
-            ("kind", [j.kind for j in each]),
-            ("drive gain", [f"{_n(j.drive.gain)} {j.force_unit}/{j.drive.unit}" for j in each]),
+            ("name", [j.name for j in joints]),
+            ("kind", [j.kind for j in joints]),
+            ("drive gain", [f"{_n(j.drive.gain)} {j.force_unit}/{j.drive.unit}" for j in joints]),
             ("limits: position", [
                 f"{_n(j.limits.position[0])} to {_n(j.limits.position[1])} {j.position_unit}"
-                for j in each
+                for j in joints
             ]),
             ("limits: speed, drive", [
                 f"{_n(j.limits.speed)} {j.position_unit}/s, {_n(j.limits.drive)} {j.drive.unit}"
-                for j in each
+                for j in joints
             ]),
         ]  # fmt: skip
 
@@ -136,15 +136,15 @@ def step_rows(rig: Rig, runs: Sequence[Run]) -> list[dict[str, str]]:
 
 
 def _step_row(runs: Sequence[Run], step: StepSummary) -> dict[str, str]:
-    first = step.records[0]
+    record = step.records[0]
     attributes = [record.attributes for record in step.records]
     travels = (_largest(attributes, f"lock_give_m_{i}") for i in step.locked)
     yielding = [travel for travel in travels if travel is not None]
     jitter = _largest(attributes, "jitter_max_s")
     period = "not periodic"
-    if first.period:
-        lines = [k * first.sample_rate / first.period for k in first.lines]
-        period = f"{_n(first.period / first.sample_rate)} s"
+    if record.period:
+        lines = [k * record.sample_rate / record.period for k in record.lines]
+        period = f"{_n(record.period / record.sample_rate)} s"
         if lines:
             period += f", {fm.count(len(lines), 'line')} at {_n(min(lines))}"
             period += f" to {_n(max(lines))} Hz" if len(lines) > 1 else " Hz"
@@ -152,7 +152,7 @@ def _step_row(runs: Sequence[Run], step: StepSummary) -> dict[str, str]:
     return {
         "run": fm.folder_name(runs[step.run].source) or f"run {step.run + 1}",
         "name": step.name,
-        "locked": "; ".join(_lock(i, first) for i in step.locked) or "none",
+        "locked": "; ".join(_lock(i, record) for i in step.locked) or "none",
         "excited": " and ".join(map(str, step.excited)) or "none",
         "repeats": str(len(step.records)),
         "seconds": _n(round(seconds, 3)),

@@ -31,13 +31,13 @@ class Worst:
 
 def worst_fit(validation: Sequence[RecordValidation]) -> Worst | None:
     """Return the lowest finite FIT of all records and channels, None where there is none."""
-    every = [
+    fits = [
         Worst(value, name, result.record)
         for result in validation
         for name, value in result.fit.items()
         if math.isfinite(value)
     ]
-    return min(every, key=lambda w: w.fit, default=None)
+    return min(fits, key=lambda w: w.fit, default=None)
 
 
 def joints_of(result: RecordValidation) -> list[int]:
@@ -101,12 +101,12 @@ def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
         for i, kind in enumerate(KINDS):
             name = ch.channel(kind, column.joint)
             fits = [r.fit[name] for r in results if name in r.fit]
-            own = float(np.mean(fits)) if fits else float("nan")
+            fit = float(np.mean(fits)) if fits else float("nan")
             printed = column.fit[i] if column.fit else None
-            mark = "" if printed is None or math.isnan(own) else mark_of(own, printed)
+            mark = "" if printed is None or math.isnan(fit) else mark_of(fit, printed)
             compared += bool(printed is not None)
             above += mark == ABOVE
-            cells.append({"own": fm.fit(own), "paper": fm.fit(printed), "mark": mark})
+            cells.append({"own": fm.fit(fit), "paper": fm.fit(printed), "mark": mark})
         rows.append(
             {
                 "record": column.step,
@@ -119,9 +119,9 @@ def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
     return FitTable(tuple(rows), compared, above)
 
 
-def mark_of(own: float, printed: float) -> str:
+def mark_of(value: float, printed: float) -> str:
     """Return a mark for a number above, below or equal to the other."""
-    return EQUAL if own == printed else ABOVE if own > printed else BELOW
+    return EQUAL if value == printed else ABOVE if value > printed else BELOW
 
 
 def table_iii(
@@ -136,17 +136,17 @@ def table_iii(
         if printed is None:
             continue
         unit = fm.display_unit(estimate.unit)
-        own = scatter.get(name)
-        spread = (own.low, own.mean, own.high) if own else (None, None, None)
+        repeats = scatter.get(name)
+        spread = (repeats.low, repeats.mean, repeats.high) if repeats else (None, None, None)
         deviation = 100 * (estimate.value / printed.mean - 1)
-        mark = mark_of(own.rsd, printed.rsd) if own and math.isfinite(own.rsd) else ""
+        mark = mark_of(repeats.rsd, printed.rsd) if repeats and math.isfinite(repeats.rsd) else ""
         out.append(
             {
                 "name": name,
                 "unit": unit.text,
                 "coupled": fm.significant(estimate.value, 4, unit.scale),
                 "repeats": [fm.significant(v, 4, unit.scale) for v in spread],  # min, mean, max
-                "rsd": fm.column_percent(own.rsd if own else None),
+                "rsd": fm.column_percent(repeats.rsd if repeats else None),
                 "rsd_mark": mark,
                 "paper": _printed(printed, unit.scale, 0 if name == "b" else 2),
                 "against": fm.column_percent(deviation, signed=True),  # coupled over their mean [%]

@@ -129,8 +129,8 @@ def _ground(axes: Any, size: float) -> None:
     x = np.linspace(-half, half, 7)
     y = 0.05 * size
     axes.plot([-half, half], [y, y], color=INK, linewidth=1.2)
-    for each in x[:-1]:
-        axes.plot([each, each + 0.05 * size], [y, y + 0.05 * size], color=INK, linewidth=0.6)
+    for start in x[:-1]:
+        axes.plot([start, start + 0.05 * size], [y, y + 0.05 * size], color=INK, linewidth=0.6)
     axes.add_patch(
         Polygon([(-0.04 * size, y), (0.04 * size, y), (0, 0)], closed=True, facecolor=PALE,
                 edgecolor=INK, linewidth=0.8)
@@ -161,8 +161,8 @@ def _links(axes: Any, rig: Rig, at: Pose) -> None:
             axes, f"link {k + 1}, {joint.link_length * 1e3:.0f} mm\n{low:.0f}° to {high:.0f}°",
             0.3 * start + 0.7 * end, _direction(at.theta[k] + np.pi / 2), colour,
         )  # fmt: skip
-        away = at.outer[k] - at.inner[k]
-        across = np.array([-away[1], away[0]]) / np.linalg.norm(away)
+        along = at.outer[k] - at.inner[k]
+        across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
         centre = 0.5 * (at.inner[k] + body)
         side = np.sign(across @ (centre - start)) or 1.0
         _name(axes, f"cylinder {k + 1}", centre, side * across, INK)
@@ -196,9 +196,9 @@ def _limits(axes: Any, points: Array) -> None:
 def _scale_bar(axes: Any) -> None:
     x0, x1 = axes.get_xlim()
     y0, y1 = axes.get_ylim()
-    wanted = 0.2 * (x1 - x0)
-    length = 10.0 ** np.floor(np.log10(wanted))
-    length = max(m * length for m in (1, 2, 5) if m * length <= wanted)
+    target = 0.2 * (x1 - x0)
+    length = 10.0 ** np.floor(np.log10(target))
+    length = max(m * length for m in (1, 2, 5) if m * length <= target)
     x, y = x0 + 0.03 * (x1 - x0), y0 + 0.03 * (y1 - y0)
     axes.plot([x, x + length], [y, y], color=INK, linewidth=1.2, solid_capstyle="butt")
     note(axes, 0.03, 0.045, f"{length * 1e3:g} mm", ha="left", va="bottom")

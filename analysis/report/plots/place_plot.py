@@ -56,10 +56,10 @@ def elements(rig: Rig) -> dict[str, Box]:
         for i in range(len(rig.joints))
         for name, (left, bottom, right, top) in table.items()
     }
-    last = out[f"joint {len(rig.joints)}"]
-    out["load"] = (last[2] + 0.6, last[1] - 0.1, last[2] + 1.6, last[3] + 0.1)
-    first = out["drive 1" if rig.electric else "cap 1"]
-    out["base"] = (first[0] - 1.0, first[1], first[0] - 0.5, first[3])
+    tip = out[f"joint {len(rig.joints)}"]
+    out["load"] = (tip[2] + 0.6, tip[1] - 0.1, tip[2] + 1.6, tip[3] + 0.1)
+    root = out["drive 1" if rig.electric else "cap 1"]
+    out["base"] = (root[0] - 1.0, root[1], root[0] - 0.5, root[3])
     if not rig.electric:
         out |= {"supply": SUPPLY, "tank": TANK, "supply sensor": SUPPLY_SENSOR}
     return out
@@ -68,7 +68,7 @@ def elements(rig: Rig) -> dict[str, Box]:
 def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) -> tuple[str, ...]:
     """Return the elements at which an effect acts.
 
-    `parameters`, by name, tell which sensor a sensor effect acts on.
+    The names in `parameters` state which sensor a sensor effect acts on.
     """
     kind = known().get(name)
     element = kind.element if kind is not None and issubclass(kind, Effect) else "joint"
@@ -88,12 +88,12 @@ def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) ->
 def _sensors(
     rig: Rig, kind: type[Any], where: str, joints: Sequence[str], words: str
 ) -> tuple[str, ...]:
-    """Return the sensors of a place that a sensor effect can act on, or those of `words`."""
+    """Return the sensors at a place that an effect can act on; those that `words` name, if any."""
     sensors = ELECTRIC_SENSORS if rig.electric else SENSORS
     known_sides = ("supply", *(sensor.split()[0] for sensor in sensors), "pressure")
     stated = [side for side in known_sides if side in words]
-    there = [place.split() for place in kind.places(rig) if kind(place).place == where]
-    sides = stated[:1] or ["supply" if place == ["bench"] else place[-1] for place in there]
+    candidates = [place.split() for place in kind.places(rig) if kind(place).place == where]
+    sides = stated[:1] or ["supply" if place == ["bench"] else place[-1] for place in candidates]
     if "supply" in sides:
         return ("supply sensor",)
     if "pressure" in sides:
@@ -131,12 +131,13 @@ def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
         axes.axis("off")
         for i in range(len(rig.joints)):
             (_electric if rig.electric else _hydraulic)(axes, WIDTH * i, i + 1)
-        _rest(axes, rig, boxes)
-        taken: dict[str, int] = {}
+        _bench(axes, rig, boxes)
+        marks: dict[str, int] = {}
         for k, (name, where, parameters, colour) in enumerate(lines):
             for element in marked(rig, name, where, parameters):
-                _mark(axes, boxes[element], k + 1, colour, taken.setdefault(element, 0), element)
-                taken[element] += 1
+                earlier = marks.get(element, 0)
+                _mark(axes, boxes[element], k + 1, colour, earlier, element)
+                marks[element] = earlier + 1
             words = f"{k + 1}  {name.replace('_', ' ')} at {place_in_words(where)}"
             if colour == ORANGE:
                 words += ", which these records cannot separate from it"
@@ -177,7 +178,7 @@ def _pin(axes: Any, box: Box, number: int, label: float = 0.3) -> None:
 
 
 def _hydraulic(axes: Any, x: float, number: int) -> None:
-    at = {n: (b[0] + x, b[1], b[2] + x, b[3]) for n, b in HYDRAULIC.items()}
+    boxes = {n: (b[0] + x, b[1], b[2] + x, b[3]) for n, b in HYDRAULIC.items()}
     _line(axes, (x + 1.7, 6.0), (x + 1.7, 5.1), (x + 3.2, 5.1), (x + 3.2, 4.2))
     _line(axes, (x + 6.5, 6.0), (x + 6.5, 5.1), (x + 5.0, 5.1), (x + 5.0, 4.2))
     _line(axes, (x + 1.1, 5.1), (x + 1.7, 5.1))
@@ -188,29 +189,29 @@ def _hydraulic(axes: Any, x: float, number: int) -> None:
     _line(axes, (x + 5.0, 3.0), (x + 5.0, 0.9))
     for end, y in ((x + 3.2, 2.1), (x + 5.0, 0.9)):
         axes.plot(end, y, "o", color=GREY, ms=3)
-    _block(axes, at["cap"], "cap", "#eef1f4")
-    _block(axes, at["rod"], "rod", "#eef1f4")
-    _block(axes, at["piston"], "", PALE)
+    _block(axes, boxes["cap"], "cap", "#eef1f4")
+    _block(axes, boxes["rod"], "rod", "#eef1f4")
+    _block(axes, boxes["piston"], "", PALE)
     axes.add_patch(Rectangle((x + 7.0, 6.55), 1.2, 0.3, fc="white", ec=INK, lw=1.0, zorder=2))
     axes.plot([x + 4.1, x + 7.0], [6.7, 6.7], color=PALE, lw=5, zorder=2.5, solid_capstyle="butt")
-    _block(axes, at["valve"], f"valve {number}")
-    _pin(axes, at["joint"], number)
+    _block(axes, boxes["valve"], f"valve {number}")
+    _pin(axes, boxes["joint"], number)
     for name in SENSORS:
-        _sensor(axes, at[name], LETTERS[name])
+        _sensor(axes, boxes[name], LETTERS[name])
 
 
 def _electric(axes: Any, x: float, number: int) -> None:
-    at = {n: (b[0] + x, b[1], b[2] + x, b[3]) for n, b in ELECTRIC.items()}
+    boxes = {n: (b[0] + x, b[1], b[2] + x, b[3]) for n, b in ELECTRIC.items()}
     _line(axes, (x + 4.2, 3.4), (x + 6.4, 3.4))
     _line(axes, (x + 2.9, 4.2), (x + 2.9, 4.9))
     _line(axes, (x + 6.9, 3.9), (x + 6.9, 4.6))
-    _block(axes, at["drive"], f"drive {number}")
-    _pin(axes, at["joint"], number, label=-1.6)  # the sensor is above
+    _block(axes, boxes["drive"], f"drive {number}")
+    _pin(axes, boxes["joint"], number, label=-1.6)  # the sensor is above
     for name in ELECTRIC_SENSORS:
-        _sensor(axes, at[name], LETTERS[name])
+        _sensor(axes, boxes[name], LETTERS[name])
 
 
-def _rest(axes: Any, rig: Rig, boxes: dict[str, Box]) -> None:
+def _bench(axes: Any, rig: Rig, boxes: dict[str, Box]) -> None:
     """Draw base, load, supply and tank."""
     base, load = boxes["base"], boxes["load"]
     for k in range(5):
@@ -237,9 +238,9 @@ def _rest(axes: Any, rig: Rig, boxes: dict[str, Box]) -> None:
     _sensor(axes, SUPPLY_SENSOR, LETTERS["supply sensor"])
 
 
-def _mark(axes: Any, box: Box, number: int, colour: str, before: int, element: str) -> None:
-    """Outline an element and put the number at its corner, next to earlier numbers."""
-    pad = 0.18 + 0.12 * before
+def _mark(axes: Any, box: Box, number: int, colour: str, earlier: int, element: str) -> None:
+    """Outline an element and put the number at its corner, next to `earlier` numbers."""
+    pad = 0.18 + 0.12 * earlier
     axes.add_patch(
         FancyBboxPatch(
             box[:2], box[2] - box[0], box[3] - box[1], boxstyle=f"round,pad={pad}", zorder=5,
@@ -252,6 +253,6 @@ def _mark(axes: Any, box: Box, number: int, colour: str, before: int, element: s
             fc="none", ec=colour, lw=2.0, gid=f"mark-{number}-{element.replace(' ', '-')}",
         )
     )  # fmt: skip
-    at = (box[2] + 0.2 - 0.75 * before, box[3] + 0.25)
-    axes.add_patch(Circle(at, 0.34, fc=colour, ec="white", lw=0.8, zorder=6))
-    axes.text(*at, str(number), color="white", ha="center", va="center", fontsize=8, zorder=7)
+    centre = (box[2] + 0.2 - 0.75 * earlier, box[3] + 0.25)
+    axes.add_patch(Circle(centre, 0.34, fc=colour, ec="white", lw=0.8, zorder=6))
+    axes.text(*centre, str(number), color="white", ha="center", va="center", fontsize=8, zorder=7)

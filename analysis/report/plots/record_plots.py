@@ -54,8 +54,8 @@ def line_spectrum(record: Record, x: Array) -> LineSpectrum | None:
     periods = len(x) // record.period if record.period else 0
     if not periods or not record.lines:
         return None
-    whole = x[: periods * record.period]
-    spectrum = 2.0 * np.abs(np.fft.rfft(whole)) / len(whole)
+    periodic = x[: periods * record.period]
+    spectrum = 2.0 * np.abs(np.fft.rfft(periodic)) / len(periodic)
     shown = max(round(1.35 * max(record.lines)), REPORT.fewest_lines)
     k = np.arange(1, min(shown, record.period // 2) + 1)
     return LineSpectrum(
@@ -95,8 +95,8 @@ def electric_excitation(rig: Rig, record: Record, joint: int, key: str) -> Marku
     shown = slice(0, int(min(record.samples, REPORT.electric_seconds * record.sample_rate)))
     with style():
         canvas = figure(3.7)
-        for place, kind in enumerate((ch.DRIVE, ch.POSITION)):
-            axes = canvas.add_axes((0.15, 0.60 - 0.485 * place, 0.82, 0.33))
+        for row, kind in enumerate((ch.DRIVE, ch.POSITION)):
+            axes = canvas.add_axes((0.15, 0.60 - 0.485 * row, 0.82, 0.33))
             name = ch.channel(kind, joint)
             x = bridged(np.asarray(record.channels[name]))
             axes.plot(*thin(record.time[shown], x[shown]), color=INK, linewidth=0.7)
@@ -142,8 +142,8 @@ def _unknown_lines(axes: Any, record: Record, spool: Array) -> None:
     spectrum = 2e3 * np.abs(np.fft.rfft((spool - spool.mean()) * window)) / window.sum()
     frequency: Array = np.fft.rfftfreq(len(spool), 1.0 / record.sample_rate).astype(np.float64)
     inside = (frequency > 0) & (frequency <= min(50.0, 0.4 * record.sample_rate))
-    seen: Array = np.maximum(spectrum[inside], 1e-9).astype(np.float64)
-    axes.plot(*thin(frequency[inside], seen), color=BLUE, linewidth=0.8)
+    amplitude: Array = np.maximum(spectrum[inside], 1e-9).astype(np.float64)
+    axes.plot(*thin(frequency[inside], amplitude), color=BLUE, linewidth=0.8)
     axes.margins(x=0)
     note(axes, 0.995, 0.99, "excited lines not stated in the record", GREY)
 
@@ -168,8 +168,8 @@ def residual(shown: Residual, key: str) -> Markup:
         top.set_title(
             f"residual; measured side {significant(unit.scale * shown.rms_side)} {unit.text} RMS"
         )
-        what = "mean of repeats, ±1 scatter" if shown.repeats > 1 else "the only repeat"
-        note(top, 0.995, 0.99, what, BLUE)
+        caption = "mean of repeats, ±1 scatter" if shown.repeats > 1 else "the only repeat"
+        note(top, 0.995, 0.99, caption, BLUE)
         _densities(low, shown, unit.scale, unit.text)
         return svg(
             canvas, key, f"Residual of one equation of joint {shown.joint}, time and spectrum"
@@ -197,8 +197,8 @@ def _densities(axes: Any, residual: Residual, scale: float, unit: str) -> None:
         note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
     axes.margins(x=0)
     # The row filter's stop band would take up most of the axis.
-    least = scale * float(residual.spectrum.max()) / REPORT.spectrum_span
-    axes.set_ylim(bottom=max(axes.get_ylim()[0], least))
+    lowest = scale * float(residual.spectrum.max()) / REPORT.spectrum_span
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], lowest))
     axes.set_xlabel("frequency [Hz]", labelpad=1)
     axes.set_ylabel(f"{unit}/√Hz")
 

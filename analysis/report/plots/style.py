@@ -102,11 +102,11 @@ def thin(x: Array, y: Array, points: int = REPORT.line_points) -> tuple[Array, A
     if n <= points:
         return x, y
     edges = np.linspace(0, n, points // 2 + 1).astype(int)
-    kept: list[int] = [0]
-    for first, last in itertools.pairwise(edges.tolist()):
-        stretch = np.nan_to_num(y[first:last])
-        kept += sorted((first + int(stretch.argmin()), first + int(stretch.argmax())))
-    index = np.unique([*kept, n - 1, *np.flatnonzero(np.isnan(y))])
+    extremes: list[int] = [0]
+    for start, stop in itertools.pairwise(edges.tolist()):
+        stretch = np.nan_to_num(y[start:stop])
+        extremes += sorted((start + int(stretch.argmin()), start + int(stretch.argmax())))
+    index = np.unique([*extremes, n - 1, *np.flatnonzero(np.isnan(y))])
     return x[index], y[index]
 
 

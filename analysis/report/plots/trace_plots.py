@@ -54,7 +54,7 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.units import AXES, display_unit, typeset
 
-WORDS = 125  # letters of a line across a page
+LINE_LENGTH = 125  # [characters] of a line across a page
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ def abscissae(
     out = []
     for line in lines:
         if effect is not None:
-            seen = prepared_signals(rig, model.terms, line.conditioned)
-            raw = effect.abscissa(rig, seen)[equation]
+            signals = prepared_signals(rig, model.terms, line.conditioned)
+            raw = effect.abscissa(rig, signals)[equation]
         else:
             raw = variables(rig, line.conditioned.signals, joint)[variable]
         out.append(filtered({"x": np.asarray(raw)}, line.conditioned, line.rows)["x"])
@@ -124,14 +124,14 @@ def against(
     if after:
         parts.append(("after: ", np.concatenate([line.after for line in lines])))
     top = 1.1 * max(float(np.quantile(np.abs(parts[0][1]), 0.995)), 2.5 * noise)
-    kept = np.linspace(0, len(x) - 1, min(REPORT.scatter_points, len(x))).astype(int)
+    drawn = np.linspace(0, len(x) - 1, min(REPORT.scatter_points, len(x))).astype(int)
     with style():
         canvas = figure(2.5, CARD * (2 if after else 1))
         for k, (word, y) in enumerate(parts):
             axes = canvas.add_subplot(1, len(parts), k + 1)
             axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
             colour = BLUE if k else GREY
-            axes.plot(x[kept], y[kept], ".", color=colour, ms=2.2, alpha=0.5, mew=0)
+            axes.plot(x[drawn], y[drawn], ".", color=colour, ms=2.2, alpha=0.5, mew=0)
             means = _binned(x, y)
             axes.plot(*means, "-", color=MODEL, lw=1.8)
             axes.plot(*means, "o", color=MODEL, ms=2.6)
@@ -182,13 +182,14 @@ def rival_errors(effect: JudgedEffect, key: str) -> Markup | None:
     with style():
         canvas = figure(0.5 + 0.4 * len(bars), CARD * 2)
         axes = canvas.add_subplot()
-        for k, (name, left, why, colour) in enumerate(reversed(bars)):
-            axes.barh(k, left - low, 0.36, left=low, color=colour, lw=0)
-            axes.text(left, k, f" {fm.significant(left)}", va="center", fontsize=7.5)
+        for k, (name, error, why, colour) in enumerate(reversed(bars)):
+            axes.barh(k, error - low, 0.36, left=low, color=colour, lw=0)
+            axes.text(error, k, f" {fm.significant(error)}", va="center", fontsize=7.5)
             axes.plot([1.0, 1.0], [k - 0.2, k + 0.2], color=INK, lw=0.8, ls="--")
-            said = textwrap.shorten(f"{name}: {why}" if why else name, WORDS, placeholder=" …")
+            text = f"{name}: {why}" if why else name
+            line = textwrap.shorten(text, LINE_LENGTH, placeholder=" …")
             axes.annotate(
-                said, (0.0, k + 0.22), xycoords=("axes fraction", "data"), va="bottom", fontsize=7.5
+                line, (0.0, k + 0.22), xycoords=("axes fraction", "data"), va="bottom", fontsize=7.5
             )
         axes.set_xscale("log")
         axes.set_xlim(low, high)
@@ -281,11 +282,11 @@ def _compared(changed: bool) -> str:
 
 def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
     """Draw the lines of a residual by kind, before next to after, and the noise of one repeat."""
-    of = lines_by_kind(shown.excited)
+    by_kind = lines_by_kind(shown.excited)
     kinds = (
-        ("excited", of[EXCITED], "o", INK, 4.0),
-        ("odd, left empty", of[ODD], "s", MODEL, 3.2),
-        ("even", of[EVEN] | of[CONSTANT], "^", BLUE, 3.0),
+        ("excited", by_kind[EXCITED], "o", INK, 4.0),
+        ("odd, left empty", by_kind[ODD], "s", MODEL, 3.2),
+        ("even", by_kind[EVEN] | by_kind[CONSTANT], "^", BLUE, 3.0),
     )
     noise = np.sqrt(shown.noise)
     low = 0.2 * float(np.median(noise))
@@ -296,10 +297,10 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
             axes = canvas.add_subplot(1, 2 if after else 1, k + 1)
             power = shown.after if k else shown.repeatable
             axes.fill_between(shown.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
-            for label, own, marker, colour, size in kinds:
-                y = np.sqrt(np.maximum(power[own], 0.0))
+            for label, chosen, marker, colour, size in kinds:
+                y = np.sqrt(np.maximum(power[chosen], 0.0))
                 axes.plot(
-                    shown.frequency[own], np.where(y > low, y, np.nan), marker, color=colour,
+                    shown.frequency[chosen], np.where(y > low, y, np.nan), marker, color=colour,
                     ms=size, mew=0, label=label,
                 )  # fmt: skip
             axes.set_yscale("log")
@@ -324,7 +325,7 @@ def _binned(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def axis(rig: Rig, name: str) -> tuple[str, float]:
-    """Return the label with its practical unit of a variable's axis, and the factor from SI.
+    """Return an axis label of a variable with its display unit, and the factor from SI.
 
     `name` is that of a channel, of a variable of clues, or of an effect's plotted quantity.
     """
@@ -335,12 +336,12 @@ def axis(rig: Rig, name: str) -> tuple[str, float]:
 def _unit_of_variable(rig: Rig, name: str) -> str:
     with suppress(ValueError):  # no channel
         return rig.unit_of(name)
-    way = rig.unit_of(ch.channel(rig.position_kind, 1))
+    position = rig.unit_of(ch.channel(rig.position_kind, 1))
     spool, pressure = ch.UNITS[ch.SPOOL], ch.UNITS[ch.SUPPLY]
     drive = rig.unit_of(ch.channel(rig.drive_kind, 1))
     return {
-        "position": way, "velocity": f"{way}/s", "acceleration": f"{way}/s^2",
-        "joint position": way if rig.electric else "rad", "absolute angle": "rad",
+        "position": position, "velocity": f"{position}/s", "acceleration": f"{position}/s^2",
+        "joint position": position if rig.electric else "rad", "absolute angle": "rad",
         "spool": spool, "spool rate": f"{spool}/s", "drive": drive, "drive rate": f"{drive}/s",
         "pressure": pressure, "pressure difference": pressure,
         "pressure across the leak": pressure, "pressure rate": f"{pressure}/s",
@@ -353,7 +354,7 @@ def equation_of(
 ) -> str:
     """Return the equation with the largest ratio of residual to noise before an effect is added."""
     conditioned = next(iter(lines.values()))[0].conditioned
-    own = [e for e in effect.abscissa(rig, conditioned.signals) if e in lines]
-    if not own:
+    equations = [e for e in effect.abscissa(rig, conditioned.signals) if e in lines]
+    if not equations:
         return equation_of_largest_reduction(result)
-    return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
+    return max(equations, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))

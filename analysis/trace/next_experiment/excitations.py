@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from analysis.design.limits import Spectrum, forecast_of, used
+from analysis.design.limits import Spectrum, forecast_of, tightest_limit
 from analysis.design.moves import Tone, with_tones
 from analysis.design.twin_records import Played, TwinStep, play
 from analysis.regression.conditioned import ConditionedRecord
@@ -155,7 +155,7 @@ def excitation(
     try:
         for attempt in range(EXPERIMENT.plays):
             played = play(rig, with_tones(step, tones))
-            share = used(rig, played)[0]
+            share = tightest_limit(rig, played)[0]
             step = played.step
             if share <= 1.05 * goal:
                 best = CandidateExcitation(family, setting, tones, played)
