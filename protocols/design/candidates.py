@@ -90,11 +90,11 @@ def described(step: Step) -> str:
     """Return a step in words: "excite joint 1; joint 2 at end_min, joint 3 closed"."""
     moving = ", ".join(f"joint {part.joint}" for part in step.excite)
     locks = sorted(step.lock, key=lambda lock: lock.joint)
-    still = ", ".join(f"joint {lock.joint} {_at(lock)}" for lock in locks)
+    still = ", ".join(f"joint {lock.joint} {_lock_text(lock)}" for lock in locks)
     return f"excite {moving}" + (f"; {still}" if still else "")
 
 
-def _at(lock: Lock) -> str:
+def _lock_text(lock: Lock) -> str:
     if lock.at != CLOSED:
         return f"at {lock.at}"
     return f"closed at {1e3 * lock.piston:g} mm"
@@ -108,14 +108,14 @@ def motion_within(
     `spare` is the share of a quantity's range that must stay free.
     """
     try:
-        alone = Protocol(name="candidate", joints=len(rig.joints), steps=(step,))
-        planned = resolve(alone, rig).steps[0]
+        protocol = Protocol(name="candidate", joints=len(rig.joints), steps=(step,))
+        planned = resolve(protocol, rig).steps[0]
         centring = centred(planned, rig, twin)
     except InputError as error:
         log.debug("%s", error)
         return None
     lines = judge_motion(planned, rig, centring).predictions
-    return centring.moved if all(_kept(line, spare) for line in lines) else None
+    return centring.moved if all(_has_margin(line, spare) for line in lines) else None
 
 
 def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[str, Array]] | None:
@@ -142,7 +142,7 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
     return by_amplitude[max(by_amplitude)]
 
 
-def _kept(line: MotionPrediction, spare: Mapping[str, float]) -> bool:
-    least = spare.get(line.quantity, 0.0) * (line.allowed_high - line.allowed_low)
+def _has_margin(line: MotionPrediction, spare: Mapping[str, float]) -> bool:
+    required = spare.get(line.quantity, 0.0) * (line.allowed_high - line.allowed_low)
     room = line.margin if line.joint is not None else line.allowed_high - line.high
-    return room >= least
+    return room >= required

@@ -74,13 +74,13 @@ def check(
     Raises InputError where the twin cannot follow the commands at all; the report states whether
     limits are kept.
     """
-    seen: dict[Hashable, StepCheck] = {}
+    checked: dict[Hashable, StepCheck] = {}
     steps = []
     for step in plan.excitations:
-        same = _content(step)  # steps of a sweep or a repetition are often alike
-        if same not in seen:
-            seen[same] = check_step(step, rig, twin, draws)
-        steps.append(replace(seen[same], step=step.name))
+        content = _content(step)  # steps of a sweep or a repetition are often alike
+        if content not in checked:
+            checked[content] = check_step(step, rig, twin, draws)
+        steps.append(replace(checked[content], step=step.name))
         if progress is not None:
             progress(len(steps) / len(plan.excitations))
     return CheckReport(
@@ -99,13 +99,13 @@ def _timeline(plan: Plan) -> tuple[Moment, ...]:
     """Return the start of each step if every condition holds at once."""
     moments: list[Moment] = []
 
-    def lay(parts: Sequence[PlannedStep], begins: float) -> None:
+    def add_moments(parts: Sequence[PlannedStep], begins: float) -> None:
         for part in parts:
             moments.append(Moment(part.name, part.title, begins, part.seconds, part.longest))
-            lay(part.nested, begins)
+            add_moments(part.nested, begins)
             begins += part.seconds
 
-    lay(plan.sequence, 0.0)
+    add_moments(plan.sequence, 0.0)
     return tuple(moments)
 
 
@@ -128,13 +128,13 @@ def judge_motion(step: StepPlan, rig: Rig, centring: CentredMotion) -> StepCheck
 
 @dataclass(frozen=True)
 class CentredMotion:
-    """Biases [V] that keep the pistons centred, and the simulation with `tried` from `start`.
+    """Biases [V] that keep the pistons centred, and the simulation with the biases `applied` [V].
 
     `moved` is the last period's motion; `start` (joints,) are the pistons [m] at its beginning.
     """
 
     biases: dict[int, float]
-    tried: dict[int, float]
+    applied: dict[int, float]
     start: Array
     moved: Mapping[str, Array]
 
@@ -153,53 +153,53 @@ def centred(
     for part in step.excite:
         start[part.joint] = part.centre
     if near is not None:
-        biases, start = dict(near.tried), near.start.copy()
+        biases, start = dict(near.applied), near.start.copy()
     seek = round(DESIGN.seek_seconds * rate)
-    whole = math.ceil(DESIGN.settle_seconds * rate / step.period) * step.period + step.period
+    settled = math.ceil(DESIGN.settle_seconds * rate / step.period) * step.period + step.period
     for attempt in range(DESIGN.bias_tries):
-        samples = min(seek, whole) if attempt < 2 and near is None else whole
-        tried, began = dict(biases), start.copy()
+        samples = min(seek, settled) if attempt < 2 and near is None else settled
+        applied, initial = dict(biases), start.copy()
         commands = _commands(step, joints, biases, samples, rate)
         moved = twin(rig, commands, start, locked)
         steady = True
         for part in step.excite:
-            steady &= _improve(part, step, rate, commands, moved, biases, start)
-        if steady and samples == whole:
-            last = {name: values[-step.period :] for name, values in moved.items()}
-            return CentredMotion(biases, tried, began, last)
-    which = ", ".join(str(part.joint + 1) for part in step.excite)
+            steady &= _correct_bias(part, step, rate, commands, moved, biases, start)
+        if steady and samples == settled:
+            last_period = {name: values[-step.period :] for name, values in moved.items()}
+            return CentredMotion(biases, applied, initial, last_period)
+    numbers = ", ".join(str(part.joint + 1) for part in step.excite)
     raise NotCentred(
-        f"{step.located}: on the twin joint {which} cannot be centred: after {DESIGN.bias_tries} "
+        f"{step.located}: on the twin joint {numbers} cannot be centred: after {DESIGN.bias_tries} "
         "biases it still drifts, or its simulation fails (end of the linkage, vacuum); "
         "lower the amplitude, or allow more drift",
         step,
     )
 
 
-def _improve(
+def _correct_bias(
     part: ExcitePlan, step: StepPlan, rate: float, commands: Array, moved: Mapping[str, Array],
     biases: dict[int, float], start: Array,
 ) -> bool:  # fmt: skip
-    """Correct bias and start of one joint from a simulation; return whether it was centred."""
+    """Correct bias and start of one joint by a simulation; return whether it was centred."""
     j = part.joint
-    own = moved["piston"][:, j]
-    exists = np.isfinite(own) & (moved.get("valid", np.ones(len(own))) > 0.0)
-    good = len(own) if exists.all() else int(np.argmin(exists))
-    begin = round(DESIGN.ramp_seconds * rate) if good > 2 * DESIGN.ramp_seconds * rate else 0
-    span = slice(max(begin, good - step.period), good)
-    seen = follow(commands[span, j], own[span], rate)
-    if not seen.gain > 0.0:
+    piston = moved["piston"][:, j]
+    valid = np.isfinite(piston) & (moved.get("valid", np.ones(len(piston))) > 0.0)
+    count = len(piston) if valid.all() else int(np.argmin(valid))
+    begin = round(DESIGN.ramp_seconds * rate) if count > 2 * DESIGN.ramp_seconds * rate else 0
+    span = slice(max(begin, count - step.period), count)
+    response = follow(commands[span, j], piston[span], rate)
+    if not response.gain > 0.0:
         raise NotCentred(
             f"{step.located}: on the twin joint {j + 1} does not follow its command "
-            f"({seen.gain:.3g} m/s per volt, expected more than 0); lower the amplitude, or "
+            f"({response.gain:.3g} m/s per volt, expected more than 0); lower the amplitude, or "
             "correct the nominal parameters of the rig or the model of the twin",
             step,
         )
     allowed = DESIGN.drift_share * part.settings.centring.drift
-    off = float(np.mean(own[span])) - part.centre
-    steady = good == len(own) and abs(seen.drift) * step.record / rate <= allowed
-    biases[j] = seen.null
-    start[j] -= float(np.clip(off, -5e-3, 5e-3)) if good == len(own) else 0.0
+    offset = float(np.mean(piston[span])) - part.centre
+    steady = count == len(piston) and abs(response.drift) * step.record / rate <= allowed
+    biases[j] = response.null
+    start[j] -= float(np.clip(offset, -5e-3, 5e-3)) if count == len(piston) else 0.0
     return steady
 
 
@@ -220,7 +220,7 @@ def _joint_lines(
 ) -> list[MotionPrediction]:
     j, limits = part.joint, rig.joints[part.joint].limits
     piston = moved["piston"][:, j]
-    # As if centred, and then off by the allowed offset.
+    # Judged as centred exactly, then shifted by the allowed offset to either side.
     piston = piston - np.mean(piston) + part.centre
     offset = part.settings.centring.offset
     low, high = float(piston.min()) - offset, float(piston.max()) + offset
@@ -279,18 +279,18 @@ PERCENT = 100  # factors are tried in hundredths, so that the factor written is 
 
 
 def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> float | None:
-    """Return the largest factor found by which a step's amplitudes keep every limit; None if none.
+    """Return the largest factor of a step's amplitudes with which it keeps every limit, or None.
 
-    Found by bisection in hundredths below 1; the factor was proved on the twin and its `draws`.
+    Found by bisection in hundredths below 1, and proved on the twin and its `draws`.
     """
     passes, fails = 0, PERCENT
     while fails - passes > 1:
         trial = (passes + fails) // 2
         try:
-            kept = check_step(_resized(step, trial / PERCENT), rig, twin, draws).ok
+            passed = check_step(_resized(step, trial / PERCENT), rig, twin, draws).ok
         except InputError:
-            kept = False
-        if kept:
+            passed = False
+        if passed:
             passes = trial
         else:
             fails = trial

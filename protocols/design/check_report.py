@@ -76,13 +76,13 @@ def widened(central: StepCheck, others: Sequence[StepCheck]) -> StepCheck:
     """
     if not others:
         return central
-    known = [{(p.quantity, p.joint): p for p in other.predictions} for other in others]
+    by_quantity = [{(p.quantity, p.joint): p for p in other.predictions} for other in others]
     lines = []
     for line in central.predictions:
-        same = [k[name] for k in known if (name := (line.quantity, line.joint)) in k]
+        matching = [k[name] for k in by_quantity if (name := (line.quantity, line.joint)) in k]
         below, above = (
             DESIGN.sigmas
-            * math.sqrt(sum((end(p) - end(line)) ** 2 for p in same) / max(len(same), 1))
+            * math.sqrt(sum((end(p) - end(line)) ** 2 for p in matching) / max(len(matching), 1))
             for end in (attrgetter("low"), attrgetter("high"))
         )
         lines.append(
@@ -139,7 +139,7 @@ class CheckReport:
         """Return the report with the factor of amplitudes by which each refused step would pass."""
         return replace(self, scales=dict(scales))
 
-    def _begins(self, step: str) -> str:
+    def _start(self, step: str) -> str:
         """Return the start of a step as text for a refusal."""
         moments = [moment for moment in self.timeline if moment.name == step]
         return f", about {moments[0].begins:.0f} s into the run" if moments else ""
@@ -151,7 +151,7 @@ class CheckReport:
     def refused(self) -> tuple[str, ...]:
         """One line per limit that would be exceeded."""
         return tuple(
-            _text(check.step, line, self.twin) + self._begins(check.step) + self._remedy(check.step)
+            _text(check.step, line, self.twin) + self._start(check.step) + self._remedy(check.step)
             for check in self.steps
             for line in check.predictions
             if line.binding and not line.ok
@@ -176,8 +176,8 @@ class CheckReport:
         """Raise InputError naming the first limit that would be exceeded."""
         if self.refused:
             more = f" (and {len(self.refused) - 1} more)" if len(self.refused) > 1 else ""
-            first = next(check.step for check in self.steps if not check.ok)
-            where = f"{self.places[first]}: " if first in self.places else ""
+            step = next(check.step for check in self.steps if not check.ok)
+            where = f"{self.places[step]}: " if step in self.places else ""
             raise InputError(f"{where}protocol {self.protocol!r} refused: {self.refused[0]}{more}")
 
     def as_dict(self) -> dict[str, Any]:
@@ -217,20 +217,20 @@ class CheckReport:
 def _text(step: str, line: MotionPrediction, twin: str) -> str:
     shown = display_unit(line.unit, LIMITS)
     scale, unit = shown.scale, shown.text
-    who = "the bench" if line.joint is None else f"joint {line.joint}"
+    where = "the bench" if line.joint is None else f"joint {line.joint}"
     low, high = scale * line.low, scale * line.high
-    of = "" if twin == NOMINAL else f" ({twin})"
+    twin_text = "" if twin == NOMINAL else f" ({twin})"
     return (
-        f"{step}, {who}: {line.quantity} {low:.4g} to {high:.4g} {unit} on the twin{of}, allowed "
-        f"{scale * line.allowed_low:.4g} to {scale * line.allowed_high:.4g} {unit}"
+        f"{step}, {where}: {line.quantity} {low:.4g} to {high:.4g} {unit} on the twin{twin_text}, "
+        f"allowed {scale * line.allowed_low:.4g} to {scale * line.allowed_high:.4g} {unit}"
     )
 
 
 def _line(data: Mapping[str, Any]) -> MotionPrediction:
     low, high = data["predicted"]
-    least, most = data["allowed"]
+    lowest, highest = data["allowed"]
     return MotionPrediction(
-        data["quantity"], data["joint"], low, high, least, most, data["unit"], data["binding"],
+        data["quantity"], data["joint"], low, high, lowest, highest, data["unit"], data["binding"],
         (data["spread"][0], data["spread"][1]),
     )  # fmt: skip
 

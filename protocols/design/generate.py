@@ -94,19 +94,19 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
     Raises InputError for a protocol that does not fit the rig or that the twin cannot follow.
     """
     plan, judge = resolve(protocol, rig), predictor.judge_of(rig)
-    done: list[SizedStep] = []
+    added: list[SizedStep] = []
     reasons: list[Reason] = []
     before = judge([])
     for step, planned in zip(plan.protocol.excitations, plan.steps, strict=True):
         moved = centred(planned, rig, predictor.twin).moved
         rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
-        done.append(SizedStep(step, rows))
-        after = judge([proof.rows for proof in done])
+        added.append(SizedStep(step, rows))
+        after = judge([proof.rows for proof in added])
         reasons.append(Reason(step.name, described(step), _why(before, after), after))
         before = after
     return Proof(
         protocol.name, rig.name, tuple(reasons), before,
-        () if complete(before) else _help(done, rig, predictor),
+        () if complete(before) else _help(added, rig, predictor),
     )  # fmt: skip
 
 
@@ -114,11 +114,11 @@ def _pool(rig: Rig, predictor: Predictor) -> list[SizedStep]:
     """Return every candidate that the rig allows, with its largest allowed amplitude."""
     pool = []
     for seed, step in enumerate(candidates(rig), start=1):
-        step_sized = sized(step, seed, rig, predictor.twin)
-        if step_sized is not None:
-            kept, moved = step_sized
-            locked = [lock.joint for lock in kept.lock]
-            pool.append(SizedStep(kept, predictor.rows(rig, moved, locked)))
+        result = sized(step, seed, rig, predictor.twin)
+        if result is not None:
+            sized_step, moved = result
+            locked = [lock.joint for lock in sized_step.lock]
+            pool.append(SizedStep(sized_step, predictor.rows(rig, moved, locked)))
     return pool
 
 
@@ -127,23 +127,24 @@ def _why(before: Verdicts, after: Verdicts) -> str:
     learned: list[str] = []
     words = []
     for family, verdict in after.items():
-        old = before[family]
-        new = [name for name in verdict.identified if name not in old.identified]
-        learned += new
-        if not new and verdict.rank > old.rank:
-            more = verdict.rank - old.rank
-            words.append(f"{more} more combination{'s' if more > 1 else ''} of {family} parameters")
-        elif old.complete and verdict.condition < DESIGN.worth * old.condition:
-            words.append(f"{family} condition {old.condition:.3g} to {verdict.condition:.3g}")
+        earlier = before[family]
+        identified = [name for name in verdict.identified if name not in earlier.identified]
+        learned += identified
+        if not identified and verdict.rank > earlier.rank:
+            gained = verdict.rank - earlier.rank
+            plural = "s" if gained > 1 else ""
+            words.append(f"{gained} more combination{plural} of {family} parameters")
+        elif earlier.complete and verdict.condition < DESIGN.worth * earlier.condition:
+            words.append(f"{family} condition {earlier.condition:.3g} to {verdict.condition:.3g}")
     words = [f"determines {' '.join(learned)}"] * bool(learned) + words
     return "; ".join(words) or "no new parameter or combination"
 
 
-def _help(done: Sequence[SizedStep], rig: Rig, predictor: Predictor) -> tuple[str, ...]:
+def _help(steps: Sequence[SizedStep], rig: Rig, predictor: Predictor) -> tuple[str, ...]:
     """Return the steps, in words, that would make the other parameters identifiable."""
     pool = _pool(rig, predictor)
-    more = extended(done, pool, predictor.judge_of(rig))[len(done) :]
-    return tuple(described(candidate.step) for candidate in more)
+    further = extended(steps, pool, predictor.judge_of(rig))[len(steps) :]
+    return tuple(described(candidate.step) for candidate in further)
 
 
 def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
@@ -159,8 +160,8 @@ def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
                 _sized_sines(f"joint{joint}_{frequency:g}hz", (joint,), frequency, rig, twin)
             )
         if N > 1:
-            every = tuple(range(1, N + 1))
-            steps.append(_sized_sines(f"all_{frequency:g}hz", every, frequency, rig, twin))
+            all_joints = tuple(range(1, N + 1))
+            steps.append(_sized_sines(f"all_{frequency:g}hz", all_joints, frequency, rig, twin))
     return Protocol(
         name=name,
         description=f"Validation records for a model of {rig.name}, 1 and 3 Hz sines",
@@ -173,8 +174,8 @@ def _sized_sines(
     name: str, moving: tuple[int, ...], frequency: float, rig: Rig, twin: Twin
 ) -> Step:
     for size in range(DESIGN.sizes):
-        first = DESIGN.sine_alone if len(moving) == 1 else DESIGN.sine_together
-        amplitude = first * DESIGN.smaller**size
+        peak = DESIGN.sine_alone if len(moving) == 1 else DESIGN.sine_together
+        amplitude = peak * DESIGN.smaller**size
         step = _sines(name, moving, frequency, float(f"{amplitude:.3g}"), len(rig.joints))
         if motion_within(step, rig, twin, ROOM) is not None:
             return step

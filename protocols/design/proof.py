@@ -72,7 +72,7 @@ class Reason:
 class Proof:
     """What the steps of a protocol determine on the twin of a rig.
 
-    `help` are further steps, in words, that would determine the lost parameters.
+    `help` are further steps, in words, that would determine the undetermined parameters.
     """
 
     protocol: str
@@ -92,7 +92,7 @@ class Proof:
             "protocol": self.protocol,
             "rig": self.rig,
             "complete": self.complete,
-            "families": {name: _plain(verdict) for name, verdict in self.verdicts.items()},
+            "families": {name: _verdict_data(verdict) for name, verdict in self.verdicts.items()},
             "steps": [
                 {
                     "step": reason.step,
@@ -107,7 +107,7 @@ class Proof:
         }
 
 
-def _plain(verdict: Verdict) -> dict[str, Any]:
+def _verdict_data(verdict: Verdict) -> dict[str, Any]:
     return {
         "parameters": list(verdict.names),
         "rank": verdict.rank,

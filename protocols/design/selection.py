@@ -2,7 +2,7 @@
 
 Greedily, the step is added that increases log det of the information most, with unit columns and a
 floor, so that a new direction counts more than a better determined one, until every parameter is
-determined. Further steps are added only while the worse condition number is above the wanted one
+determined. Further steps are added only while the worse condition number is above `condition`
 and falls by a tenth or more. Then unnecessary steps are removed, and single steps are exchanged
 while that improves the worse condition number (Fedorov's exchange).
 """
@@ -44,31 +44,33 @@ def extended(
     chosen = list(start)
     scales = _scales([*start, *pool])
     for _ in pool:
-        rest = [candidate for candidate in pool if candidate not in chosen]
-        now = _verdicts(chosen, judge)
-        if not complete(now):
-            before = _score(chosen, scales)
+        remaining = [candidate for candidate in pool if candidate not in chosen]
+        verdicts = _verdicts(chosen, judge)
+        if not complete(verdicts):
+            score = _score(chosen, scales)
             gain = {
-                id(candidate): _score([*chosen, candidate], scales) - before for candidate in rest
+                id(candidate): _score([*chosen, candidate], scales) - score
+                for candidate in remaining
             }
             best = max(
-                rest,
+                remaining,
                 key=lambda candidate: gain[id(candidate)] - DESIGN.closed_price * _cost(candidate),
             )
             if gain[id(best)] < 1.0:
                 break  # no step adds a direction
         else:
-            if worst(now) <= DESIGN.condition:
+            if condition_of(verdicts) <= DESIGN.condition:
                 break
-            best = min(rest, key=lambda candidate: worst(_verdicts([*chosen, candidate], judge)))
-            if worst(_verdicts([*chosen, best], judge)) > DESIGN.worth * worst(now):
+            trials = {id(c): condition_of(_verdicts([*chosen, c], judge)) for c in remaining}
+            best = min(remaining, key=lambda candidate: trials[id(candidate)])
+            if trials[id(best)] > DESIGN.worth * condition_of(verdicts):
                 break
         chosen.append(best)
     return chosen
 
 
-def worst(verdicts: Verdicts) -> float:
-    """Return the larger condition number."""
+def condition_of(verdicts: Verdicts) -> float:
+    """Return the largest condition number of the families."""
     return max(verdict.condition for verdict in verdicts.values())
 
 
@@ -77,15 +79,15 @@ def _verdicts(steps: Sequence[SizedStep], judge: Judge) -> Verdicts:
 
 
 def _pruned(chosen: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
-    """Remove every step without which as much is determined, and as well as wanted."""
+    """Remove steps without which the rank is the same and the condition number acceptable."""
     kept = list(chosen)
-    now = _verdicts(kept, judge)
-    allowed = max(DESIGN.condition, worst(now))
+    initial = _verdicts(kept, judge)
+    allowed = max(DESIGN.condition, condition_of(initial))
     for step in sorted(chosen, key=_cost, reverse=True):
         fewer = [other for other in kept if other is not step]
         verdicts = _verdicts(fewer, judge)
-        same = all(verdicts[family].rank == now[family].rank for family in verdicts)
-        if fewer and same and (worst(verdicts) <= allowed or not complete(now)):
+        equal_rank = all(verdicts[family].rank == initial[family].rank for family in verdicts)
+        if fewer and equal_rank and (condition_of(verdicts) <= allowed or not complete(initial)):
             kept = fewer
     return kept
 
@@ -94,28 +96,28 @@ def _exchanged(
     chosen: Sequence[SizedStep], pool: Sequence[SizedStep], judge: Judge
 ) -> list[SizedStep]:
     """Exchange single steps for others while that improves the worse condition number."""
-    now = list(chosen)
+    current = list(chosen)
     for _ in pool:
         trials = [
-            [*now[:place], other, *now[place + 1 :]]
-            for place in range(len(now))
+            [*current[:index], other, *current[index + 1 :]]
+            for index in range(len(current))
             for other in pool
-            if other not in now
+            if other not in current
         ]
-        best = min(trials, key=lambda steps: _badness(steps, judge), default=now)
-        if not _badness(best, judge) < _badness(now, judge) + np.log(DESIGN.worth):
+        best = min(trials, key=lambda steps: _log_cost(steps, judge), default=current)
+        if not _log_cost(best, judge) < _log_cost(current, judge) + np.log(DESIGN.worth):
             break
-        now = best
-    return now
+        current = best
+    return current
 
 
-def _badness(steps: Sequence[SizedStep], judge: Judge) -> float:
+def _log_cost(steps: Sequence[SizedStep], judge: Judge) -> float:
     """Return the log of the worse condition number, plus a tenth for each valve closed beyond."""
     verdicts = _verdicts(steps, judge)
     if not complete(verdicts):
         return float("inf")
     return float(
-        np.log(worst(verdicts)) - np.log(DESIGN.worth) * sum(_cost(step) for step in steps)
+        np.log(condition_of(verdicts)) - np.log(DESIGN.worth) * sum(_cost(step) for step in steps)
     )
 
 

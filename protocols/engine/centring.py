@@ -53,17 +53,17 @@ def follow(command: Array, piston: Array, rate: float) -> Follow:
     output is known. Short gaps (NaN) are bridged. Returns NaN where the command hardly varies or
     too few samples arrived.
     """
-    known = np.isfinite(command) & np.isfinite(piston)
-    if np.count_nonzero(known) < 10:
+    arrived = np.isfinite(command) & np.isfinite(piston)
+    if np.count_nonzero(arrived) < 10:
         return _UNKNOWN
     time = np.arange(len(command)) / rate
-    whole = np.interp(time, time[known], command[known])
-    middle = float(np.mean(whole))
-    moved = np.cumsum(whole - middle) / rate
-    if np.ptp(moved) < 1e-9:
+    bridged = np.interp(time, time[arrived], command[arrived])
+    middle = float(np.mean(bridged))
+    integral = np.cumsum(bridged - middle) / rate
+    if np.ptp(integral) < 1e-9:
         return _UNKNOWN
-    basis = np.column_stack((np.ones_like(time), time, moved))[known]
-    _, drift, gain = np.linalg.lstsq(basis, piston[known], rcond=None)[0]
+    basis = np.column_stack((np.ones_like(time), time, integral))[arrived]
+    _, drift, gain = np.linalg.lstsq(basis, piston[arrived], rcond=None)[0]
     null = middle - float(drift / gain) if gain else float("nan")
     return Follow(float(gain), null, float(drift))
 
@@ -94,8 +94,8 @@ def recentring(moved: Motion, centre: float, seconds: float, cap: float) -> floa
 def free_path(wave: Array, period: int, gain: float, rate: float) -> Array:
     """Return the motion (period,) [m] about its mean of a piston with `gain` [m/(s V)]."""
     command = np.resize(wave, period)
-    way = np.cumsum(command - command.mean()) * gain / rate
-    return np.asarray(way - way.mean())
+    path = np.cumsum(command - command.mean()) * gain / rate
+    return np.asarray(path - path.mean())
 
 
 def under_loop(piston: Array, pull: float, rate: float) -> Array:
@@ -109,9 +109,9 @@ def under_loop(piston: Array, pull: float, rate: float) -> Array:
     return np.fft.irfft(lines, len(piston))
 
 
-def trim(bias: float, drift: float, wanted: float, gain: float) -> float:
-    """Return the bias [V] that changes the drift [m/s] into the wanted one: v + (w - d) / k."""
-    return bias + (wanted - drift) / gain
+def trim(bias: float, drift: float, target: float, gain: float) -> float:
+    """Return the bias [V] that changes the drift d [m/s] to the target w: v + (w - d) / k."""
+    return bias + (target - drift) / gain
 
 
 @dataclass(frozen=True)
@@ -128,28 +128,28 @@ class BiasForecast:
 
 
 def forecast(
-    reference: Array, seen: Array, horizon: int, rate: float, shortest: int
+    reference: Array, samples: Array, horizon: int, rate: float, shortest: int
 ) -> BiasForecast:
-    """Predict the motion of a piston from one period that it is known, or assumed, to repeat.
+    """Predict a piston's motion, assuming that it repeats one period plus a drift.
 
-    `reference` (period,) is that period; `seen` (m,) the samples since, from phase 0; `horizon` the
-    number of samples to come. seen - reference is a straight line where the drift changed once, at
-    the trim. From `shortest` samples on the line is extrapolated, by its own length at most,
+    `reference` (period,) is that period; `samples` (m,) those since, from phase 0; `horizon` the
+    number of samples to come. samples - reference is a straight line where the drift changed once,
+    at the trim. From `shortest` samples on the line is extrapolated, by its own length at most,
     because the slope of a short line is inaccurate.
     """
-    period, m = len(reference), len(seen)
+    period, m = len(reference), len(samples)
     stride = max(1, min(period, m) // 500)
-    past = np.arange(m - 1, -1, -stride)[::-1]
-    apart = seen[past] - reference[past % period]
-    known = np.isfinite(apart)
-    shift = float(np.mean(apart[known][-20:])) if known.any() else 0.0
+    indices = np.arange(m - 1, -1, -stride)[::-1]
+    deviation = samples[indices] - reference[indices % period]
+    arrived = np.isfinite(deviation)
+    shift = float(np.mean(deviation[arrived][-20:])) if arrived.any() else 0.0
     slope = 0.0
-    if m >= shortest and np.count_nonzero(known) > 2:
-        since = past[known] - np.mean(past[known])
-        slope = rate * float(since @ apart[known] / (since @ since))
+    if m >= shortest and np.count_nonzero(arrived) > 2:
+        time = indices[arrived] - np.mean(indices[arrived])
+        slope = rate * float(time @ deviation[arrived] / (time @ time))
     reach = max(1, min(horizon, m))
-    ahead = np.arange(0, reach, max(1, reach // 1000))
-    path = reference[(m + ahead) % period] + shift + slope * ahead / rate
+    future = np.arange(0, reach, max(1, reach // 1000))
+    path = reference[(m + future) % period] + shift + slope * future / rate
     return BiasForecast(float(np.fmin.reduce(path)), float(np.fmax.reduce(path)), slope, shift)
 
 

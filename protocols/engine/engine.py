@@ -45,7 +45,7 @@ def run(
     bench.listen(runner.inputs.control.accept)
     machine.to(EngineState.IDLE, "the plan is proved")
     try:
-        _all(plan, runner)
+        _run_steps(plan, runner)
         runner.report_phase(plan.sequence[-1].name, "done", 0, 0, f"{runner.records} records")
     except SafetyTrip as trip:
         _trip(plan, runner, trip)
@@ -58,49 +58,49 @@ def _nobody(step: str, phase: str, repeat: int, repeats: int, message: str) -> N
     log.debug("%s %s %d/%d %s", step, phase, repeat, repeats, message)
 
 
-def _all(plan: Plan, runner: PlanRunner) -> None:
+def _run_steps(plan: Plan, runner: PlanRunner) -> None:
     """Run the steps; failed ones are skipped or retried as the protocol allows."""
-    skipped, lost = 0, 0
+    skipped, attempts = 0, 0
     rule, retry = plan.protocol.on_error, plan.protocol.retry
-    waiting: Sequence[PlannedStep] = plan.sequence
-    while waiting:
-        part = waiting[0]
-        runner.begin(part, waiting[1:])
+    pending: Sequence[PlannedStep] = plan.sequence
+    while pending:
+        step = pending[0]
+        runner.begin(step, pending[1:])
         try:
-            runner.do(part)
+            runner.do(step)
         except DeviceLost as error:
-            lost = _reconnect(runner, error, retry, lost)
+            attempts = _reconnect(runner, error, retry, attempts)
             continue
         except RunEnded:
             raise
         except ProtocolAborted as error:
-            runner.rest_now(f"{part.name} failed")
+            runner.rest_now(f"{step.name} failed")
             if rule.then != "skip" or skipped >= rule.at_most:
                 raise
             skipped += 1
-            runner.mark(rule.mark or f"{part.name} is skipped: {error}")
-            log.warning("%s is skipped: %s", part.name, error)
-        waiting = waiting[1:]
+            runner.mark(rule.mark or f"{step.name} is skipped: {error}")
+            log.warning("%s is skipped: %s", step.name, error)
+        pending = pending[1:]
 
 
-def _reconnect(runner: PlanRunner, error: DeviceLost, retry: Retry | None, lost: int) -> int:
-    """Zero the outputs and reconnect; return the attempts of the whole run, of which `lost` before.
+def _reconnect(runner: PlanRunner, error: DeviceLost, retry: Retry | None, attempts: int) -> int:
+    """Zero the outputs and reconnect; return `attempts` in the whole run, with those made here.
 
     Raises DeviceLost where no attempt is left.
     """
-    while retry is not None and lost < retry.times:
-        lost += 1
-        left = retry.times - lost
-        log.warning("%s; connecting again in %g s, %d more allowed", error, retry.wait, left)
+    while retry is not None and attempts < retry.times:
+        attempts += 1
+        remaining = retry.times - attempts
+        log.warning("%s; connecting again in %g s, %d more allowed", error, retry.wait, remaining)
         runner.rest_now("the device was lost", confirmed=False)
-        runner.bench.event("device lost", runner.bench.tick, message=str(error), retries=left)
+        runner.bench.event("device lost", runner.bench.tick, message=str(error), retries=remaining)
         try:
             runner.reconnect(retry.wait)
         except DeviceLost as again:  # a device that restarts may need longer than one wait
             error = again
             continue
         runner.bench.event("device back", runner.bench.tick)
-        return lost
+        return attempts
     raise error
 
 
@@ -114,10 +114,10 @@ def _trip(plan: Plan, runner: PlanRunner, trip: SafetyTrip) -> None:
 def _make_safe(runner: PlanRunner) -> None:
     """Zero the outputs and note it; without the device's confirmation the state is unchanged."""
     try:
-        sure = runner.bench.zero_outputs()
+        confirmed = runner.bench.zero_outputs()
     except DeviceError as error:
         log.error("%s", error)
-        sure = False
-    if sure:
+        confirmed = False
+    if confirmed:
         with suppress(RecordingFailed):
             runner.machine.to(EngineState.SAFE, "outputs confirmed at zero")

@@ -44,17 +44,17 @@ class ExcitationRun:
         place: Place,
         step: StepPlan,
         engine: ExcitationEngine,
-        first: int = 1,
+        first_repeat: int = 1,
         attributes: Mapping[str, str] | None = None,
     ) -> None:
-        """Number the records from `first`; `attributes` are kept with each."""
+        """Number the records from `first_repeat`; `attributes` are stored with each."""
         self.session = session
         self.place = place
         self.step = step
         self.taken = 0  # complete records
         self._engine = engine
-        self._first = first
-        self._more = dict(attributes or {})
+        self._first = first_repeat
+        self._extra = dict(attributes or {})
         self._hold = Hold(step.name, step.settle, step.record / session.rate)
         self.locks: list[JointLock] = []
 
@@ -72,21 +72,21 @@ class ExcitationRun:
         self._stop(excitation)
         return complete
 
-    def move_until(self, done: Callable[[], bool], most: float) -> bool:
-        """Excite without records until `done`; return False after `most` seconds or a stop."""
+    def move_until(self, reached: Callable[[], bool], longest: float) -> bool:
+        """Excite without records until `reached()`; False after `longest` seconds or a stop."""
         excitation = self._start()
         excitation.hold()
-        began, good = self.session.now, done()
-        while not good and not self._engine.interrupted:
-            if self.session.now - began >= most * self.session.rate:
+        began, stop = self.session.now, reached()
+        while not stop and not self._engine.interrupted:
+            if self.session.now - began >= longest * self.session.rate:
                 break
             excitation.go_on(ENGINE.look_seconds)
-            good = done()
+            stop = reached()
         self._stop(excitation)
-        return good
+        return stop
 
     def _start(self) -> Playback:
-        """Place, lock and let the waveforms grow."""
+        """Position and lock the joints, and let the waveforms grow."""
         self._engine.machine.to(EngineState.HOMING, self.step.name)
         self.session.bench.guard(self._roles(moving=True))
         nulls = self._place()
@@ -122,9 +122,9 @@ class ExcitationRun:
         where = ", ".join(f"joint {j + 1} to {1e3 * s:g} mm" for j, s in targets.items())
         self.report_phase("place", where)
         self.session.wait(0.01)  # to obtain the device's time
-        # They are centred again when they move: half of the offset allowed then is enough here.
-        near = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
-        tolerance = max(self.place.tolerance, near)
+        # They are centred again once excited: half of the offset allowed then is enough here.
+        half_offset = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
+        tolerance = max(self.place.tolerance, half_offset)
         settle, name = self.step.settle, self.step.name
         return move(self.session, targets, self.place, tolerance, settle, name)
 
@@ -167,7 +167,7 @@ class ExcitationRun:
         self.report_phase(
             "record", f"record {repeat} of {self._first - 1 + self.step.repeats}", repeat
         )
-        first, driven = excitation.at, excitation.joints
+        first, driven = excitation.boundary, excitation.joints
         meta = self._meta(repeat)
         with self.session.bench.record(meta, start_tick=first, ticks=self.step.record) as record:
             if not excitation.record():
@@ -178,7 +178,7 @@ class ExcitationRun:
 
     def _meta(self, repeat: int) -> RecordMeta:
         attributes: dict[str, str | float | int] = {
-            **{f"parameter_{name}": value for name, value in self._more.items()},
+            **{f"parameter_{name}": value for name, value in self._extra.items()},
             "excited": " ".join(str(e.joint + 1) for e in self.step.excite),
         }
         for e in self.step.excite:
@@ -215,17 +215,18 @@ class ExcitationRun:
         return attributes
 
     def _relock(self, excitation: Playback) -> bool:
-        """Close a valve again whose piston crept; return whether there was one."""
+        """Close again each valve whose piston crept too far; return whether there was one."""
         changed = False
         for n, held in enumerate(self.locks):
             if held.at != CLOSED:
                 continue
             first = self.session.now - self.step.period
-            off = placement(self.session, held.joint, first, self.session.now).piston - held.piston
-            if abs(off) <= ENGINE.relock_share * held.tolerance:
+            reading = placement(self.session, held.joint, first, self.session.now)
+            creep = reading.piston - held.piston
+            if abs(creep) <= ENGINE.relock_share * held.tolerance:
                 continue
             self.report_phase(
-                "lock", f"joint {held.joint + 1} crept {1e3 * off:.2f} mm; closed anew"
+                "lock", f"joint {held.joint + 1} crept {1e3 * creep:.2f} mm; closed anew"
             )
             plan = next(part for part in self.step.locks if part.joint == held.joint)
             excitation.hold()

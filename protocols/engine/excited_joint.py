@@ -63,22 +63,23 @@ def found_under_loop(
     The drift is exact over two whole periods, else from the fit of `follow`. Raises ProtocolAborted
     for a piston that does not follow its command.
     """
-    seen = follow(command, piston, rate)
-    if not seen.gain > 0.0:
+    response = follow(command, piston, rate)
+    if not response.gain > 0.0:
         raise ProtocolAborted(
             f"{step}: joint {driven.joint + 1} does not follow its command: "
-            f"{np.nanstd(command):.3g} V (rms) move the piston by {seen.gain:.3g} m/s per volt, "
-            "expected more than 0; is the pump on, and the valve connected the right way round?"
+            f"{np.nanstd(command):.3g} V (rms) move the piston by {response.gain:.3g} m/s per "
+            "volt, expected more than 0; is the pump on, and the valve connected the right way "
+            "round?"
         )
     if len(piston) >= 2 * period:
         moved = motion(piston, period, rate)
-        bias = float(np.nanmean(command[-period:])) - moved.drift / seen.gain
+        bias = float(np.nanmean(command[-period:])) - moved.drift / response.gain
     else:
-        moved = moved_by(piston, seen.drift, rate)
-        bias = seen.null
-    log.info("%s: joint %d moves %.4f m/s per volt, null %.4f V", step, driven.joint + 1, seen.gain,
-             bias)  # fmt: skip
-    return replace(driven, bias=bias, gain=seen.gain, moved=moved)
+        moved = moved_by(piston, response.drift, rate)
+        bias = response.null
+    log.info("%s: joint %d moves %.4f m/s per volt, null %.4f V", step, driven.joint + 1,
+             response.gain, bias)  # fmt: skip
+    return replace(driven, bias=bias, gain=response.gain, moved=moved)
 
 
 def off_centre(driven: ExcitedJoint) -> float:
@@ -103,21 +104,21 @@ def check_swing(
 
 def settled(driven: ExcitedJoint, moved: Motion, record: float, step: str) -> bool:
     """Return whether offset and drift over a record of `record` seconds are within limits."""
-    off = moved.ends - driven.plan.centre
+    offset = moved.ends - driven.plan.centre
     log.info(
-        "%s: joint %d at bias %.4f V drifts %.3f mm/s (asked %.3f), centre off by %.2f mm",
-        step, driven.joint + 1, driven.bias, 1e3 * moved.drift, 1e3 * driven.target, 1e3 * off,
+        "%s: joint %d at bias %.4f V drifts %.3f mm/s (target %.3f), centre off by %.2f mm",
+        step, driven.joint + 1, driven.bias, 1e3 * moved.drift, 1e3 * driven.target, 1e3 * offset,
     )  # fmt: skip
-    wrong = abs(moved.drift - driven.target) * record
-    return wrong <= driven.centring.drift and abs(off) <= driven.centring.offset
+    error = abs(moved.drift - driven.target) * record
+    return error <= driven.centring.drift and abs(offset) <= driven.centring.offset
 
 
 def trimmed(driven: ExcitedJoint, moved: Motion, seconds: float, gently: bool) -> ExcitedJoint:
     """Return the joint with the bias for its next `seconds`; `gently` where that is a record."""
     if driven.loop > 0.0:
         # The loop's steady offset is what it adds to the bias: move it into the bias.
-        off = moved.mean - driven.plan.centre
-        bias = driven.bias - driven.loop * off - moved.drift / driven.gain
+        offset = moved.mean - driven.plan.centre
+        bias = driven.bias - driven.loop * offset - moved.drift / driven.gain
         return replace(driven, bias=bias, moved=moved)
     cap = ENGINE.recentre_cap * driven.centring.drift if gently else math.inf
     target = recentring(moved, driven.plan.centre, seconds, cap)
@@ -129,7 +130,7 @@ def corrected(
     driven: ExcitedJoint,
     reference: Array,
     other_law: bool,
-    seen: Array,
+    samples: Array,
     horizon: int,
     rate: float,
     limits: tuple[float, float],
@@ -137,27 +138,27 @@ def corrected(
 ) -> ExcitedJoint | None:  # fmt: skip
     """Return the joint with a bias that keeps it within `limits` [m], None if none is needed.
 
-    `reference`, `seen` and `horizon` are those of `forecast`; `other_law` states that the reference
-    was measured under another law. The piston is moved to be centred at the end of the period.
+    `reference`, `samples` and `horizon` are those of `forecast`; `other_law` states that the
+    reference was measured under another law. The new bias centres the piston at the period's end.
     """
     if driven.loop > 0.0:
         return None
     # Under another law the reference has another shape, whose difference looks like a drift until a
     # whole period has passed; its own drift is also different.
     shortest = len(reference) if other_law else max(ENGINE.shortest_line, len(reference) // 10)
-    ahead = forecast(reference, seen, horizon, rate, shortest)
-    if not leaves(ahead, *limits):
+    expected = forecast(reference, samples, horizon, rate, shortest)
+    if not leaves(expected, *limits):
         return None
-    rest = len(reference) - len(seen) % len(reference)
-    off = float(np.nanmean(reference)) + ahead.shift - driven.plan.centre
-    back = -off / max(ENGINE.shortest_return, rest / rate)
-    back = float(np.clip(back, -ENGINE.fastest_return, ENGINE.fastest_return))
-    drift = ahead.slope + (0.0 if other_law else driven.moved.drift)
+    remaining = len(reference) - len(samples) % len(reference)
+    offset = float(np.nanmean(reference)) + expected.shift - driven.plan.centre
+    speed = -offset / max(ENGINE.shortest_return, remaining / rate)
+    speed = float(np.clip(speed, -ENGINE.fastest_return, ENGINE.fastest_return))
+    drift = expected.slope + (0.0 if other_law else driven.moved.drift)
     log.warning(
         "%s: joint %d would reach %.1f..%.1f mm; its bias is corrected at once",
-        step, driven.joint + 1, 1e3 * ahead.low, 1e3 * ahead.high,
+        step, driven.joint + 1, 1e3 * expected.low, 1e3 * expected.high,
     )  # fmt: skip
-    return replace(driven, bias=trim(driven.bias, drift, back, driven.gain), target=back)
+    return replace(driven, bias=trim(driven.bias, drift, speed, driven.gain), target=speed)
 
 
 def returned(driven: ExcitedJoint) -> ExcitedJoint:

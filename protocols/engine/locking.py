@@ -64,7 +64,7 @@ def move(
     settle: float,
     step: str,
 ) -> dict[int, float]:
-    """Bring joints (0-based) to their places +- tolerance [m], hold them; returns their nulls [V].
+    """Move pistons to `targets` [m] by joint (0-based), within `tolerance` [m]; return nulls [V].
 
     The null is the command that kept the piston still while it was in place for `settle`
     seconds; the position laws stay in force. Raises ProtocolAborted after `place.timeout`.
@@ -74,32 +74,33 @@ def move(
     began, still_since = session.now, session.now
     while True:
         first = session.wait(ENGINE.look_seconds)
-        seen = {j: placement(session, j, first, session.now) for j in targets}
-        late = {j for j in targets if not _in_place(seen[j], targets[j], tolerance)}
-        if late:
+        readings = {j: placement(session, j, first, session.now) for j in targets}
+        outside = {j for j in targets if not _in_place(readings[j], targets[j], tolerance)}
+        if outside:
             still_since = session.now
         elif session.now - still_since >= settle * session.rate:
             return {j: placement(session, j, still_since, session.now).command for j in targets}
-        # Only the error of a piston at rest is due to a missing command; others are still moving.
-        stuck = {j for j in late if abs(seen[j].speed) < ENGINE.rocking_speed}
+        # Integrate only where the piston is at rest; others are still moving.
+        stuck = {j for j in outside if abs(readings[j].speed) < ENGINE.rocking_speed}
         for j in stuck:
-            biases[j] += ENGINE.integral_share * place.position_gain * (targets[j] - seen[j].piston)
+            error = targets[j] - readings[j].piston
+            biases[j] += ENGINE.integral_share * place.position_gain * error
             biases[j] = float(np.clip(biases[j], -place.limit, place.limit))
         if stuck:
             session.apply({j: position_law(place, targets[j], biases[j]) for j in stuck})
         if session.now - began > place.timeout * session.rate:
-            j = min(late, default=min(targets))
+            j = min(outside, default=min(targets))
             raise ProtocolAborted(
                 f"{step}: joint {j + 1} did not reach its place within {place.timeout:g} s: "
-                f"piston measured at {1e3 * seen[j].piston:.2f} mm "
-                f"(moving {1e3 * seen[j].speed:.2f} mm/s), "
+                f"piston measured at {1e3 * readings[j].piston:.2f} mm "
+                f"(moving {1e3 * readings[j].speed:.2f} mm/s), "
                 f"expected {1e3 * targets[j]:.2f} mm +- {1e3 * tolerance:g} mm; "
                 "is the pump on, and the valve connected the right way round?"
             )
 
 
-def _in_place(seen: PlacementReading, target: float, tolerance: float) -> bool:
-    return abs(seen.piston - target) <= tolerance and abs(seen.speed) <= ENGINE.rocking_speed
+def _in_place(reading: PlacementReading, target: float, tolerance: float) -> bool:
+    return abs(reading.piston - target) <= tolerance and abs(reading.speed) <= ENGINE.rocking_speed
 
 
 @dataclass(frozen=True)
@@ -140,24 +141,25 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     session.apply({plan.joint: OutputLaw(0.0, push, place.position_gain, plan.piston, place.limit)})
     began, still_since = session.now, session.now
     while session.now - still_since < hold.settle * session.rate:
-        seen = placement(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
-        if abs(seen.piston - plan.piston) > plan.tolerance or abs(seen.speed) > ENGINE.still_speed:
+        reading = placement(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
+        off = abs(reading.piston - plan.piston) > plan.tolerance
+        if off or abs(reading.speed) > ENGINE.still_speed:
             still_since = session.now
         if session.now - began > place.timeout * session.rate:
             raise LockFailed(
                 hold.step,
                 plan.joint + 1,
                 f"did not reach its end stop ({plan.at}) within {place.timeout:g} s",
-                seen.piston,
+                reading.piston,
                 f"{1e3 * plan.piston:.2f} mm +- {1e3 * plan.tolerance:g} mm",
             )
     law = OutputLaw(bias=push, limit=abs(push))
     session.apply({plan.joint: law})
     first = session.wait(hold.settle)
-    stands = placement(session, plan.joint, first, session.now).piston
-    held = JointLock(plan.joint, plan.at, stands, law, plan.tolerance)
+    position = placement(session, plan.joint, first, session.now).piston
+    held = JointLock(plan.joint, plan.at, position, law, plan.tolerance)
     verify(session, held, hold.step, first, session.now)
-    log.info("%s: joint %d held at %s, %.2f mm", hold.step, plan.joint + 1, plan.at, 1e3 * stands)
+    log.info("%s: joint %d held at %s, %.2f mm", hold.step, plan.joint + 1, plan.at, 1e3 * position)
     return held
 
 
@@ -169,28 +171,28 @@ def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     """
     joint, target = plan.joint, {plan.joint: plan.piston}
     null = move(session, target, place, place.tolerance, hold.settle, hold.step)[joint]
-    seen = _stand(session, joint, OFF, hold)
-    creep = abs(seen.speed) * hold.record
-    log.info("%s: joint %d closed creeps %.3f mm/s", hold.step, joint + 1, 1e3 * seen.speed)
-    if creep <= ENGINE.creep_share * plan.tolerance and _near(seen, plan):
-        return JointLock(joint, plan.at, seen.piston, OFF, plan.tolerance)
+    reading = _measure_at_rest(session, joint, OFF, hold)
+    creep = abs(reading.speed) * hold.record
+    log.info("%s: joint %d closed creeps %.3f mm/s", hold.step, joint + 1, 1e3 * reading.speed)
+    if creep <= ENGINE.creep_share * plan.tolerance and _is_near(reading, plan):
+        return JointLock(joint, plan.at, reading.piston, OFF, plan.tolerance)
     law = position_law(place, plan.piston, null)
     log.warning("%s: joint %d creeps with its valve closed; its position loop holds it",
                 hold.step, joint + 1)  # fmt: skip
     move(session, target, place, place.tolerance, hold.settle, hold.step)
-    seen = _stand(session, joint, law, hold)
-    if not _near(seen, plan):
+    reading = _measure_at_rest(session, joint, law, hold)
+    if not _is_near(reading, plan):
         raise LockFailed(
             hold.step,
             joint + 1,
             "stays neither with its valve closed nor by its position loop",
-            seen.piston,
+            reading.piston,
             f"{1e3 * plan.piston:.2f} mm +- {1e3 * plan.tolerance:g} mm; does the valve leak?",
         )
-    return JointLock(joint, plan.at, seen.piston, law, plan.tolerance)
+    return JointLock(joint, plan.at, reading.piston, law, plan.tolerance)
 
 
-def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> PlacementReading:
+def _measure_at_rest(session: Session, joint: int, law: OutputLaw, hold: Hold) -> PlacementReading:
     """Apply a law, wait until the pressures settle, and measure for the same time again."""
     session.apply({joint: law})
     session.wait(hold.settle)
@@ -198,8 +200,8 @@ def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> Placemen
     return placement(session, joint, first, session.now)
 
 
-def _near(seen: PlacementReading, plan: LockPlan) -> bool:
-    return abs(seen.piston - plan.piston) <= 0.5 * plan.tolerance
+def _is_near(reading: PlacementReading, plan: LockPlan) -> bool:
+    return abs(reading.piston - plan.piston) <= 0.5 * plan.tolerance
 
 
 def lock_movement(session: Session, held: JointLock, first: int, last: int) -> float:

@@ -86,22 +86,22 @@ class Manual:
         low, high = self._rig.joints[joint].limits.piston
         margin = ENGINE.jog_margin * (high - low)
         target = high - margin if words == ["+"] else low + margin
-        here = self._piston[joint]
-        if np.isfinite(here) and (here >= target if words == ["+"] else here <= target):
+        piston = self._piston[joint]
+        if np.isfinite(piston) and (piston >= target if words == ["+"] else piston <= target):
             return (
-                f"jog: joint {joint + 1} stands at {1e3 * here:.1f} mm; a jog this way ends at "
+                f"jog: joint {joint + 1} stands at {1e3 * piston:.1f} mm; a jog this way ends at "
                 f"{1e3 * target:.1f} mm"
             )
         self._jog, self._until = (joint, target), self._clock() + ENGINE.jog_hold
         return None
 
     def _lock(self, joint: int, words: list[str]) -> str | None:
-        here = float(self._piston[joint])
-        if not np.isfinite(here):
+        piston = float(self._piston[joint])
+        if not np.isfinite(piston):
             return f"lock: where the piston of joint {joint + 1} stands is not known"
         if self._jog is not None and self._jog[0] == joint:
             self._jog = None
-        self._locked[joint] = here
+        self._locked[joint] = piston
         return None
 
     def _unlock(self, joint: int, words: list[str]) -> str | None:
@@ -135,10 +135,10 @@ class Manual:
         """Apply laws and roles if they have changed."""
         laws, roles = [], []
         for joint in range(len(self._rig.joints)):
-            at = self._locked.get(joint)
-            if at is not None:
-                laws.append(position_law(self._place, at, 0.0))
-                roles.append(JointRole(locked_at=at, tolerance=ENGINE.manual_tolerance))
+            position = self._locked.get(joint)
+            if position is not None:
+                laws.append(position_law(self._place, position, 0.0))
+                roles.append(JointRole(locked_at=position, tolerance=ENGINE.manual_tolerance))
                 continue
             moving = self._jog is not None and self._jog[0] == joint
             law = position_law(self._jogging, self._jog[1], 0.0) if moving and self._jog else OFF

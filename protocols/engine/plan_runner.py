@@ -84,8 +84,8 @@ class PlanRunner:
         """Return the expected remaining time [s]; conditions count with their least time."""
         if self._part is None:
             return self._later_seconds
-        own = self._part.seconds - (self.elapsed - self._part_began)
-        return self._later_seconds + max(0.0, own)
+        remaining = self._part.seconds - (self.elapsed - self._part_began)
+        return self._later_seconds + max(0.0, remaining)
 
     def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         """Report a phase and the expected end of the run."""
@@ -137,14 +137,15 @@ class PlanRunner:
         (step,) = planned.excitations
         done = self._judge(condition)
         self.session.wait(ENGINE.look_seconds)
-        left = most
+        remaining = most
         while not done():
             began = self.elapsed
-            if left <= 0.0:
+            if remaining <= 0.0:
                 return False
-            good = ExcitationRun(self.session, self._place, step, self).move_until(done, left)
-            left -= self.elapsed - began
-            if good or self._skipped(step.name):
+            running = ExcitationRun(self.session, self._place, step, self)
+            reached = running.move_until(done, remaining)
+            remaining -= self.elapsed - began
+            if reached or self._skipped(step.name):
                 return True
             if self.interrupted:
                 self._safe_point()
@@ -165,7 +166,7 @@ class PlanRunner:
         self.machine.to(EngineState.LOCKED, "valves closed")
         self.session.off()
         if planned.step.name is None:
-            self._pass(seconds)
+            self._wait_at_rest(seconds)
         else:
             self._record_at_rest(planned, seconds)
         self.rest_now(f"{planned.name} is over")
@@ -203,12 +204,12 @@ class PlanRunner:
     def rest(self, seconds: float, why: str) -> None:
         """Let time pass with all outputs at zero."""
         self.rest_now(why)
-        self._pass(seconds)
+        self._wait_at_rest(seconds)
 
     def wait(self, condition: Condition, most: float) -> bool:
         """Rest until a condition holds; False after `most` seconds."""
         self.rest_now(f"waiting for {condition.text}")
-        return self._pass(most, self._judge(condition))
+        return self._wait_at_rest(most, self._judge(condition))
 
     def ask(self, question: Question) -> str:
         """Ask a person, outputs at zero; return the answer, or the default if unattended.
@@ -258,20 +259,20 @@ class PlanRunner:
                 self.do(part)
             if condition.estimates:
                 self._await_estimates()
-            good = self._judge(condition)()
-            verdict = "holds" if good else "does not hold"
+            fulfilled = self._judge(condition)()
+            verdict = "holds" if fulfilled else "does not hold"
             text = f"{condition.text} {verdict} after round {number}: {self.readings(condition)}"
             self.mark(text)
             self.report_phase(planned.name, "repeat", number, rounds, text)
-            if good:
+            if fulfilled:
                 return True
         return False
 
     def _await_estimates(self) -> None:
         """Wait, in wall time, until the parallel estimator has the last record."""
-        until = time.monotonic() + ENGINE.estimate_seconds
+        deadline = time.monotonic() + ENGINE.estimate_seconds
         while not self.inputs.estimates.complete(self._last_record):
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 log.warning("the estimator does not keep up; its last estimates count")
                 return
             self.session.wait(ENGINE.look_seconds)
@@ -338,7 +339,7 @@ class PlanRunner:
         self.report_phase(name, "skip", 0, 0, "skipped by a person")
         return True
 
-    def _pass(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
+    def _wait_at_rest(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
         """Wait at rest; return True when `done`, or a person wants to continue; else False."""
         began = self.elapsed
         self.session.wait(min(ENGINE.look_seconds, seconds))
@@ -347,10 +348,10 @@ class PlanRunner:
                 return True
             if self.inputs.control.requests.pause and self.machine.state is EngineState.IDLE:
                 self._safe_point()
-            left = seconds - (self.elapsed - began)
-            if left <= 0.5 / self.session.rate:
+            remaining = seconds - (self.elapsed - began)
+            if remaining <= 0.5 / self.session.rate:
                 return False
-            self.session.wait(min(ENGINE.look_seconds, left))
+            self.session.wait(min(ENGINE.look_seconds, remaining))
         return True
 
     def _judge(self, condition: Condition | None) -> Callable[[], bool]:
@@ -371,7 +372,7 @@ class PlanRunner:
         first = max(0, self.session.now - round(ENGINE.look_seconds * self.session.rate))
         for name in condition.names:
             if name in self.session.rig.recorded:
-                seen = self.session.channel(name, first, self.session.now)
-                known = seen[np.isfinite(seen)]
-                values[name] = float(np.mean(known)) if len(known) else math.nan
+                samples = self.session.channel(name, first, self.session.now)
+                finite = samples[np.isfinite(samples)]
+                values[name] = float(np.mean(finite)) if len(finite) else math.nan
         return values

@@ -31,7 +31,7 @@ from protocols.steps.plans import FIRM_SECONDS, StepPlan
 
 
 class Playback:
-    """One step's excitation in progress; `at` is the tick of the last boundary."""
+    """One step's excitation in progress; `boundary` is the tick of the last one."""
 
     def __init__(
         self, session: Session, step: StepPlan, place: Place, locks: Sequence[JointLock]
@@ -42,8 +42,8 @@ class Playback:
         self.locks = tuple(locks)
         self.joints: tuple[ExcitedJoint, ...] = ()
         self.start = 0
-        self.at = 0
-        self._alone = True  # the period before ran under other laws than this one
+        self.boundary = 0
+        self._after_other_law = True  # the last period ran under another law than this one
         self._references: list[Array] = []  # the last undisturbed period of each joint
         self._checked = 0  # locks are verified up to this tick
 
@@ -69,7 +69,7 @@ class Playback:
         self.go_on(0.5 * FIRM_SECONDS)
         self._loosen(firm)
         passed = self.session.now - self.start
-        self.at = self.start + math.ceil(passed / self.step.period) * self.step.period
+        self.boundary = self.start + math.ceil(passed / self.step.period) * self.step.period
         for _ in range(ENGINE.warm_ups):
             self.hold()
             self._advance(self.step.warm_up)
@@ -90,14 +90,14 @@ class Playback:
         self._release()
         for _ in range(self.step.tries + 1):
             self._play()
-            moved = self._stretch(self.step.trial)
+            moved = self._play_through(self.step.trial)
             if moved is None:
                 continue
             pairs = list(zip(self.joints, moved, strict=True))
-            good = all(settled(d, m, record, self.step.name) for d, m in pairs)
-            seconds = record if good else self.step.trial / self.session.rate
-            self.joints = tuple(trimmed(d, m, seconds, good) for d, m in pairs)
-            if good:
+            centred = all(settled(d, m, record, self.step.name) for d, m in pairs)
+            seconds = record if centred else self.step.trial / self.session.rate
+            self.joints = tuple(trimmed(d, m, seconds, centred) for d, m in pairs)
+            if centred:
                 return
         worst = max(self.joints, key=lambda d: abs(d.moved.ends - d.plan.centre))
         raise not_centred(worst, record, self.step.tries + 1, self.step.name)
@@ -116,18 +116,18 @@ class Playback:
         }
         before = {j: self._off_path(j, path) for j, path in paths.items()}
         allowed = {d.joint: ENGINE.released_share * d.centring.offset for d in self.joints}
-        if all(abs(off) <= 2 * allowed[j] for j, off in before.items()):
+        if all(abs(distance) <= 2 * allowed[j] for j, distance in before.items()):
             return
         laws = {d.joint: self._law(d, 1.0, 0.0) for d in self.joints}
-        while before and self.session.now < self.at + period:
+        while before and self.session.now < self.boundary + period:
             self.go_on(ENGINE.ramp_step)
-            for j, off in list(before.items()):
-                now = self._off_path(j, paths[j])
-                if abs(now) <= allowed[j] or now * off < 0.0:
+            for j, distance in list(before.items()):
+                present = self._off_path(j, paths[j])
+                if abs(present) <= allowed[j] or present * distance < 0.0:
                     self.session.apply({j: laws[j]})
                     del before[j]
         self.session.apply({j: laws[j] for j in before})
-        self._advance(math.ceil((self.session.now - self.at) / period) * period)
+        self._advance(math.ceil((self.session.now - self.boundary) / period) * period)
         self._references = [
             paths.get(d.joint, reference)
             for d, reference in zip(self.joints, self._references, strict=True)
@@ -145,7 +145,7 @@ class Playback:
         The biases are then trimmed by its motion for the next one.
         """
         self._play()
-        moved = self._stretch(self.step.record)
+        moved = self._play_through(self.step.record)
         if moved is None:
             return False
         seconds = self.step.record / self.session.rate
@@ -156,14 +156,14 @@ class Playback:
 
     def hold(self) -> None:
         """Centre by the slow loop, until the next trial."""
-        self._play(loop=self._loose())
-        self._alone = True
+        self._play(loop=self._slow_gain())
+        self._after_other_law = True
 
     def resume(self, locks: Sequence[JointLock]) -> None:
         """Continue at the next boundary, with renewed locks."""
         self.locks = tuple(locks)
         self._checked = self.session.now
-        behind = self.session.now - self.at
+        behind = self.session.now - self.boundary
         self._advance(math.ceil(behind / self.step.period) * self.step.period)
 
     def stop(self) -> None:
@@ -193,14 +193,14 @@ class Playback:
 
     def _loosen(self, firm: float) -> None:
         """Lower the position gain to the slow loop's, no faster than the loop settles."""
-        loop, loose = firm, self._loose()
+        loop, loose = firm, self._slow_gain()
         slowest = min(d.gain for d in self.joints)
         while loop * ENGINE.looser > loose:
             loop *= ENGINE.looser
             self._play(loop=loop)
             self.go_on(0.5 / (slowest * loop))
 
-    def _loose(self) -> float:
+    def _slow_gain(self) -> float:
         return min(d.centring.position_gain for d in self.joints)
 
     def go_on(self, seconds: float) -> None:
@@ -214,8 +214,8 @@ class Playback:
 
     def _advance(self, samples: int) -> None:
         """Continue to the boundary `samples` later, checking the locks."""
-        self.at += samples
-        self.session.until(self.at, self._watch_locks)
+        self.boundary += samples
+        self.session.until(self.boundary, self._watch_locks)
 
     def _find_biases(self, samples: int) -> None:
         """Compute each bias from the last `samples`, or the last two periods if those are fewer."""
@@ -233,36 +233,37 @@ class Playback:
             for driven in self.joints
         )
 
-    def _moved(self, driven: ExcitedJoint) -> Motion:
-        """Measure the last stretch of one joint."""
+    def _last_motion(self, driven: ExcitedJoint) -> Motion:
+        """Return the motion of one joint up to the last boundary."""
         j, period, rate = driven.joint, self.step.period, self.session.rate
-        if self._alone and self.step.trial < 2 * period:
-            piston = self.session.piston(j, self.at - period, self.at)
-            command = self.session.command(j, self.at - period, self.at)
+        if self._after_other_law and self.step.trial < 2 * period:
+            piston = self.session.piston(j, self.boundary - period, self.boundary)
+            command = self.session.command(j, self.boundary - period, self.boundary)
             return moved_by(piston, follow(command, piston, rate).drift, rate)
-        return motion(self.session.piston(j, self.at - 2 * period, self.at), period, rate)
+        piston = self.session.piston(j, self.boundary - 2 * period, self.boundary)
+        return motion(piston, period, rate)
 
     def _last_period(self) -> list[Array]:
-        first = self.at - self.step.period
-        return [self.session.piston(d.joint, first, self.at) for d in self.joints]
+        first = self.boundary - self.step.period
+        return [self.session.piston(d.joint, first, self.boundary) for d in self.joints]
 
-    def _stretch(self, samples: int) -> list[Motion] | None:
-        """Continue for whole periods; return how each joint moved.
+    def _play_through(self, samples: int) -> list[Motion] | None:
+        """Play `samples`, whole periods; return the motion of each joint.
 
         None if a piston was about to leave its limits: then the biases were changed at once, and
         the stretch ended with the period begun.
         """
-        first, last = self.at, self.at + samples
-        while self.at < last:
-            self._advance(min(last - self.at, round(ENGINE.look_ahead * self.session.rate)))
-            if self.at < last and self._correct(first, last):
-                past = (self.at - first) % self.step.period
-                self._advance(self.step.period - past if past else 0)
+        first, last = self.boundary, self.boundary + samples
+        while self.boundary < last:
+            self._advance(min(last - self.boundary, round(ENGINE.look_ahead * self.session.rate)))
+            if self.boundary < last and self._correct(first, last):
+                elapsed = (self.boundary - first) % self.step.period
+                self._advance(self.step.period - elapsed if elapsed else 0)
                 self.joints = tuple(returned(d) for d in self.joints)
-                self._alone = True
+                self._after_other_law = True
                 return None
-        moved = [self._moved(driven) for driven in self.joints]
-        self._alone = False
+        moved = [self._last_motion(driven) for driven in self.joints]
+        self._after_other_law = False
         self._references = self._last_period()
         return moved
 
@@ -272,9 +273,9 @@ class Playback:
             corrected(
                 driven,
                 reference,
-                self._alone,
-                self.session.piston(driven.joint, first, self.at),
-                last - self.at,
+                self._after_other_law,
+                self.session.piston(driven.joint, first, self.boundary),
+                last - self.boundary,
                 self.session.rate,
                 self.session.rig.joints[driven.joint].limits.piston,
                 self.step.name,

@@ -135,10 +135,10 @@ class Session:
             more = tick - self.now > self.bench.info.block_samples
             block = self.bench.exchange(more)
             if block.tick > self.now:
-                lost = max(self.now, block.tick - len(self._ring))
-                self._ring[self._places(lost, block.tick)] = np.nan
+                gap_start = max(self.now, block.tick - len(self._ring))
+                self._ring[self._indices(gap_start, block.tick)] = np.nan
             self.now = block.tick + len(block.data)
-            self._ring[self._places(block.tick, self.now)] = block.data
+            self._ring[self._indices(block.tick, self.now)] = block.data
             if watch is not None:
                 watch()
 
@@ -156,14 +156,14 @@ class Session:
         """Return a channel by its name over ticks [first, last), NaN where lost."""
         column, oldest = self._columns[name], self.now - len(self._ring)
         if oldest <= first and last <= self.now:
-            return self._ring[self._places(first, last), column].copy()  # the ring is overwritten
+            return self._ring[self._indices(first, last), column].copy()  # the ring is overwritten
         begin, end = max(first, oldest), min(last, self.now)
         values = np.full(last - first, np.nan)
         if begin < end:
-            values[begin - first : end - first] = self._ring[self._places(begin, end), column]
+            values[begin - first : end - first] = self._ring[self._indices(begin, end), column]
         return values
 
-    def _places(self, first: int, last: int) -> slice | NDArray[np.int64]:
+    def _indices(self, first: int, last: int) -> slice | NDArray[np.int64]:
         """Return the indices of ticks [first, last) in the ring, a slice if contiguous."""
         size = len(self._ring)
         begin = first % size

@@ -84,7 +84,7 @@ class StateMachine:
         if state is self._state:
             return
         if state not in TRANSITIONS[self._state]:
-            raise RuntimeError(f"no way from state {self._state} to {state} ({why})")
+            raise RuntimeError(f"state {self._state} cannot change to {state} ({why})")
         before, self._state = self._state, state
         log.info("%s -> %s: %s", before, state, why)
         if self._listener is None:

@@ -49,8 +49,8 @@ class Scope:
 
     def changed(self, values: Mapping[str, Any], swept: bool = False) -> Scope:
         """Return the scope with other values."""
-        more = {name: str(value) for name, value in values.items()} if swept else {}
-        return Scope({**self.values, **values}, {**self.swept, **more})
+        as_text = {name: str(value) for name, value in values.items()} if swept else {}
+        return Scope({**self.values, **values}, {**self.swept, **as_text})
 
 
 # Returns each step as plain data, with `RawStep.places`.
@@ -86,7 +86,7 @@ class Expander:
             elif kind == "include":
                 expanded += self._included(item, where, scope)
             else:
-                expanded.append(self._plain(item, kind, where, scope))
+                expanded.append(self._step(item, kind, where, scope))
             if len(expanded) > MOST_STEPS:
                 self._too_many(where, len(expanded))
         return expanded
@@ -113,16 +113,16 @@ class Expander:
         def value_of(match: re.Match[str]) -> Any:
             return "$" if match["name"] is None else scope.values[match["name"]]
 
-        whole = _REFERENCE.fullmatch(data)
-        if whole is not None:
-            return value_of(whole)
+        reference = _REFERENCE.fullmatch(data)
+        if reference is not None:
+            return value_of(reference)
         return _REFERENCE.sub(lambda match: str(value_of(match)), data)
 
-    def _plain(self, item: Any, kind: str | None, where: Path, scope: Scope) -> RawStep:
+    def _step(self, item: Any, kind: str | None, where: Path, scope: Scope) -> RawStep:
         lines = {(): self._line(where), **self._below(where)}
         nested = isinstance(item, dict) and kind is not None and STEPS[kind].nests
-        own = {k: v for k, v in item.items() if k != "steps"} if nested else item
-        data = self.substituted(own, where, scope)
+        fields = {k: v for k, v in item.items() if k != "steps"} if nested else item
+        data = self.substituted(fields, where, scope)
         places: dict[Path, str] = {}
         if nested and "steps" in item:
             inner = self.steps(item["steps"], (*where, "steps"), scope)
@@ -151,28 +151,27 @@ class Expander:
         return repeated
 
     def _rows(self, over: Any, where: Path, scope: Scope) -> list[dict[str, Any]]:
-        """Return the value of each parameter, run by run; a row without any where none is right."""
-        place: Path = (*where, "sweep")
+        """Return the parameters' values for each run of a sweep; one empty row for invalid data."""
+        key: Path = (*where, "sweep")
         if isinstance(over, dict) and over and all(isinstance(v, list) for v in over.values()):
-            self._known(over, place, scope)
+            self._known(over, key, scope)
             for name, values in over.items():
                 if not values:
-                    self._note((*place, name), f"sweep {name}: an empty list")
-            full = {name: values for name, values in over.items() if values}
-            count = math.prod(map(len, full.values()))
+                    self._note((*key, name), f"sweep {name}: an empty list")
+            nonempty = {name: values for name, values in over.items() if values}
+            count = math.prod(map(len, nonempty.values()))
             if count > MOST_STEPS:
                 self._too_many(where, count)
-            return [dict(zip(full, row, strict=True)) for row in itertools.product(*full.values())]
+            rows = itertools.product(*nonempty.values())
+            return [dict(zip(nonempty, row, strict=True)) for row in rows]
         if isinstance(over, list) and over and all(isinstance(row, dict) for row in over):
             for number, row in enumerate(over):
-                self._known(row, (*place, number), scope)
+                self._known(row, (*key, number), scope)
                 if set(row) != set(over[0]):
                     text = "sweep: every row must state the same parameters"
-                    self._note((*place, number), text)
+                    self._note((*key, number), text)
             return over
-        self._note(
-            place, "sweep: expected lists of values by parameter, or a list of rows of values"
-        )
+        self._note(key, "sweep: expected lists of values by parameter, or a list of rows of values")
         return [{}]
 
     def _included(self, item: Any, where: Path, scope: Scope) -> list[RawStep]:
@@ -223,15 +222,15 @@ class Expander:
             where = where[:-1]
         return self.lines.get(where, 1)
 
-    def _at(self, where: Path) -> str:
+    def _location(self, where: Path) -> str:
         return f"{self.source}:{self._line(where)}"
 
     def _too_many(self, where: Path, count: int) -> None:
         text = f"{count} steps; expected at most {MOST_STEPS} in one protocol"
-        raise InputError(f"{self._at(where)}: {text}")
+        raise InputError(f"{self._location(where)}: {text}")
 
     def _note(self, where: Path, text: str) -> None:
-        problem = (self._line(where), f"{self._at(where)}: {text}")
+        problem = (self._line(where), f"{self._location(where)}: {text}")
         if problem not in self.problems:  # a sweep reads its steps for each value
             self.problems.append(problem)
 
@@ -265,15 +264,15 @@ def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
 
     Nested steps take the number of the step that they are in.
     """
-    taken = {name for s in steps if not s.included for name in _names(s.data)}
+    used = {name for s in steps if not s.included for name in _names(s.data)}
     unique = []
     for step in steps:
         names = _names(step.data) if step.included else []
         number, ending = 1, ""
-        while any(name + ending in taken for name in names):
+        while any(name + ending in used for name in names):
             number += 1
             ending = f"_{number}"
-        taken.update(name + ending for name in names)
+        used.update(name + ending for name in names)
         unique.append(replace(step, data=_renamed(step.data, ending)) if ending else step)
     return unique
 

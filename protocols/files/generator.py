@@ -50,16 +50,16 @@ def load_generator(path: Path, values: Mapping[str, Any]) -> Protocol:
         raise InputError(f"{path}: steps() raised {type(error).__name__}: {error}") from error
     if len(drawn) > MOST_STEPS:
         raise InputError(f"{path}: steps() yields more than {MOST_STEPS} steps, the most allowed")
-    plain = [step for step in drawn if not isinstance(step, StepKind)]
-    if len(plain) == len(drawn):
+    dictionaries = [step for step in drawn if not isinstance(step, StepKind)]
+    if len(dictionaries) == len(drawn):
         data = {**head, "parameters": parameters, "steps": drawn}
         return validate_model(Protocol, data, {}, str(path), {"folder": path.parent})
-    if plain:
+    if dictionaries:
         raise InputError(f"{path}: steps() yields objects and dictionaries; expected one of them")
-    first = {**head, "parameters": parameters, "steps": [{"mark": "to be replaced"}]}
-    made = validate_model(Protocol, first, {}, str(path), {"folder": path.parent})
+    placeholder = {**head, "parameters": parameters, "steps": [{"mark": "to be replaced"}]}
+    head_only = validate_model(Protocol, placeholder, {}, str(path), {"folder": path.parent})
     try:
-        return Protocol(**{**dict(made), "steps": tuple(drawn)})
+        return Protocol(**{**dict(head_only), "steps": tuple(drawn)})
     except ValueError as error:
         reason = str(error).splitlines()
         raise InputError(f"{path}: {reason[2].strip() if len(reason) > 2 else error}") from error

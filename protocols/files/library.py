@@ -22,7 +22,7 @@ from protocols.steps.base import StepKind
 from rig.model.parse import InputError, Problem, load_yaml, validate_model
 from rig.model.parse import Path as Keys
 
-_NOTHING = RawStep({"mark": "in place of steps that could not be read"}, {})
+_PLACEHOLDER = RawStep({"mark": "in place of steps that could not be read"}, {})
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -52,7 +52,7 @@ def read_protocol(
 
 
 def parsed_values(settings: Sequence[str]) -> dict[str, Any]:
-    """Return the values of `NAME=VALUE` texts as a file would state them; InputError if not so."""
+    """Return the values of `NAME=VALUE` texts as a file would state them; InputError otherwise."""
     values_by_name: dict[str, Any] = {}
     for setting in settings:
         name, equals, value = setting.partition("=")
@@ -101,30 +101,30 @@ def _protocol(
         raise InputError(f"{source}:{lines.get(('version',), 1)}: {later_version(version)}")
     declared = data.get("parameters") or {}
     steps: list[RawStep] = []
-    known: list[Problem] = []
+    problems: list[Problem] = []
     if isinstance(data.get("steps"), list) and isinstance(declared, dict):
         expander = Expander(source, lines, _Includes(folder, chain, source))
-        known = expander.problems
+        problems = expander.problems
         for name in values:
             if name not in declared:
-                known.append((0, f"{source}: {unknown_parameter(name, declared)}"))
+                problems.append((0, f"{source}: {unknown_parameter(name, declared)}"))
         scope = Scope({**declared, **{k: v for k, v in values.items() if k in declared}})
         steps = made_unique(expander.steps(data["steps"], ("steps",), scope))
-        if known and not steps:
-            steps = [_NOTHING]
-        plain = {key: data[key] for key in ("name", "description") if key in data}
-        head = {k: v for k, v in data.items() if k not in ("steps", "parameters", *plain)}
-        data = expander.substituted(head, (), scope) | plain
+        if problems and not steps:
+            steps = [_PLACEHOLDER]
+        texts = {key: data[key] for key in ("name", "description") if key in data}
+        head = {k: v for k, v in data.items() if k not in ("steps", "parameters", *texts)}
+        data = expander.substituted(head, (), scope) | texts
         data["parameters"] = dict(scope.values)
         data["steps"] = [step.data for step in steps]
         lines = {p: line for p, line in lines.items() if p[:1] != ("steps",) or len(p) == 1}
         for number, step in enumerate(steps):
             lines |= {("steps", number, *path): line for path, line in step.lines.items()}
-    context = {"folder": folder, INCOMPLETE: bool(known)}
-    made = validate_model(Protocol, data, lines, source, context, known)
+    context = {"folder": folder, INCOMPLETE: bool(problems)}
+    protocol = validate_model(Protocol, data, lines, source, context, problems)
     places = {("steps", k, *p): at for k, step in enumerate(steps) for p, at in step.places.items()}
-    _locate(made.steps, source, lines, places, ("steps",), 1)
-    return made, [step.data for step in steps]
+    _locate(protocol.steps, source, lines, places, ("steps",), 1)
+    return protocol, [step.data for step in steps]
 
 
 def _locate(
@@ -137,10 +137,10 @@ def _locate(
 ) -> None:
     """Set file and line of steps, nested ones too; `places` are those of included ones."""
     for number, step in enumerate(steps):
-        here = (*path, number)
-        own = lines.get(here, line)
-        step.locate(places.get(here, f"{source}:{own}"))
-        _locate(getattr(step, "steps", ()), source, lines, places, (*here, "steps"), own)
+        key = (*path, number)
+        step_line = lines.get(key, line)
+        step.locate(places.get(key, f"{source}:{step_line}"))
+        _locate(getattr(step, "steps", ()), source, lines, places, (*key, "steps"), step_line)
 
 
 def _places(step: StepKind, path: Keys = ()) -> Iterator[tuple[Keys, str]]:
@@ -164,12 +164,12 @@ class _Includes:
             text, shown, folder = _text(name, self._folder)
         except InputError as error:
             raise InputError(f"{self._source}:{line}: include: {error}") from error
-        same = [seen for seen in self._chain if _same_file(seen, shown)]
-        if same:
-            circle = " -> ".join((*self._chain[self._chain.index(same[0]) :], shown))
+        repeated = [seen for seen in self._chain if _same_file(seen, shown)]
+        if repeated:
+            circle = " -> ".join((*self._chain[self._chain.index(repeated[0]) :], shown))
             raise InputError(f"{self._source}:{line}: include: circular: {circle}")
-        made, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
-        places = (dict(_places(step)) for step in made.steps)
+        protocol, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
+        places = (dict(_places(step)) for step in protocol.steps)
         return list(zip(steps, places, strict=True))
 
 

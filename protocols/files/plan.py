@@ -116,15 +116,15 @@ def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) ->
             f"rig {rig.name!r} has {len(rig.joints)}; write one whose steps name each joint"
         )
     for joint in rig.joints:
-        near, stroke = changed.place.tolerance, joint.cylinder.stroke
+        tolerance, stroke = changed.place.tolerance, joint.cylinder.stroke
         if changed.place.limit > joint.limits.command:
             raise InputError(
                 f"protocol {changed.name!r}: place.limit {changed.place.limit:g} V is above "
                 f"the limit of joint {joint.name!r}, command {joint.limits.command:g} V"
             )
-        if near > LOCK_SHARE * stroke:
+        if tolerance > LOCK_SHARE * stroke:
             raise InputError(
-                f"protocol {changed.name!r}: place.tolerance {1e3 * near:g} mm of a stroke of "
+                f"protocol {changed.name!r}: place.tolerance {1e3 * tolerance:g} mm of a stroke of "
                 f"{1e3 * stroke:g} mm counts joint {joint.name!r} as in place nearly anywhere; "
                 f"expected at most {1e3 * LOCK_SHARE * stroke:g} mm"
             )
@@ -140,13 +140,13 @@ def override(protocol: Protocol, overrides: Overrides) -> Protocol:
         raise InputError(f"the amplitude's scale is {overrides.amplitude_scale:g}; expected > 0")
     if overrides.seed is not None and overrides.seed < 0:
         raise InputError(f"the seed is {overrides.seed}; expected 0 or more")
-    kept = _kept(protocol, overrides.steps)
+    selected = _selected(protocol, overrides.steps)
     numbers = iter(range(len(protocol.excitations)))
 
     def change(step: StepKind) -> StepKind:
         return _changed(step, next(numbers), overrides) if isinstance(step, Step) else step
 
-    return protocol.model_copy(update={"steps": mapped(kept, change)})
+    return protocol.model_copy(update={"steps": mapped(selected, change)})
 
 
 def mapped(
@@ -156,12 +156,12 @@ def mapped(
     mapped_steps = []
     for step in steps:
         inner = getattr(step, "steps", None)
-        new = step if inner is None else step.model_copy(update={"steps": mapped(inner, change)})
-        mapped_steps.append(change(new))
+        copy = step if inner is None else step.model_copy(update={"steps": mapped(inner, change)})
+        mapped_steps.append(change(copy))
     return tuple(mapped_steps)
 
 
-def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[StepKind, ...]:
+def _selected(protocol: Protocol, names: Sequence[str] | None) -> tuple[StepKind, ...]:
     if names is None:
         return protocol.steps
     known = [step.name for step in protocol.steps if step.name]
@@ -173,12 +173,12 @@ def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[StepKind, ..
     return tuple(step for step in protocol.steps if step.name in names)
 
 
-def _changed(step: Step, place: int, overrides: Overrides) -> Step:
+def _changed(step: Step, index: int, overrides: Overrides) -> Step:
     excite = []
     for part in step.excite:
         signal = part.signal.scaled(overrides.amplitude_scale)
         if overrides.seed is not None:
-            signal = signal.reseeded(overrides.seed + place)
+            signal = signal.reseeded(overrides.seed + index)
         excite.append(part.model_copy(update={"signal": signal}))
     return step.model_copy(
         update={
@@ -251,7 +251,7 @@ class _RigPlanner:
         duration, repeats, warm_up = None, 1, 1
         if isinstance(step, Step):
             duration, repeats, warm_up = step.duration, step.repeats, step.warm_up
-        record = period if duration is None else _whole(step.name, duration, period, rate)
+        record = period if duration is None else _record_samples(step.name, duration, period, rate)
         return StepPlan(
             name=step.name,
             locks=self.locks(step, (*step.lock, *inherited)),
@@ -275,13 +275,13 @@ class _RigPlanner:
 
 
 def _located(problem: str, step: StepKind) -> str:
-    """Return a problem with its step's file and line, unless a nested step's are before it."""
-    named = any(problem.startswith(f"{part.where}: ") for part in every_step([step]))
-    named = named or not step.where
-    return problem if named else f"{step.where}: {problem}"
+    """Return a problem with its step's file and line, unless it has those of a nested step."""
+    has_place = any(problem.startswith(f"{part.where}: ") for part in every_step([step]))
+    has_place = has_place or not step.where
+    return problem if has_place else f"{step.where}: {problem}"
 
 
-def _whole(step: str, duration: float, period: int, rate: float) -> int:
+def _record_samples(step: str, duration: float, period: int, rate: float) -> int:
     if not duration <= LONGEST_RECORD:  # NaN as well
         raise InputError(
             f"step {step!r}: duration {duration:g} s; expected at most {LONGEST_RECORD:g} s"
@@ -333,17 +333,17 @@ def piston_gain(rig: Rig, joint: int) -> float:
     """
     part = rig.joints[joint]
     names = [f"C_{signs}_{joint + 1}" for signs in ("pp", "mp", "pm", "mm")]
-    lost = [name for name in names if not rig.nominal.get(name, 0.0) > 0.0]
-    if rig.electric or lost:
+    missing = [name for name in names if not rig.nominal.get(name, 0.0) > 0.0]
+    if rig.electric or missing:
         raise InputError(
-            f"rig {rig.name!r} states no nominal {' '.join(lost) or 'valve gains'}: an amplitude "
-            "of a length needs them; expected volts"
+            f"rig {rig.name!r} states no nominal {' '.join(missing) or 'valve gains'}: an "
+            "amplitude of a length needs them; expected volts"
         )
     pp, mp, pm, mm = (rig.nominal[name] for name in names)
     cap, rod = part.cylinder.cap_area, part.cylinder.rod_area
-    out = math.sqrt(cap * rig.supply.pressure / (cap**3 / pp**2 + rod**3 / mp**2))
-    back = math.sqrt(rod * rig.supply.pressure / (cap**3 / pm**2 + rod**3 / mm**2))
-    return 0.5 * (out + back) * part.valve.spool_gain
+    extending = math.sqrt(cap * rig.supply.pressure / (cap**3 / pp**2 + rod**3 / mp**2))
+    retracting = math.sqrt(rod * rig.supply.pressure / (cap**3 / pm**2 + rod**3 / mm**2))
+    return 0.5 * (extending + retracting) * part.valve.spool_gain
 
 
 def _waveform(part: Excite, step: str, rig: Rig) -> Waveform:

@@ -90,33 +90,33 @@ class Protocol(ProtocolPart):
     @field_validator("steps")
     @classmethod
     def _names_differ(cls, steps: tuple[StepKind, ...]) -> tuple[StepKind, ...]:
-        seen: set[str] = set()
+        names: set[str] = set()
         for step in every_step(steps):
             if step.name is None:
                 continue
-            if step.name in seen:
+            if step.name in names:
                 raise ValueError(
                     f"two steps are called {step.name!r}; records need different names"
                 )
-            seen.add(step.name)
+            names.add(step.name)
         return steps
 
     @model_validator(mode="after")
     def _every_joint_has_a_role(self, info: ValidationInfo) -> Self:
         if info.context and info.context.get(INCOMPLETE):
             return self  # a lock may be in a step that could not be read
-        wanted = set(range(1, self.joints + 1))
+        joints = set(range(1, self.joints + 1))
         locked: set[int] = set()
         for step in every_step(self.steps):
             if isinstance(step, LockStep):
                 locked = {part.joint for part in step.lock}
-            named = _named_joints(step)
-            if named - wanted:
+            assigned = _named_joints(step)
+            if assigned - joints:
                 raise ValueError(
-                    f"step {step.name or step.key!r}: joint {min(named - wanted)} does not exist; "
-                    f"the protocol says joints: {self.joints}"
+                    f"step {step.name or step.key!r}: joint {min(assigned - joints)} does not "
+                    f"exist; the protocol says joints: {self.joints}"
                 )
-            idle = wanted - named - locked
+            idle = joints - assigned - locked
             if isinstance(step, Step | WarmUpStep) and idle:
                 raise ValueError(
                     f"step {step.name!r}: joint {min(idle)} is neither locked nor "
@@ -162,6 +162,6 @@ def _with_references(node: Any) -> Any:
         return node
     if node.get("type") in _PLAIN and "const" not in node:
         about = {k: node[k] for k in ("title", "description", "default") if k in node}
-        rest = {k: v for k, v in node.items() if k not in about}
-        return {**about, "anyOf": [rest, _REFERENCE]}
+        rules = {k: v for k, v in node.items() if k not in about}
+        return {**about, "anyOf": [rules, _REFERENCE]}
     return {key: _with_references(value) for key, value in node.items()}

@@ -47,8 +47,8 @@ class Comparison:
 
     def holds(self, values: Mapping[str, float]) -> bool:
         """Return whether it holds; False for a missing or NaN value."""
-        seen = values.get(self.name, math.nan)
-        return math.isfinite(seen) and _COMPARE[self.sign](seen, self.value)
+        value = values.get(self.name, math.nan)
+        return math.isfinite(value) and _COMPARE[self.sign](value, self.value)
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Condition:
     @property
     def estimates(self) -> tuple[str, ...]:
         """The parameters whose on-line estimates it needs."""
-        known = [n.removesuffix(RSD) for n in self.names if n != ELAPSED and not _is_channel(n)]
-        return tuple(dict.fromkeys(known))
+        names = (n for n in self.names if n != ELAPSED and not _is_channel(n))
+        return tuple(dict.fromkeys(name.removesuffix(RSD) for name in names))
 
     def holds(self, values: Mapping[str, float]) -> bool:
         """Return whether it holds for `values` in SI by name."""
@@ -76,8 +76,8 @@ class Condition:
     def readings(self, values: Mapping[str, float]) -> str:
         """Return the values it compares, in display units: 'oil_temperature 38.2 °C'."""
         names = [name for name in self.names if name != ELAPSED]
-        seen = [_reading(name, values.get(name, math.nan)) for name in names]
-        return ", ".join(seen) or "it compares the time alone"
+        readings = [_reading(name, values.get(name, math.nan)) for name in names]
+        return ", ".join(readings) or "it compares the time alone"
 
 
 def parse_condition(text: str) -> Condition:

@@ -95,8 +95,8 @@ class AmplitudeSignal(SignalKind):
 
         For a travel s, the volts with which the integral of the command peaks at s / gain.
         """
-        made = self.waveform(sample_rate)
+        wave = self.waveform(sample_rate)
         if self.travel is None:
-            return made
-        factor = self.travel / (gain * made.travel(sample_rate))
-        return Waveform(made.samples * factor, made.lines, made.detection_lines)
+            return wave
+        factor = self.travel / (gain * wave.travel(sample_rate))
+        return Waveform(wave.samples * factor, wave.lines, wave.detection_lines)

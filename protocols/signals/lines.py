@@ -32,9 +32,9 @@ class Lines(SignalKind):
             raise ValueError("amplitudes must be above zero; leave a line out instead")
         if self.lines[0] < 1 or any(a >= b for a, b in pairwise(self.lines)):
             raise ValueError("lines must be numbers from 1 on in rising order")
-        both = sorted(set(self.lines) & set(self.detection_lines))
-        if both:
-            raise ValueError(f"line {both[0]} is excited and a detection line; it can be one")
+        twice = sorted(set(self.lines) & set(self.detection_lines))
+        if twice:
+            raise ValueError(f"line {twice[0]} is excited and a detection line; expected only one")
         return self
 
     def scaled(self, factor: float) -> Self:

@@ -17,8 +17,8 @@ from protocols.steps.base import StepKind
 MISSPELT: Final = 0.8  # similarity (difflib) from which an unknown key is a kind's, misspelt
 _kinds: tuple[type[StepKind], ...] = classes_in(sys.modules[__name__], StepKind)
 STEPS: dict[str, type[StepKind]] = {
-    found.key: found
-    for found in sorted(
+    kind.key: kind
+    for kind in sorted(
         (k for k in _kinds if hasattr(k, "key")), key=lambda kind: (kind.rank, kind.key)
     )
 }
@@ -34,8 +34,8 @@ def kind_of_step(data: Any) -> str | None:
         return data.key
     if not isinstance(data, dict):
         return None
-    known = {name for kind in STEPS.values() for name in kind.model_fields}
-    if any(get_close_matches(str(key), STEPS, 1, MISSPELT) for key in data if key not in known):
+    keys = {name for kind in STEPS.values() for name in kind.model_fields}
+    if any(get_close_matches(str(key), STEPS, 1, MISSPELT) for key in data if key not in keys):
         return None
     return next((key for key in STEPS if key in data), None)
 
@@ -48,7 +48,7 @@ def _tag_of_step(data: Any) -> str | None:
 if TYPE_CHECKING:
     AnyStep = StepKind
 else:
-    _tagged = tuple(Annotated[found, Tag(f"{key} step")] for key, found in STEPS.items())
+    _tagged = tuple(Annotated[kind, Tag(f"{key} step")] for key, kind in STEPS.items())
     AnyStep = Annotated[
         Union[_tagged],  # noqa: UP007 - of the classes discovered
         Discriminator(

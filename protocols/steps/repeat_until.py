@@ -12,8 +12,8 @@ from protocols.steps.base import Actions, PlannedStep, Planner, StepKind
 class RepeatStep(StepKind):
     """Run `steps` repeatedly until a condition holds, `at_most` times.
 
-    Records of a later round continue the repeat numbers of their step. Reaching `at_most` is noted;
-    with `required` it is an error.
+    Records of a later round continue the repeat numbers of their step. Reaching `at_most` is
+    logged; with `required` it is an error.
     """
 
     key: ClassVar[str] = "repeat_until"
@@ -42,8 +42,8 @@ class RepeatStep(StepKind):
     def run(self, planned: PlannedStep, actions: Actions) -> None:
         """Repeat the nested steps until the condition holds."""
         assert planned.condition is not None
-        good = actions.repeat(planned, planned.condition, self.at_most)
-        if good:
+        fulfilled = actions.repeat(planned, planned.condition, self.at_most)
+        if fulfilled:
             return
         why = f"{planned.condition.text} does not hold after {self.at_most} rounds"
         if self.required:

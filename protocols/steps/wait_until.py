@@ -28,5 +28,7 @@ class WaitStep(StepKind):
         """Wait."""
         assert planned.condition is not None
         if not actions.wait(planned.condition, self.timeout):
-            seen = actions.readings(planned.condition)
-            actions.fail(f"{planned.condition.text} did not come within {self.timeout:g} s: {seen}")
+            values = actions.readings(planned.condition)
+            actions.fail(
+                f"{planned.condition.text} did not come within {self.timeout:g} s: {values}"
+            )

@@ -30,14 +30,16 @@ class WarmUpStep(StepKind):
         condition = planner.condition(self.warm_up)
         step = planner.excitation(self)
         rate = planner.rig.sample_rate
-        before = MOVE_SECONDS * (1 + len(step.locks)) + step.samples(rate) / rate
+        positioning = MOVE_SECONDS * (1 + len(step.locks)) + step.samples(rate) / rate
         title = f"move until {condition.text}, at most {self.timeout:g} s"
-        most = before + self.timeout
-        return PlannedStep(self, title, before, (step,), condition=condition, most=most)
+        longest = positioning + self.timeout
+        return PlannedStep(self, title, positioning, (step,), condition=condition, most=longest)
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
         """Move until the condition holds."""
         assert planned.condition is not None
         if not actions.excite_until(planned, planned.condition, self.timeout):
-            seen = actions.readings(planned.condition)
-            actions.fail(f"{self.warm_up} did not come within {self.timeout:g} s of moving: {seen}")
+            values = actions.readings(planned.condition)
+            actions.fail(
+                f"{self.warm_up} did not come within {self.timeout:g} s of moving: {values}"
+            )
