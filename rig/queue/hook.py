@@ -53,9 +53,9 @@ class Hook:
         if not self._command:
             return
         text = json.dumps(dict(message), default=str).encode() + b"\n"
-        before = self._threads[-1] if self._threads else None
+        previous = self._threads[-1] if self._threads else None
         thread = threading.Thread(
-            target=self._deliver, args=(text, before), daemon=True, name="notify"
+            target=self._deliver, args=(text, previous), daemon=True, name="notify"
         )
         self._threads = [t for t in self._threads if t.is_alive()] + [thread]
         thread.start()
@@ -66,9 +66,9 @@ class Hook:
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
 
-    def _deliver(self, text: bytes, before: threading.Thread | None) -> None:
-        if before is not None:
-            before.join(IN_ORDER)
+    def _deliver(self, text: bytes, previous: threading.Thread | None) -> None:
+        if previous is not None:
+            previous.join(IN_ORDER)
         try:
             with self._log.open("ab") as output:
                 self._run(text, output.fileno())

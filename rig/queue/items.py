@@ -141,13 +141,13 @@ def parse_time(text: str, now: datetime, option: str) -> datetime:
                 f"{option} {text!r}: expected a time such as 22:30 or 2026-03-01T22:30"
             ) from None
     local = now.astimezone()
-    wanted = local.replace(hour=clock.hour, minute=clock.minute, second=0, microsecond=0)
-    if wanted < local.replace(second=0, microsecond=0):
+    moment = local.replace(hour=clock.hour, minute=clock.minute, second=0, microsecond=0)
+    if moment < local.replace(second=0, microsecond=0):
         # In local time, since a day with a change of the clocks does not last 24 h.
-        day = wanted.date().toordinal() + 1
+        day = moment.date().toordinal() + 1
         naive = datetime.combine(datetime.fromordinal(day).date(), clock)
-        wanted = naive.astimezone()
-    return wanted.astimezone(UTC)
+        moment = naive.astimezone()
+    return moment.astimezone(UTC)
 
 
 def require_one_line(text: str, option: str) -> None:
@@ -184,11 +184,11 @@ class QueueJob:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> QueueJob:
         """Return a job from plain data; keys of later versions are ignored."""
-        known = {f.name for f in fields(cls)}
-        kept = {key: value for key, value in data.items() if key in known}
+        names = {f.name for f in fields(cls)}
+        values = {key: value for key, value in data.items() if key in names}
         for name in ("options", "run_options"):
-            kept[name] = tuple(kept.get(name, ()))
-        return cls(**kept)
+            values[name] = tuple(values.get(name, ()))
+        return cls(**values)
 
     def check_words(self) -> list[str]:
         """Return the arguments of the proof on the twin, with JSON on standard output."""
@@ -236,8 +236,8 @@ class Item:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the item as plain data for JSON."""
-        plain = asdict(self)
-        return {**plain, "found": plain.pop("results")}
+        data = asdict(self)
+        return {**data, "found": data.pop("results")}
 
     def next_folder(self) -> str:
         """Return the run folder of the next attempt; a number is appended from the second on."""

@@ -36,9 +36,9 @@ class ItemOutcome:
     latched: bool = False
     in_use: bool = False
 
-    def adding(self, more: str) -> ItemOutcome:
+    def adding(self, reason: str) -> ItemOutcome:
         """Return the outcome with a further reason."""
-        return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
+        return replace(self, reason=f"{self.reason}; {reason}".removeprefix("; "))
 
     def as_requested(self, state: str, why: str) -> ItemOutcome:
         """Return the outcome with `state` and the reason `why` if the process ended on request."""
@@ -58,22 +58,22 @@ def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
     return ItemOutcome(_STATES[code], reason if code else "", latched, in_use)
 
 
-def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:
+def outcome_of_folder(folder: Path, last_line: str) -> ItemOutcome:
     """Return the outcome of a process with unknown exit code, from its run folder and last line."""
     unseen = "ended while no runner was watching"
     if not store.is_run(folder):
-        if not said:
+        if not last_line:
             return ItemOutcome(
                 it.INTERRUPTED, "its process was killed before anything was recorded"
             )
-        return ItemOutcome(_state_of(said), f"{said}; {unseen}")
+        return ItemOutcome(_state_of(last_line), f"{last_line}; {unseen}")
     state = runstate.read_state(folder)
     if state == runstate.DONE:
         return ItemOutcome(it.DONE, unseen)
     if state == runstate.TRIPPED:
-        return ItemOutcome(it.TRIPPED, said or _end_message(folder) or unseen)
+        return ItemOutcome(it.TRIPPED, last_line or _end_message(folder) or unseen)
     if state == runstate.ABORTED:
-        why = said or _end_message(folder)
+        why = last_line or _end_message(folder)
         return ItemOutcome(_state_of(why), f"{why}; {unseen}".removeprefix("; "))
     return ItemOutcome(it.INTERRUPTED, "its process was killed while no runner watched")
 

@@ -25,7 +25,7 @@ from typing import IO, Any, Final
 from rig.model.trips import OperatorStop
 
 BRAMAH: Final = (sys.executable, "-c", "from rig.cli.main import run; run()")
-_SAID = "bramah: "  # begins the lines with which a verb reports its error
+_PREFIX = "bramah: "  # begins the lines with which a verb reports its error
 _TAIL = 1 << 16  # [bytes] at the end of a log that are searched for these lines
 _POLL = 0.05  # [s]
 
@@ -106,12 +106,12 @@ class ProcessResult:
 
 def reason_in(text: str) -> str:
     """Return the last error messages of a verb, joined by ';', '' if there are none."""
-    lines = [line.partition(_SAID) for line in text.splitlines()]
+    lines = [line.partition(_PREFIX) for line in text.splitlines()]
     while lines and not lines[-1][1]:
         lines.pop()
     reason_lines = list(takewhile(lambda parts: parts[1], reversed(lines)))
-    said = [reason.replace("\033[0m", "").strip() for _, _, reason in reversed(reason_lines)]
-    return "; ".join(said)
+    messages = [reason.replace("\033[0m", "").strip() for _, _, reason in reversed(reason_lines)]
+    return "; ".join(messages)
 
 
 def reason_of(path: Path) -> str:
@@ -158,7 +158,7 @@ def call(
     """
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         child = start([*program, *words], output, errors)
-        late = False
+        timed_out = False
         try:
             deadline = time.monotonic() + seconds
             while child.poll() is None:
@@ -166,7 +166,7 @@ def call(
                 if why is not None:
                     raise OperatorStop(why)
                 if time.monotonic() > deadline:
-                    late = True
+                    timed_out = True
                     break
                 time.sleep(_POLL)
         finally:
@@ -176,11 +176,10 @@ def call(
             child.wait()
         output.seek(0)
         errors.seek(0)
-        said = errors.read().decode(errors="replace")
+        error_text = errors.read().decode(errors="replace")
         result = output.read().decode(errors="replace")
-    reason = f"did not end within {seconds:.0f} s" if late else reason_in(said)
+    reason = f"did not end within {seconds:.0f} s" if timed_out else reason_in(error_text)
     if not reason and child.returncode:
-        reason = (
-            f"ended with {child.returncode}: {(said.strip().splitlines() or ['no message'])[-1]}"
-        )
+        last_line = (error_text.strip().splitlines() or ["no message"])[-1]
+        reason = f"ended with {child.returncode}: {last_line}"
     return ProcessResult(child.returncode, result, reason)

@@ -43,32 +43,35 @@ def _wait(reason: str) -> Readiness:
     return Readiness(False, reason)
 
 
-def dependence(item: Item, others: Mapping[int, Item]) -> Readiness:
+def dependence(item: Item, items: Mapping[int, Item]) -> Readiness:
     """Evaluate an item's condition on an earlier item."""
     wanted = item.job.wanted
     if item.job.after is None:
         return Readiness(True)
-    other = others[item.job.after]
-    if not other.over:
-        return _wait(f"item {other.id} is {other.state}")
-    if wanted in (ENDED, other.state):
+    earlier = items[item.job.after]
+    if not earlier.over:
+        return _wait(f"item {earlier.id} is {earlier.state}")
+    if wanted in (ENDED, earlier.state):
         return Readiness(True)
-    if wanted in OVER or other.state != DONE:
+    if wanted in OVER or earlier.state != DONE:
         expected = wanted if wanted in OVER else DONE
-        return Readiness(False, f"item {other.id} is {other.state}; wanted: {expected}", SKIPPED)
-    return _compared(wanted, other)
+        reason = f"item {earlier.id} is {earlier.state}; wanted: {expected}"
+        return Readiness(False, reason, SKIPPED)
+    return _compared(wanted, earlier)
 
 
-def _compared(wanted: str, other: Item) -> Readiness:
+def _compared(wanted: str, earlier: Item) -> Readiness:
     condition = result_condition(wanted)
-    value = result_value(other.results, condition)
+    value = result_value(earlier.results, condition)
     if value is None:
-        why = other.results.get("error", f"{condition.name} was not identified")
-        return Readiness(False, f"{wanted!r} of item {other.id} cannot be judged: {why}", SKIPPED)
+        why = earlier.results.get("error", f"{condition.name} was not identified")
+        reason = f"{wanted!r} of item {earlier.id} cannot be judged: {why}"
+        return Readiness(False, reason, SKIPPED)
     if condition.holds(value):
         return Readiness(True)
     part = f"{condition.name}.{condition.part}"
-    return Readiness(False, f"{part} of item {other.id} is {value:.4g}; wanted: {wanted}", SKIPPED)
+    reason = f"{part} of item {earlier.id} is {value:.4g}; wanted: {wanted}"
+    return Readiness(False, reason, SKIPPED)
 
 
 def judge(

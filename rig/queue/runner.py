@@ -204,8 +204,8 @@ class Runner:
             raise OperatorStop(self._stop.reason)
 
     def _pause(self, seconds: float) -> None:
-        until = time.monotonic() + seconds
-        while time.monotonic() < until and self._stop.reason is None:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and self._stop.reason is None:
             time.sleep(min(self._settings.poll, seconds))
 
     # Which item
@@ -223,16 +223,16 @@ class Runner:
 
     def _holder_of(self, job: QueueJob) -> str:
         """Return who had a bench when an item was last refused for that, '' after a while."""
-        since, holder = self._in_use.get((job.rig, job.endpoint), (-math.inf, ""))
-        return holder if time.monotonic() - since < self._settings.in_use_seconds else ""
+        refused_at, holder = self._in_use.get((job.rig, job.endpoint), (-math.inf, ""))
+        return holder if time.monotonic() - refused_at < self._settings.in_use_seconds else ""
 
     def _read(self, job: QueueJob) -> dict[str, float] | str:
         """Return the means of a bench's channels, cached for a while; moves nothing."""
         key = (job.rig, job.endpoint)
-        kept = self._readings.get(key)
-        if kept is None or time.monotonic() - kept[0] > self._settings.probe_every:
+        cached = self._readings.get(key)
+        if cached is None or time.monotonic() - cached[0] > self._settings.probe_every:
             words = ["probe", *job.bench_words, "--json", "-"]
-            answer = self._call(words, self._settings.probe_seconds)
+            answer = self._call_verb(words, self._settings.probe_seconds)
             readings = answer.as_json()
             means: dict[str, float] | str = answer.reason or (
                 f"`bramah probe` wrote {answer.output[:60]!r}, not a JSON list of channels"
@@ -243,11 +243,11 @@ class Runner:
                     for reading in readings
                     if reading["mean"] is not None
                 }
-            kept = (time.monotonic(), means)
-            self._readings[key] = kept
-        return kept[1]
+            cached = (time.monotonic(), means)
+            self._readings[key] = cached
+        return cached[1]
 
-    def _call(self, words: Sequence[str], seconds: float) -> processes.ProcessResult:
+    def _call_verb(self, words: Sequence[str], seconds: float) -> processes.ProcessResult:
         return processes.call(self._program, words, seconds, lambda: self._stop.reason)
 
     # One item
@@ -256,7 +256,7 @@ class Runner:
         """Check a claimed item against the present limits, then run it to its end."""
         self._say(f"item {item.id} {item.job.name}: checking")
         try:
-            proof = self._call(item.job.check_words(), self._settings.check_seconds)
+            proof = self._call_verb(item.job.check_words(), self._settings.check_seconds)
         except OperatorStop:
             self._queue.release(item.id, "the runner was stopped during its check")
             raise
@@ -267,7 +267,7 @@ class Runner:
             self._finish(item, ItemOutcome(it.CANCELLED, "cancelled during its check"))
             return
         begun = self._queue.begin(item.id)
-        self._after(begun, self._run(begun))
+        self._conclude(begun, self._run(begun))
 
     def _run(self, item: Item) -> ItemOutcome:
         """Run an item's process to its end and return the outcome."""
@@ -293,28 +293,29 @@ class Runner:
         outcome = outcome_of(child.returncode, processes.reason_of(path), began=began)
         return outcome.as_requested(request, self._why(request))
 
-    def _watch(self, item: Item, over: Callable[[], bool], pid: Callable[[], int | None]) -> str:
+    def _watch(self, item: Item, ended: Callable[[], bool], pid: Callable[[], int | None]) -> str:
         """Wait until a process has ended; return the state for which it was asked to end, or ''."""
-        asked, since = "", 0.0
-        while not over():
+        requested, requested_at = "", 0.0
+        while not ended():
             end_state = it.STOPPED if self._stop.reason else ""
             if not end_state and self._queue.item(item.id).cancel:
                 end_state = it.CANCELLED
             process = pid()
-            if end_state and not asked and process is not None:
+            if end_state and not requested and process is not None:
                 self._say(f"item {item.id} {item.job.name}: asked to end")
                 processes.ask_to_end(process)
-                asked, since = end_state, time.monotonic()
-            if asked and process and time.monotonic() - since > self._settings.stop_seconds:
+                requested, requested_at = end_state, time.monotonic()
+            overdue = time.monotonic() - requested_at > self._settings.stop_seconds
+            if requested and process and overdue:
                 log.error("item %d: did not end within %g s and is killed", item.id,
                           self._settings.stop_seconds)  # fmt: skip
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
-                since = time.monotonic()
+                requested_at = time.monotonic()
             time.sleep(self._settings.poll)
-        return asked
+        return requested
 
-    def _after(self, item: Item, outcome: ItemOutcome) -> None:
+    def _conclude(self, item: Item, outcome: ItemOutcome) -> None:
         """Finish an item, recover its run if its process died, and stop the queue if necessary."""
         if outcome.in_use:
             key = (item.job.rig, item.job.endpoint)
@@ -380,7 +381,7 @@ class Runner:
                 continue
             self._say(f"item {item.id} {item.job.name}: identifying")
             words = ["identify", item.run, "--json", "-"]
-            answer = self._call(words, self._settings.identify_seconds)
+            answer = self._call_verb(words, self._settings.identify_seconds)
             result = answer.as_json() if answer.code == 0 else None
             why = answer.reason or "no result"
             self._queue.keep_results(
@@ -394,9 +395,9 @@ class Runner:
             if item.state == it.CHECKING:
                 self._queue.release(item.id, "the runner ended during its check")
             elif item.state == it.RUNNING:
-                self._after(item, self._ended_unwatched(item))
+                self._conclude(item, self._outcome_unwatched(item))
 
-    def _ended_unwatched(self, item: Item) -> ItemOutcome:
+    def _outcome_unwatched(self, item: Item) -> ItemOutcome:
         lock = item_lock(self._queue.path, item.id)
         request = it.CANCELLED if item.cancel else ""
         if held(lock):
@@ -404,8 +405,8 @@ class Runner:
                 f"item {item.id} {item.job.name}: its process still runs; waiting for its end"
             )
             request = self._watch(item, lambda: not held(lock), lambda: _pid_of(item)) or request
-        said = processes.reason_of(log_of(self._queue.path, item))
-        return outcome_of_folder(Path(item.run), said).as_requested(request, self._why(request))
+        message = processes.reason_of(log_of(self._queue.path, item))
+        return outcome_of_folder(Path(item.run), message).as_requested(request, self._why(request))
 
     def _why(self, request: str) -> str:
         """Return why a process was asked to end, for the state that was requested."""

@@ -56,7 +56,7 @@ class QueueLine:
     reason: str
 
 
-def _item(row: Sequence[Any]) -> Item:
+def _item_of(row: Sequence[Any]) -> Item:
     (number, priority, place, state, reason, job, attempt, run, pid, cancel) = row[:10]
     added, started, ended, proof, results = row[10:]
     return Item(
@@ -139,7 +139,7 @@ class QueueStore:
             rows = self._db.execute(
                 f"SELECT {_COLUMNS} FROM item ORDER BY priority DESC, place, id"
             )
-            return [_item(row) for row in rows]
+            return [_item_of(row) for row in rows]
 
     def item(self, number: int) -> Item:
         """Return one item; raises InputError."""
@@ -148,10 +148,10 @@ class QueueStore:
                 f"SELECT {_COLUMNS} FROM item WHERE id = ?", (number,)
             ).fetchone()
         if row is None:
-            known = [item.id for item in self.items()]
-            which = f"items {min(known)} to {max(known)}" if known else "no items"
-            raise InputError(f"{self.path}: no item {number}; the queue has {which}")
-        return _item(row)
+            numbers = [item.id for item in self.items()]
+            items = f"items {min(numbers)} to {max(numbers)}" if numbers else "no items"
+            raise InputError(f"{self.path}: no item {number}; the queue has {items}")
+        return _item_of(row)
 
     def history(self, number: int | None = None) -> list[QueueLine]:
         """Return the history of an item, or of the whole queue, oldest first."""
@@ -212,18 +212,19 @@ class QueueStore:
                 raise InputError(f"item {number} is {item.state}; only a queued item can be moved")
             if before == number:
                 raise InputError(f"item {number}: --before names the item itself")
-            other = None if before is None else self.item(before)
-            rank = other.priority if other else item.priority if priority is None else priority
+            successor = None if before is None else self.item(before)
+            rank = item.priority if priority is None else priority
+            rank = successor.priority if successor else rank
             peers = [i for i in self.items() if i.priority == rank and i.id != number]
-            at = len(peers) if last else 0
-            if other is not None:
-                at = next(k for k, peer in enumerate(peers) if peer.id == other.id)
-            order = [*peers[:at], item, *peers[at:]]
+            index = len(peers) if last else 0
+            if successor is not None:
+                index = next(k for k, peer in enumerate(peers) if peer.id == successor.id)
+            order = [*peers[:index], item, *peers[index:]]
             for place, peer in enumerate(order, start=1):
                 self._db.execute(
                     "UPDATE item SET place = ?, priority = ? WHERE id = ?", (place, rank, peer.id)
                 )
-            self._note(number, item.attempt, "moved", f"priority {rank}, place {at + 1}")
+            self._note(number, item.attempt, "moved", f"priority {rank}, place {index + 1}")
         return self.item(number)
 
     def cancel(self, number: int, who: str) -> Item:
