@@ -16,15 +16,15 @@ from rig.model.trips import Violation, describe
 
 log = logging.getLogger(__name__)
 
-# Of an alarm or a violation: every event has its own tick, and the time in the run and the date.
+# Fields of an alarm or a violation that every event has anyway: tick, time in the run, date.
 _OF_EVENTS = frozenset({"tick", "time", "seconds"})
 
 OnEvent = Callable[[str, int | None, Mapping[str, Any]], None]
 
 
-def event_fields(what: Alarm | Violation) -> dict[str, Any]:
-    """Return the data of an alarm or violation for an event, without what every event has."""
-    return {k: v for k, v in asdict(what).items() if k not in _OF_EVENTS}
+def event_fields(source: Alarm | Violation) -> dict[str, Any]:
+    """Return the data of an alarm or violation for an event, without `_OF_EVENTS`."""
+    return {k: v for k, v in asdict(source).items() if k not in _OF_EVENTS}
 
 
 class AlarmLog:
@@ -75,27 +75,27 @@ class AlarmLog:
 
     def _raise(self, alarm: Alarm) -> str:
         self.table = states.raised(self.table, alarm)
-        known = self.table.get(alarm.key) or alarm
+        stored = self.table.get(alarm.key) or alarm
         # The table keeps time and value of the first occurrence; the log has every occurrence.
-        now = replace(
+        current = replace(
             alarm,
-            state=known.state,
-            acknowledged=known.acknowledged,
-            cause=known.cause,
-            count=known.count,
+            state=stored.state,
+            acknowledged=stored.acknowledged,
+            cause=stored.cause,
+            count=stored.count,
         )
         if not alarm.trips:
             log.warning("warning: %s", alarm.sentence)
-        self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **event_fields(now)})
+        self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **event_fields(current)})
         return alarm.key
 
     def acknowledge(self, key: str | None, tick: int) -> None:
         """Acknowledge an alarm, or all (None), for a person; an unknown key is logged."""
-        seen = [alarm.key for alarm in self.table.unacknowledged]
+        keys = [alarm.key for alarm in self.table.unacknowledged]
         try:
             self.table = states.acknowledged(self.table, key)
         except KeyError as error:
             log.info("%s", error.args[0])
             return
-        for key_of_alarm in seen if key is None else [key]:
+        for key_of_alarm in keys if key is None else [key]:
             self._on_event("alarm acknowledged", tick, {"alarm": key_of_alarm})

@@ -61,9 +61,9 @@ class Holder:
 
 def state_folder() -> Path:
     """Return the folder of stored state: `BRAMAH_STATE`, or the user's default."""
-    named = os.environ.get(STATE_VARIABLE)
-    if named:
-        return Path(named).absolute()
+    stated = os.environ.get(STATE_VARIABLE)
+    if stated:
+        return Path(stated).absolute()
     base = os.environ.get("XDG_STATE_HOME")
     if base and os.path.isabs(base):
         return Path(base) / "bramah"
@@ -71,10 +71,10 @@ def state_folder() -> Path:
 
 
 def _folder_name(wire: Wire) -> str:
-    kind, _, place = wire.endpoint.lower().partition("?")[0].partition("://")
+    kind, _, address = wire.endpoint.lower().partition("?")[0].partition("://")
     for name in _THIS_COMPUTER:
-        place = re.sub(rf"^{re.escape(name)}(?=:|$)", LOCALHOST, place)
-    return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{place}")
+        address = re.sub(rf"^{re.escape(name)}(?=:|$)", LOCALHOST, address)
+    return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{address}")
 
 
 def _load_trip(path: Path) -> LatchedTrip:
@@ -149,7 +149,7 @@ class BenchState:
         if self.read_trip() is not None:
             return True
         where = "" if run is None else str(run.absolute())
-        kept = LatchedTrip(
+        latched = LatchedTrip(
             trip,
             runstate.utc_now(),
             where,
@@ -158,7 +158,7 @@ class BenchState:
             runstate.computer_name(),
         )
         try:
-            replace_text(self.folder / _TRIP, json.dumps(asdict(kept)) + "\n")
+            replace_text(self.folder / _TRIP, json.dumps(asdict(latched)) + "\n")
         except OSError as error:
             log.error("%s: the trip could not be latched here: %s", self.folder, error)
             return False
@@ -219,8 +219,8 @@ class BenchState:
         except OSError as error:
             process = os.pread(handle, 32, 0).decode("ascii", "replace").strip()
             os.close(handle)
-            known = self.holder()
-            run = f", which writes {known.run}" if known and known.run else ""
+            holder = self.holder()
+            run = f", which writes {holder.run}" if holder and holder.run else ""
             raise DeviceBusy(
                 f"the bench at {self.endpoint} is in use by process {process} of this computer"
                 f"{run}; wait for its end or stop it"

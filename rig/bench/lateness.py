@@ -38,13 +38,13 @@ class HostTiming:
         """Add a block; blocks of a device with its own clock are ignored."""
         if block.read_at is None:
             return
-        due = (block.tick + np.arange(len(block.data))) / self._sample_rate
-        late = block.read_at - due
-        own = np.isfinite(late)
+        nominal = (block.tick + np.arange(len(block.data))) / self._sample_rate
+        late = block.read_at - nominal
+        measured = np.isfinite(late)
         self._samples += len(late)
-        self._interpolated += int(np.count_nonzero(~own))
-        self._late += int(np.count_nonzero(late[own] > BENCH.late_share / self._sample_rate))
-        self._worst = max(self._worst, float(late[own].max(initial=0.0)))
+        self._interpolated += int(np.count_nonzero(~measured))
+        self._late += int(np.count_nonzero(late[measured] > BENCH.late_share / self._sample_rate))
+        self._worst = max(self._worst, float(late[measured].max(initial=0.0)))
 
     def summary(self) -> dict[str, float] | None:
         """Return the counts and the largest lateness [s]; None for a device with its own clock."""

@@ -39,7 +39,7 @@ class Outputs:
         self._connected = False  # whether the device has answered, so that its outputs may not be 0
         self._at_zero = True  # no device has answered yet, or the last one has confirmed zero
         self._silent = False
-        self._told = False  # whether an unconfirmed zero has been logged
+        self._logged = False  # whether an unconfirmed zero has been logged
         self._armed_from: int | None = None  # tick from which on a law may output a voltage
 
     def connect(self) -> DeviceInfo:
@@ -48,15 +48,15 @@ class Outputs:
         self._connected, self._at_zero = True, False
         self.driver.zero_outputs()
         self._at_zero = True
-        for what, actual, wanted in (
+        for quantity, found, expected in (
             ("joints", info.joints, len(self._rig.joints)),
             ("measured channels", info.channels, len(self._rig.channels)),
             ("samples a second", info.sample_rate, self._rig.sample_rate),
         ):
-            if actual != wanted:
+            if found != expected:
                 raise DeviceError(
-                    f"the device {info.identity!r} has {actual:g} {what}, "
-                    f"rig {self._rig.name!r} has {wanted:g}; use the rig file of this device"
+                    f"the device {info.identity!r} has {found:g} {quantity}, "
+                    f"rig {self._rig.name!r} has {expected:g}; use the rig file of this device"
                 )
         return info
 
@@ -72,11 +72,11 @@ class Outputs:
             except (Exception, SystemExit) as error:
                 problem = error
             else:
-                self._silent = self._told = False
+                self._silent = self._logged = False
                 self._at_zero = True
                 return True
         self._at_zero = False
-        if not self._told:
+        if not self._logged:
             log.error(
                 "%s (%s); the device's own watchdog should zero them in %g s: keep away from the "
                 "machine, use its emergency stop",
@@ -85,7 +85,7 @@ class Outputs:
                 self._rig.wire.watchdog,
                 extra={"alarm": True},
             )
-        self._silent = self._told = True
+        self._silent = self._logged = True
         return False
 
     def surely_zero(self) -> bool:
@@ -125,8 +125,8 @@ class Outputs:
 
     def zeroed_elsewhere(self, block: SampleBlock) -> bool:
         """Return whether a block shows that another client has zeroed the outputs."""
-        due = self._armed_from is not None and block.tick >= self._armed_from
-        return due and not block.armed and not block.tripped
+        in_force = self._armed_from is not None and block.tick >= self._armed_from
+        return in_force and not block.armed and not block.tripped
 
     def bounded(self, laws: Sequence[OutputLaw]) -> list[OutputLaw]:
         """Return the laws limited to each joint's limits.command; raises ValueError."""
@@ -147,23 +147,23 @@ class Outputs:
         `BENCH.queued_seconds` of device time, or that much wall time plus two answer times.
         """
         rig = self._rig
-        wanted = round(seconds * rig.sample_rate)
-        most = round((seconds + BENCH.queued_seconds) * rig.sample_rate)
+        needed = round(seconds * rig.sample_rate)
+        longest = round((seconds + BENCH.queued_seconds) * rig.sample_rate)
         deadline = clock() + seconds + BENCH.queued_seconds + 2 * rig.wire.timeout
-        quiet = taken = 0
+        quiet = recorded = 0
         moving = False
-        while quiet < wanted and taken < most and clock() < deadline:
+        while quiet < needed and recorded < longest and clock() < deadline:
             try:
                 block = self.safely(self.driver.read_block)
                 keep(block)
             except (DeviceError, RecordingFailed) as error:
-                log.warning("%.1f s recorded after zeroing: %s", taken / rig.sample_rate, error)
+                log.warning("%.1f s recorded after zeroing: %s", recorded / rig.sample_rate, error)
                 return True
             nonzero = np.flatnonzero((block.data[:, len(rig.channels) :] != 0.0).any(axis=1))
-            since = len(block.data) - 1 - int(nonzero[-1]) if len(nonzero) else None
-            moving = since == 0
-            quiet = quiet + len(block.data) if since is None else since
-            taken += len(block.data)
+            zero_samples = len(block.data) - 1 - int(nonzero[-1]) if len(nonzero) else None
+            moving = zero_samples == 0
+            quiet = quiet + len(block.data) if zero_samples is None else zero_samples
+            recorded += len(block.data)
         return not moving
 
     def close(self, *, tripped: bool = False) -> bool:

@@ -60,20 +60,22 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
         cause = driver.trip_cause()
         driver.start()
         block = driver.read_block()
-        taken = block
+        latest = block
         for _ in range(MOST_BLOCKS):
-            if taken.read_at is None or sum(map(len, late)) >= TIMED_SAMPLES:
+            if latest.read_at is None or sum(map(len, late)) >= TIMED_SAMPLES:
                 break
-            taken = driver.read_block()
-            if taken.read_at is not None:
-                due = (taken.tick + np.arange(len(taken.data))) / rig.sample_rate
-                late.append((taken.read_at - due)[np.isfinite(taken.read_at)])
+            latest = driver.read_block()
+            if latest.read_at is not None:
+                nominal = (latest.tick + np.arange(len(latest.data))) / rig.sample_rate
+                late.append((latest.read_at - nominal)[np.isfinite(latest.read_at)])
         driver.stop()
         doubts = driver.doubts() if isinstance(driver, ReportsDoubts) else {}
     finally:
         driver.close()
-    every = np.concatenate(late) if late else np.empty(0)
-    timing = Lateness(len(every), float(every.mean()), float(every.std())) if len(every) else None
+    samples = np.concatenate(late) if late else np.empty(0)
+    n, timing = len(samples), None
+    if n:
+        timing = Lateness(n, float(samples.mean()), float(samples.std()))
     marked = [
         replace(reading, mark=doubts.get(reading.channel, reading.mark))
         for reading in readings(block, rig)

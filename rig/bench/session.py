@@ -98,7 +98,7 @@ class Bench:
         self._alarms = AlarmLog(rig, lambda event, tick, about: self.event(event, tick, **about))
         self._stop = StopFlag()
         self._signals = signals
-        self._display = Display(rig, publisher, _place(recorder), clock)
+        self._display = Display(rig, publisher, _folder_of(recorder), clock)
         self._arrival: ArrivalClock | None = None
         self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
@@ -150,12 +150,12 @@ class Bench:
         Raises OperatorStop during the wait, DeviceError or a subclass if the device is still lost.
         """
         self._outputs.close()
-        until = self._clock() + wait
+        deadline = self._clock() + wait
         self.status(device=LOST)
-        while self._clock() < until:
+        while self._clock() < deadline:
             self._obey_requests()
             self._display.repeat()
-            time.sleep(min(0.1, max(0.0, until - self._clock())))
+            time.sleep(min(0.1, max(0.0, deadline - self._clock())))
         self.info = self._connect()
         cause = self._outputs.safely(self._driver.trip_cause)
         if cause is not None:
@@ -169,10 +169,10 @@ class Bench:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        sure = self._leave(error)
+        confirmed = self._leave(error)
         if error is None and self._stop.reason is not None:
             raise OperatorStop(f"{self._stop.reason}; the run itself was complete")
-        if error is None and not sure:
+        if error is None and not confirmed:
             raise DeviceLost(f"{UNSURE}; the run itself was complete")
 
     def _leave(self, error: BaseException | None) -> bool:
@@ -182,17 +182,17 @@ class Bench:
         """
         state, message = _outcome(error)
         unsure = f"{message}; {UNSURE}".lstrip("; ")
-        sure = False
+        confirmed = False
         try:
-            sure = self._outputs.surely_zero()
+            confirmed = self._outputs.surely_zero()
             # Published first because a screen waits for it, and writing the data can take seconds.
             lost = isinstance(error, DeviceLost)
-            self._display.ended(state, message if sure else unsure, lost=lost)
-            if sure and not self._ends_at_zero(error):
+            self._display.ended(state, message if confirmed else unsure, lost=lost)
+            if confirmed and not self._ends_at_zero(error):
                 log.error("%s: the device still reports a command", UNSURE, extra={"alarm": True})
-                sure = False
-            if not self._outputs.close(tripped=self.trip is not None) or not sure:
-                sure, message = False, unsure
+                confirmed = False
+            if not self._outputs.close(tripped=self.trip is not None) or not confirmed:
+                confirmed, message = False, unsure
                 self._display.ended(state, message)
                 if error is not None:
                     error.add_note(UNSURE)
@@ -203,7 +203,7 @@ class Bench:
             finally:
                 self._display.close()
                 self._stop.restore()
-        return sure
+        return confirmed
 
     def _ends_at_zero(self, error: BaseException | None) -> bool:
         """Record the outputs at zero after an early end; False if the device reports a command."""
@@ -413,16 +413,16 @@ class Bench:
         are zeroed.
         """
         rate = self.rig.sample_rate
-        passed, taken = 0, []
-        wanted = math.ceil(seconds * rate - 1e-6)
-        while passed < wanted:
-            before = self._expected
-            block = self.exchange(more=wanted - passed > self.info.block_samples)
-            passed += len(block.data) if before is None else self.tick - before
-            taken.append(block.data)
+        samples, blocks = 0, []
+        needed = math.ceil(seconds * rate - 1e-6)
+        while samples < needed:
+            expected = self._expected
+            block = self.exchange(more=needed - samples > self.info.block_samples)
+            samples += len(block.data) if expected is None else self.tick - expected
+            blocks.append(block.data)
             if watch is not None:
                 self._outputs.safely(lambda b=block: watch(b))  # type: ignore[misc]
-        return np.concatenate(taken) if taken else np.empty((0, len(self.rig.recorded)))
+        return np.concatenate(blocks) if blocks else np.empty((0, len(self.rig.recorded)))
 
     # Called by the engine
 
@@ -466,19 +466,19 @@ class Bench:
         the `with` block; `start_tick` and `ticks` fix it in advance (as returned by `apply`) or
         afterwards.
         """
-        what = RecordMeta(**fields) if meta is None else meta
+        description = RecordMeta(**fields) if meta is None else meta
         if start_tick is None:
             if self._expected is None:
                 raise ValueError("no tick is known yet: exchange a block first, or give start_tick")
             start_tick = self._expected
-        return RecordHandle(self, what, start_tick, ticks)
+        return RecordHandle(self, description, start_tick, ticks)
 
 
 def _nothing() -> None:
     pass
 
 
-def _place(recorder: Recorder | None) -> str:
+def _folder_of(recorder: Recorder | None) -> str:
     """Return the absolute path of the run's folder, since a screen may run in another folder."""
     return "" if recorder is None else str(recorder.folder.absolute())
 

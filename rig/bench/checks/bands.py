@@ -94,8 +94,8 @@ class Bounds:
 
         True for most blocks, and three times as fast as checking each sample.
         """
-        held = np.count_nonzero(least >= self.low) + np.count_nonzero(most <= self.high)
-        return bool(held == 2 * len(self.low))
+        inside = np.count_nonzero(least >= self.low) + np.count_nonzero(most <= self.high)
+        return bool(inside == 2 * len(self.low))
 
     def within(self, other: Bounds) -> Bounds:
         """Return the intersection of both bands."""
@@ -158,16 +158,16 @@ def _trip_band(rig: Rig, roles: tuple[JointRole, ...], name: str) -> Range:
         valve = rig.joints[joint - 1].valve
         step = valve.command_range / ((1 << (valve.command_bits - 1)) - 1)
         low, high = low - step, high + step
-    own = ends(rig.alarms.channels.get(name, _NO_BAND).trip)
-    return max(low, own[0]), min(high, own[1])
+    stated = ends(rig.alarms.channels.get(name, _NO_BAND).trip)
+    return max(low, stated[0]), min(high, stated[1])
 
 
 def _warning_band(
     rig: Rig, roles: tuple[JointRole, ...], name: str, settings: GuardSettings
 ) -> Range:
-    given = rig.alarms.channels.get(name, _NO_BAND).warning
-    if given is not None:
-        return ends(given)
+    stated = rig.alarms.channels.get(name, _NO_BAND).warning
+    if stated is not None:
+        return ends(stated)
     kind, joint = ch.kind_of(name)
     share = rig.alarms.warning_share
     if joint is not None:
@@ -217,7 +217,7 @@ def inner_bounds(rig: Rig, outer: Bounds, settings: GuardSettings) -> Bounds:
     widths = []
     for column, name in enumerate(rig.recorded):
         low, high = outer.of(column)
-        given = rig.alarms.channels.get(name, _NO_BAND).dead_band
-        usual = settings.dead_band * (high - low) if high - low < _HUGE else 0.0
-        widths.append(usual if given is None else given)
+        stated = rig.alarms.channels.get(name, _NO_BAND).dead_band
+        default = settings.dead_band * (high - low) if high - low < _HUGE else 0.0
+        widths.append(default if stated is None else stated)
     return Bounds(outer.low + np.array(widths), outer.high - np.array(widths))

@@ -44,17 +44,17 @@ class ExpectedSpool:
 
         The spool at a sample follows from the commands up to the sample before.
         """
-        wanted = np.minimum(np.maximum(self._gain * commands, -self._stroke), self._stroke)
+        targets = np.minimum(np.maximum(self._gain * commands, -self._stroke), self._stroke)
         # At rest under the first command.
-        self._states = self._states or [np.array([row[0], 0.0]) for row in wanted]
+        self._states = self._states or [np.array([row[0], 0.0]) for row in targets]
         out = np.empty_like(commands)
-        for first in range(0, commands.shape[1], _AT_ONCE):
+        for start in range(0, commands.shape[1], _AT_ONCE):
             for j, maps in enumerate(self._maps):
-                part = wanted[j][first : first + _AT_ONCE]
-                n = len(part)
-                known = np.concatenate((self._states[j], part))
-                out[j, first : first + n] = maps[:n, 0, : n + 2] @ known
-                self._states[j] = maps[n, :, : n + 2] @ known
+                inputs = targets[j][start : start + _AT_ONCE]
+                n = len(inputs)
+                state_and_inputs = np.concatenate((self._states[j], inputs))
+                out[j, start : start + n] = maps[:n, 0, : n + 2] @ state_and_inputs
+                self._states[j] = maps[n, :, : n + 2] @ state_and_inputs
         return out
 
 

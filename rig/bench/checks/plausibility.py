@@ -86,10 +86,10 @@ class Plausibility:
         self._hop = max(1, round(settings.hop * rate))
         self._confirm = round(settings.confirm * rate)
         self._expected = ExpectedSpool(rig)
-        each = range(1, len(rig.joints) + 1)
+        joints = range(1, len(rig.joints) + 1)
 
         def columns(kind: str) -> list[int]:
-            return [rig.recorded.index(ch.channel(kind, i)) for i in each]
+            return [rig.recorded.index(ch.channel(kind, i)) for i in joints]
 
         self._spools_at = np.array(columns(ch.SPOOL))
         self._commands_at = np.array(columns(ch.COMMAND))
@@ -166,38 +166,38 @@ class Plausibility:
             self._spools_expected = _latest(self._window, self._spools_expected, expected)
 
     def _findings(self, window: _Window, roles: Roles, tick: int) -> Iterator[Violation]:
-        def say(
+        def report(
             limit: str, column: int, value: float, allowed: tuple[float, float], unit: str = ""
         ) -> Violation:
             name = self._rig.recorded[column]
             joint = ch.kind_of(name)[1]
             return Violation(limit, value, allowed, unit or ch.unit_of(name), joint, name, tick)
 
-        yield from self._spools(window, say)
-        yield from self._pistons(window, roles, say)
-        yield from self._pressures(window, roles, say)
-        yield from self._sensors(window, roles, say)
-        yield from self._noisy(window.data, say)
+        yield from self._spools(window, report)
+        yield from self._pistons(window, roles, report)
+        yield from self._pressures(window, roles, report)
+        yield from self._sensors(window, roles, report)
+        yield from self._noisy(window.data, report)
 
-    def _spools(self, window: _Window, say: Callable[..., Violation]) -> Iterator[Violation]:
+    def _spools(self, window: _Window, report: Callable[..., Violation]) -> Iterator[Violation]:
         settings, expected = self._settings, window.expected
-        off = window.data[self._spools_at] - expected
-        means = _mean(off)
+        deviation = window.data[self._spools_at] - expected
+        means = _mean(deviation)
         constants = means.tolist()
-        moving = _mean(np.abs(off - means[:, None])).tolist()
+        moving = _mean(np.abs(deviation - means[:, None])).tolist()
         commanded = _mean(np.abs(expected - _mean(expected)[:, None])).tolist()
         for j, joint in enumerate(self._rig.joints):
             stroke = joint.valve.spool_stroke
             bound = max(settings.spool_share * commanded[j], self._spool_floor[j])
             if moving[j] > bound:
-                yield say(NOT_FOLLOWING, self._spool[j], moving[j], (-math.inf, bound))
+                yield report(NOT_FOLLOWING, self._spool[j], moving[j], (-math.inf, bound))
             elif abs(constants[j]) > settings.spool_constant * stroke:
                 bound = settings.spool_constant * stroke
-                yield say(NOT_FOLLOWING, self._spool[j], constants[j], (-bound, bound))
+                yield report(NOT_FOLLOWING, self._spool[j], constants[j], (-bound, bound))
 
-    def _pistons(self, window: _Window, roles: Roles, say: Callable[..., Violation]) -> Iterator[
-        Violation
-    ]:  # fmt: skip
+    def _pistons(
+        self, window: _Window, roles: Roles, report: Callable[..., Violation]
+    ) -> Iterator[Violation]:
         settings = self._settings
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
             if role.locked:
@@ -208,7 +208,7 @@ class Plausibility:
             if self._within_stroke(window, j) and swing < still:
                 opening = _mean(np.abs(window.data[self._spool[j]]))
                 if opening > settings.open_spool * joint.valve.spool_stroke:
-                    yield say(NOTHING_MOVES, column, swing, (still, math.inf))
+                    yield report(NOTHING_MOVES, column, swing, (still, math.inf))
             if window.at_zero(self._command[j]):
                 piston = window.data[column]
                 half = len(piston) // 2
@@ -216,40 +216,40 @@ class Plausibility:
                 speed = step * self._rig.sample_rate / (len(piston) - half)
                 drift = settings.drift * joint.limits.speed
                 if abs(speed) > drift:
-                    yield say(DRIFTS, column, speed, (-drift, drift), "m/s")
+                    yield report(DRIFTS, column, speed, (-drift, drift), "m/s")
 
-    def _pressures(self, window: _Window, roles: Roles, say: Callable[..., Violation]) -> Iterator[
-        Violation
-    ]:  # fmt: skip
+    def _pressures(
+        self, window: _Window, roles: Roles, report: Callable[..., Violation]
+    ) -> Iterator[Violation]:
         settings, nominal = self._settings, self._rig.supply.pressure
         means, peaks = window.mean, window.most
         supply = nominal if self._supply is None else means[self._supply]
         top = settings.above_supply * max(supply, nominal)
-        least = settings.empty_chamber * nominal
-        lost = settings.supply_lost * nominal
+        empty = settings.empty_chamber * nominal
+        supply_lost = settings.supply_lost * nominal
         excited = any(role.excited for role in roles)
-        if excited and self._supply is not None and peaks[self._supply] < lost:
-            yield say(SUPPLY_LOST, self._supply, supply, (lost, math.inf))
+        if excited and self._supply is not None and peaks[self._supply] < supply_lost:
+            yield report(SUPPLY_LOST, self._supply, supply, (supply_lost, math.inf))
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
             swing = window.swing(self._command[j])
             driven = role.excited and swing > SWING * joint.limits.command
             for column in (self._cap[j], self._rod[j]):
                 mean, peak = means[column], peaks[column]
                 if mean > top:
-                    yield say(ABOVE_SUPPLY, column, mean, (-math.inf, top))
-                if driven and peak < least:
-                    yield say(EMPTY_CHAMBER, column, peak, (least, math.inf))
+                    yield report(ABOVE_SUPPLY, column, mean, (-math.inf, top))
+                if driven and peak < empty:
+                    yield report(EMPTY_CHAMBER, column, peak, (empty, math.inf))
 
-    def _sensors(self, window: _Window, roles: Roles, say: Callable[..., Violation]) -> Iterator[
-        Violation
-    ]:  # fmt: skip
+    def _sensors(
+        self, window: _Window, roles: Roles, report: Callable[..., Violation]
+    ) -> Iterator[Violation]:
         def shown(limit: str, finding: PressureFinding) -> Violation:
             column = (self._cap if finding.cap else self._rod)[finding.joint]
-            return say(limit, column, finding.value, finding.allowed)
+            return report(limit, column, finding.value, finding.allowed)
 
         excited = [j for j, role in enumerate(roles) if role.excited]
-        held = [j for j, role in enumerate(roles) if role.locked]
-        if len(excited) != 1 or len(excited) + len(held) != len(roles):
+        locked = [j for j, role in enumerate(roles) if role.locked]
+        if len(excited) != 1 or len(excited) + len(locked) != len(roles):
             return  # a free joint loads the others by an unknown amount
         rig, settings, slow = self._rig, self._settings, self._slow
         rows = slow.last(settings.trend_span)
@@ -261,8 +261,8 @@ class Plausibility:
         if rows is None:
             return
         commands = rows[:, :, pressure_sensors.COMMAND]
-        shut = [j for j in held if not np.count_nonzero(commands[:, j])]
-        closed = [j for j in shut if self._within_stroke(window, j)]
+        still_closed = [j for j in locked if not np.count_nonzero(commands[:, j])]
+        closed = [j for j in still_closed if self._within_stroke(window, j)]
         for swap in pressure_sensors.swapped(rig, settings, closed, rows, self._slow_noise):
             yield shown(SWAPPED, swap)
 
@@ -270,7 +270,7 @@ class Plausibility:
         reach = self._rig.joints[j].cylinder.stroke * (0.5 - self._settings.stroke_end)
         return -reach < window.least[self._piston[j]] and window.most[self._piston[j]] < reach
 
-    def _noisy(self, data: Array, say: Callable[..., Violation]) -> Iterator[Violation]:
+    def _noisy(self, data: Array, report: Callable[..., Violation]) -> Iterator[Violation]:
         """Estimate each channel's noise from its third difference, in which motion is small.
 
         The median over the window leaves out the few samples of a step or an impact.
@@ -289,10 +289,10 @@ class Plausibility:
         above = size.size - np.count_nonzero(size <= self._noise_bound)
         if 2 * above < size.shape[1] - 3:
             return
-        seen, allowed = np.median(size[:, :-3], axis=1) / self._noise_scale, self._noise_allowed
-        for column in np.flatnonzero(seen > allowed).tolist():
+        noise, allowed = np.median(size[:, :-3], axis=1) / self._noise_scale, self._noise_allowed
+        for column in np.flatnonzero(noise > allowed).tolist():
             bound = float(allowed[column])
-            yield say(NOISY, column, float(seen[column]), (-math.inf, bound))
+            yield report(NOISY, column, float(noise[column]), (-math.inf, bound))
 
 
 def _mean(values: Array) -> Array:
@@ -303,8 +303,8 @@ def _mean(values: Array) -> Array:
 
 def _latest(count: int, old: Array, new: Array) -> Array:
     """Return the last `count` columns of `old` and `new`, (rows, n) each; fewer if there are."""
-    kept = max(0, min(old.shape[1], count - new.shape[1]))
-    joined = np.empty((len(old), kept + min(new.shape[1], count)))
-    joined[:, :kept] = old[:, old.shape[1] - kept :]
-    joined[:, kept:] = new[:, -count:]
+    older = max(0, min(old.shape[1], count - new.shape[1]))
+    joined = np.empty((len(old), older + min(new.shape[1], count)))
+    joined[:, :older] = old[:, old.shape[1] - older :]
+    joined[:, older:] = new[:, -count:]
     return joined

@@ -66,11 +66,11 @@ def swapped(
     for j in closed:
         expected = swing_ratio(rig, j, float(np.add.reduce(rows[:, j, PISTON]) / len(rows)))
         for side, ratio in ((0, expected), (1, 1.0 / expected)):
-            own, partner = swings[j][side], swings[j][1 - side]
-            if min(own / noise[side], partner / noise[1 - side]) < settings.swing_noise:
+            swing, partner = swings[j][side], swings[j][1 - side]
+            if min(swing / noise[side], partner / noise[1 - side]) < settings.swing_noise:
                 continue
             fitting = ratio * partner
-            if fitting / others_far <= own <= fitting * others_far:
+            if fitting / others_far <= swing <= fitting * others_far:
                 continue
             for i in range(len(swings)):
                 for k in range(2):
@@ -80,7 +80,7 @@ def swapped(
                     together = np.mean(x[:, i, k] * x[:, j, 1 - side]) / (swings[i][k] * partner)
                     if together < -settings.swing_phase:
                         bounds = fitting / others_far, fitting * others_far
-                        yield PressureFinding(j, side == 0, own, bounds)
+                        yield PressureFinding(j, side == 0, swing, bounds)
 
 
 def drifting(
@@ -97,25 +97,25 @@ def drifting(
     force = cap - part.rod_area / part.cap_area * rod
     bound = settings.trend * rig.supply.pressure
     time = np.arange(len(force)) / (len(force) - 1) - 0.5
-    least = settings.trend_alone * (time @ time)
+    least_energy = settings.trend_alone * (time @ time)
     # The Cauchy-Schwarz bound of the trend; mostly it is small and no fit is needed.
     spread = force - np.add.reduce(force) / len(force)
-    if spread @ spread < (1.0 - 1e-6) * bound**2 * least:
+    if spread @ spread < (1.0 - 1e-6) * bound**2 * least_energy:
         return None
     terms = _motion(rows[:, joint, PISTON], seconds)
-    leftover = time - terms @ _fit(terms, time)
-    energy = leftover @ leftover
-    if energy < least:
+    unexplained = time - terms @ _fit(terms, time)
+    energy = unexplained @ unexplained
+    if energy < least_energy:
         return None
     # The coefficient of time in a joint fit of motion and time (Frisch, Waugh 1933).
-    trend = (leftover @ force) / energy
+    trend = (unexplained @ force) / energy
     if abs(trend) < bound:
         return None
-    rest = force - terms @ _fit(terms, force)
-    explained = rest - leftover * trend
-    if rest @ rest < settings.trend_clear**2 * (explained @ explained):
+    residual = force - terms @ _fit(terms, force)
+    explained = residual - unexplained * trend
+    if residual @ residual < settings.trend_clear**2 * (explained @ explained):
         return None
-    trends = np.array([leftover @ cap, leftover @ rod]) / energy
+    trends = np.array([unexplained @ cap, unexplained @ rod]) / energy
     size = np.abs(trends)
     side = int(np.argmax(size))
     if size[1 - side] > settings.trend_other * size[side]:
@@ -142,11 +142,11 @@ class SlowRows:
     def add(self, states: Array) -> None:
         """Add the next samples, (n, joints, 4): piston [m], cap and rod [Pa], command [V]."""
         samples = np.concatenate([self._begun, states]) if len(self._begun) else states
-        whole = len(samples) // self.each * self.each
-        self._begun = samples[whole:]
-        parts = samples[:whole].reshape(-1, self.each, *samples.shape[1:])
-        rows = np.add.reduce(parts, axis=1) / self.each
-        np.maximum.reduce(np.abs(parts[:, :, :, COMMAND]), axis=1, out=rows[:, :, COMMAND])
+        complete = len(samples) // self.each * self.each
+        self._begun = samples[complete:]
+        groups = samples[:complete].reshape(-1, self.each, *samples.shape[1:])
+        rows = np.add.reduce(groups, axis=1) / self.each
+        np.maximum.reduce(np.abs(groups[:, :, :, COMMAND]), axis=1, out=rows[:, :, COMMAND])
         self._rows = np.concatenate([self._rows, rows])[-self._most :]
 
     def last(self, span: float) -> Array | None:

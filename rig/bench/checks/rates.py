@@ -51,10 +51,10 @@ class Rate:
             return None, []
         start = first + len(joined) - len(values) + self.window
         share = rig.alarms.warning_share
-        over = size > self.bounds
+        exceeded = size > self.bounds
         trip = None
-        if over.any():
-            trip = self._violation(rig, steps, start, *first_of(over), 1.0)
+        if exceeded.any():
+            trip = self._violation(rig, steps, start, *first_of(exceeded), 1.0)
         warnings = [
             self._violation(rig, steps, start, int(np.argmax(near[:, column])), column, share)
             for column in np.flatnonzero(near.any(axis=0)).tolist()
@@ -85,10 +85,10 @@ def rates(rig: Rig) -> tuple[Rate, ...]:
         window = rate_window(rig.sensors.of(kind).noise, limit, rig.sample_rate)
         what = "piston speed" if kind == ch.PISTON else "pressure rate"
         limits_by_window.setdefault((what, window), []).append((column, limit))
-    made = []
-    for (what, window), entries in limits_by_window.items():
+    bounded_rates = []
+    for (name, window), entries in limits_by_window.items():
         bounds = np.full(len(rig.recorded), math.inf)
         for column, limit in entries:
             bounds[column] = limit * (window / rig.sample_rate)
-        made.append(Rate(what, window, bounds, rig.alarms.warning_share * bounds))
-    return tuple(made)
+        bounded_rates.append(Rate(name, window, bounds, rig.alarms.warning_share * bounds))
+    return tuple(bounded_rates)

@@ -26,11 +26,11 @@ class Recent:
         """Append rows (n, columns); views that `last` returned before are then invalid."""
         end = self._end + len(rows)
         if end > len(self._rows):
-            kept = self.last(self._keep).copy()
-            end = len(kept) + len(rows)
+            retained = self.last(self._keep).copy()
+            end = len(retained) + len(rows)
             if end > len(self._rows):
                 self._rows = np.empty((_ROOM * end, self._rows.shape[1]))
-            self._rows[: len(kept)] = kept
+            self._rows[: len(retained)] = retained
         self._rows[end - len(rows) : end] = rows
         self._end = end
 

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 SWING: Final = 0.05  # share of the command's limit, peak to peak, that moves a joint
 HELD: Final = 0.01  # share of the command's limit that, kept up in a jog, moves a joint
-_MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
+_MOVES = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
 
 _VACUUM = -90e3  # no gauge pressure is far below this, so such a range cannot be exceeded
 
@@ -37,22 +37,22 @@ class Frozen:
     """Finds a channel of one joint (0-based) that stays constant while the joint moves."""
 
     def __init__(self, rig: Rig, joint: int) -> None:
-        own = [(c, *ch.kind_of(name)) for c, name in enumerate(rig.channels)]
-        parts = [(c, rig.sensors.of(kind)) for c, kind, which in own if which == joint + 1]
+        measured = [(c, *ch.kind_of(name)) for c, name in enumerate(rig.channels)]
+        parts = [(c, rig.sensors.of(kind)) for c, kind, number in measured if number == joint + 1]
         self._columns = np.array([column for column, _ in parts])
         codes = np.array([converter_step(s) for _, s in parts])
         noise = np.array([s.noise for _, s in parts])
         self._judged = noise >= codes
         self.judged = np.zeros(len(rig.recorded), dtype=bool)  # of all that is recorded
         self.judged[self._columns[self._judged]] = True
-        self._moved = _MOVED * np.maximum(noise, codes)
+        self._moves_by = _MOVES * np.maximum(noise, codes)
         self._low = np.array([s.range[0] for _, s in parts]) + codes
         self._high = np.array([s.range[1] for _, s in parts]) - codes
         self._command = rig.recorded.index(ch.channel(ch.COMMAND, joint + 1))
         self._swing = SWING * rig.joints[joint].limits.command
         self._held = HELD * rig.joints[joint].limits.command
         self._position = np.array(
-            [kind == rig.position_kind for _, kind, i in own if i == joint + 1]
+            [kind == rig.position_kind for _, kind, i in measured if i == joint + 1]
         )
 
     def find(self, window: Array, jogged: bool = False) -> int | None:
@@ -65,7 +65,7 @@ class Frozen:
         command = window[:, self._command]
         if jogged:
             still &= self._position & (max(command.min(), -command.max()) >= self._held)
-        elif np.ptp(command) < self._swing or not (np.ptp(values, axis=0) > self._moved).any():
+        elif np.ptp(command) < self._swing or not (np.ptp(values, axis=0) > self._moves_by).any():
             return None
         return int(self._columns[np.argmax(still)]) if still.any() else None
 
@@ -101,10 +101,10 @@ class Saturation:
         runs = run_lengths(block.saturated, self._runs)
         self._runs, self._any = runs[-1], True
         measured = block.data[:, : runs.shape[1]]
-        over = runs >= np.where(measured > self._middles, self._at_high, self._at_low)
-        if not over.any():
+        too_long = runs >= np.where(measured > self._middles, self._at_high, self._at_low)
+        if not too_long.any():
             return []
-        row, column = first_of(over)
+        row, column = first_of(too_long)
         name = self._rig.channels[column]
         kind, joint = ch.kind_of(name)
         ends = self._rig.sensors.of(kind).range

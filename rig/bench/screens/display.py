@@ -102,8 +102,8 @@ class Display:
         if state == runstate.RUNNING and not self._publisher.watched:
             return  # no screen attached; a later one gets the last minute and new samples
         if self._first is not None:
-            done = (self._tick - self._first) / self._rig.sample_rate
-            self.progress = replace(self.progress, done_s=done)
+            elapsed = (self._tick - self._first) / self._rig.sample_rate
+            self.progress = replace(self.progress, done_s=elapsed)
         limits, warnings = self._both_bands()
         view = BenchView(
             run=self._run,

@@ -215,5 +215,5 @@ def past_from(header: Mapping[str, Any], raw: bytes) -> PastMinute:
         plan = tuple(PlanLine(**line) for line in header["plan"])
     except (TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"not a valid answer to the command past: {error}") from error
-    cut = 1 + len(names)
-    return PastMinute(names, table[:, 0], table[:, 1:cut], table[:, cut:], plan)
+    middle = 1 + len(names)
+    return PastMinute(names, table[:, 0], table[:, 1:middle], table[:, middle:], plan)

@@ -168,13 +168,13 @@ class Publisher:
         if len(os.fsencode(path)) > _MAX_PATH:
             raise zmq.ZMQError(errno.ENAMETOOLONG)
         path.unlink(missing_ok=True)
-        made = self._context.socket(kind)
-        made.setsockopt(zmq.SNDHWM, 8)
-        made.setsockopt(zmq.RCVHWM, _COMMANDS_AT_ONCE)
-        made.setsockopt(zmq.LINGER, 200)  # [ms] for sending the last snapshot and answer
-        made.setsockopt(zmq.MAXMSGSIZE, 1 << 16)
-        made.bind(_address(path))
-        return made
+        bound = self._context.socket(kind)
+        bound.setsockopt(zmq.SNDHWM, 8)
+        bound.setsockopt(zmq.RCVHWM, _COMMANDS_AT_ONCE)
+        bound.setsockopt(zmq.LINGER, 200)  # [ms] for sending the last snapshot and answer
+        bound.setsockopt(zmq.MAXMSGSIZE, 1 << 16)
+        bound.bind(_address(path))
+        return bound
 
     @property
     def watched(self) -> bool:
