@@ -46,7 +46,7 @@ def write_group(
     """Write one group: a dataset with `units` per channel, attributes on the group."""
     target = file.create_group(group)
     for key, value in attributes.items():
-        target.attrs[key] = _plain(value)
+        target.attrs[key] = _attribute_value(value)
     for name, values in columns.items():
         data = np.ascontiguousarray(values, dtype="<f8")
         # A checksum needs chunks, which need a length above 0.
@@ -57,7 +57,7 @@ def write_group(
         dataset.attrs["units"] = unit_of(name)
 
 
-def _plain(value: Any) -> Any:
+def _attribute_value(value: Any) -> Any:
     if isinstance(value, bool):
         return int(value)  # HDF5 would store an enumeration
     if isinstance(value, (tuple, list)):
@@ -117,11 +117,11 @@ class _Output(io.FileIO):
 
     def write(self, data: Any) -> int:
         """Write all of `data`, unless a write has failed; return its length [bytes]."""
-        rest = memoryview(data)
-        size = len(rest)
+        unwritten = memoryview(data)
+        size = len(unwritten)
         try:
-            while rest and self.failure is None:
-                rest = rest[super().write(rest) :]
+            while unwritten and self.failure is None:
+                unwritten = unwritten[super().write(unwritten) :]
         except OSError as error:
             self.failure = error
         return size
@@ -171,8 +171,8 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
             for section in sections:
                 assembled = assemble(journal, spans, section)
                 attributes = _attributes(section, rate, assembled, clocks.get(section.stream))
-                each = {name: assembled.data[:, i] for i, name in enumerate(columns)}
-                write_group(file, section.group, each, attributes)
+                channels = {name: assembled.data[:, i] for i, name in enumerate(columns)}
+                write_group(file, section.group, channels, attributes)
                 _note_saturation(file[section.group], columns, assembled)
                 lost += assembled.lost if section.meta else 0
         damaged = verify(journal, fresh, sections)
@@ -205,17 +205,18 @@ def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:
     total = damaged = 0
     with h5py.File(path, "r", locking=False) as file:
         for section in sections:
-            kept = np.column_stack([file[section.group][name][:] for name in columns])
-            if kept.shape != (section.ticks, len(columns)):
-                raise OSError(f"group {section.group} has {len(kept)} samples, not {section.ticks}")
+            stored = np.column_stack([file[section.group][name][:] for name in columns])
+            if stored.shape != (section.ticks, len(columns)):
+                count = f"{len(stored)} samples, not {section.ticks}"
+                raise OSError(f"group {section.group} has {count}")
             arrived = 0
-            for block, rows, part in blocks_of(journal, spans, section):
+            for block, rows, block_rows in blocks_of(journal, spans, section):
                 if block is None:
                     damaged += 1
                     continue
-                if not np.array_equal(kept[rows], block.data[part], equal_nan=True):
+                if not np.array_equal(stored[rows], block.data[block_rows], equal_nan=True):
                     raise OSError(f"group {section.group} differs at tick {block.tick}")
-                arrived += part.stop - part.start
+                arrived += block_rows.stop - block_rows.start
             if arrived + int(file[section.group].attrs["lost_samples"]) != section.ticks:
                 raise OSError(f"group {section.group} has a wrong count of lost samples")
             total += arrived
@@ -235,8 +236,8 @@ def write_run(folder: str | Path, run: Run) -> Path:
     with store.whole_run(out, run.rig, run.source) as path:
         with create(path / store.ARCHIVE, run.rig.name) as file:
             for order, r in enumerate(run.records):
-                about = record_attributes(vars(r), r.sample_rate, r.start, complete=True)
-                more = {**r.attributes, **about, "stream": order, "start_tick": 0}
-                write_group(file, r.name, r.channels, more, run.rig.unit_of)
+                described = record_attributes(vars(r), r.sample_rate, r.start, complete=True)
+                attributes = {**r.attributes, **described, "stream": order, "start_tick": 0}
+                write_group(file, r.name, r.channels, attributes, run.rig.unit_of)
         write_state(path, DONE)
     return out

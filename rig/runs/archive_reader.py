@@ -16,7 +16,7 @@ from rig.runs.runstate import BETWEEN
 from rig.runs.sections import Written
 
 FORMAT = 1
-_OWN = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
+_HEAD = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
 
 
 def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
@@ -29,7 +29,7 @@ def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
             f"{path}: record {name} cannot be read: the file is damaged; take it from a backup"
         )
     attributes = {key: _python(value) for key, value in group.attrs.items()}
-    missing = [key for key in _OWN if key not in attributes]
+    missing = [key for key in _HEAD if key not in attributes]
     if missing:
         raise InputError(f"{path}: record {name} lacks {missing[0]!r}; take it from a backup")
     lengths = {str(key): group[key].shape for key in group}
@@ -46,7 +46,7 @@ def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
         start=float(attributes["start_s"]),
         period=int(attributes["period"]),
         lines=tuple(int(k) for k in attributes["lines"]),
-        attributes={k: v for k, v in attributes.items() if k not in _OWN[:-1] and k != "kind"},
+        attributes={k: v for k, v in attributes.items() if k not in _HEAD[:-1] and k != "kind"},
     )
 
 

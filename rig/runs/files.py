@@ -97,18 +97,18 @@ def replace_text(path: Path, text: str) -> None:
 
 def replace_bytes(path: Path, content: bytes) -> None:
     """Replace a file atomically: a reader sees the old or the new bytes; raises OSError."""
-    fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with fresh.open("wb") as stream:
+        with temporary.open("wb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
-        fresh.replace(path)
+        temporary.replace(path)
     except OSError as error:
         error.filename = os.fspath(path)  # the name that the user knows; a failed write names none
         raise
     finally:
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     sync_to_disk(path.parent)
 
 
@@ -131,9 +131,9 @@ def _remove_abandoned(folder: Path) -> None:
     """Remove a scratch folder of this user; raises OSError if its process holds it."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        found = os.fstat(handle)
+        status = os.fstat(handle)
         # A younger one may not be locked yet.
-        if found.st_uid == os.getuid() and time.time() - found.st_mtime > _UNLOCKED_SECONDS:
+        if status.st_uid == os.getuid() and time.time() - status.st_mtime > _UNLOCKED_SECONDS:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             shutil.rmtree(folder)
     finally:
@@ -146,25 +146,25 @@ def new_folder(out: Path) -> Iterator[Path]:
 
     `out` must be absent or empty, and stays so after an error or a kill. Raises OSError.
     """
-    place = out.resolve()
-    empty = place.exists()
-    place.parent.mkdir(parents=True, exist_ok=True)
-    fresh = (place if empty else place.parent) / f".{place.name}.{os.getpid()}.tmp"
-    fresh.mkdir()
+    target = out.resolve()
+    exists = target.exists()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = (target if exists else target.parent) / f".{target.name}.{os.getpid()}.tmp"
+    temporary.mkdir()
     try:
-        yield fresh
-        files = list(fresh.iterdir())
-        for path in (*files, fresh):
+        yield temporary
+        files = list(temporary.iterdir())
+        for path in (*files, temporary):
             sync_to_disk(path)
-        if empty:
+        if exists:
             for path in files:
-                path.replace(place / path.name)
+                path.replace(target / path.name)
         else:
-            fresh.replace(place)
+            temporary.replace(target)
     except OSError as error:
         if error.errno is not None and error.filename is None:  # a failed write
             error.filename = os.fspath(out)
         raise
     finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-    sync_to_disk(place if empty else place.parent)
+        shutil.rmtree(temporary, ignore_errors=True)
+    sync_to_disk(target if exists else target.parent)

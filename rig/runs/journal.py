@@ -166,19 +166,19 @@ def read_tail(path: Path, after: int) -> list[BlockRow]:
     """
     tail = tail_of(path)
     data = tail.read_bytes()[:TAIL_BYTES] if tail.is_file() else b""
-    rows, at = [], 0
-    while at + _ENTRY.size <= len(data):
-        begin, length, crc = _ENTRY.unpack_from(data, at)
-        body = data[at + _ENTRY.size : at + _ENTRY.size + length]
+    rows, offset = [], 0
+    while offset + _ENTRY.size <= len(data):
+        begin, length, crc = _ENTRY.unpack_from(data, offset)
+        body = data[offset + _ENTRY.size : offset + _ENTRY.size + length]
         if begin != _ENTRY_BEGIN or not _NUMBERS.size <= len(body) == length:
             break
-        at += _ENTRY.size + length
+        offset += _ENTRY.size + length
         if zlib.crc32(body) != crc:
             continue
-        *first, late, block_crc, size = _NUMBERS.unpack_from(body)
+        *numbers, late, block_crc, size = _NUMBERS.unpack_from(body)
         samples, marks = body[_NUMBERS.size :][:size], body[_NUMBERS.size + size :]
         row = BlockRow._make(
-            (*first, None if math.isnan(late) else late, block_crc, samples, marks)
+            (*numbers, None if math.isnan(late) else late, block_crc, samples, marks)
         )
         if row.id > after:
             rows.append(row)
@@ -245,8 +245,8 @@ class Journal:
             if journal.meta("format") != _FORMAT:
                 db.close()
                 raise InputError(f"{path}: not a journal of this format")
-            (last,) = db.execute("SELECT max(id) FROM block").fetchone()
-            journal._newest = read_tail(path, after=int(last or 0))
+            (highest,) = db.execute("SELECT max(id) FROM block").fetchone()
+            journal._newest = read_tail(path, after=int(highest or 0))
         except (sqlite3.Error, OSError) as error:
             raise InputError(
                 f"{path}: not a readable journal ({error}; is the disk full, or the file another "
@@ -280,12 +280,12 @@ class Journal:
         self._count += 1
         numbers = (self._count, stream, block.sequence, block.tick, len(block.data))
         row = BlockRow(*numbers, late, crc, data, marks)
-        kept = self._tail.add(row)
-        if not kept:
+        stored = self._tail.add(row)
+        if not stored:
             self.flush()
-            kept = self._tail.add(row)
+            stored = self._tail.add(row)
         self._newest.append(row)
-        if not kept or len(self._newest) >= TAIL_BLOCKS:
+        if not stored or len(self._newest) >= TAIL_BLOCKS:
             self.flush()
 
     def require_folder(self) -> None:
@@ -350,14 +350,14 @@ class Journal:
 
     def spans(self) -> Spans:
         """Return the spans of all readable blocks in order of arrival."""
-        out: list[tuple[int, int, int, int]] = []
+        spans: list[tuple[int, int, int, int]] = []
         rows = self._db.execute("SELECT id, stream, tick, samples FROM block ORDER BY id")
         try:
-            out.extend(rows)
+            spans.extend(rows)
         except sqlite3.DatabaseError as error:  # a damaged page: keep the blocks before it
-            log.warning("%s: unreadable after %d blocks: %s", self.path, len(out), error)
-        out.extend((row.id, row.stream, row.tick, row.samples) for row in self._newest)
-        table = np.array(out, dtype=np.int64).reshape(len(out), 4)
+            log.warning("%s: unreadable after %d blocks: %s", self.path, len(spans), error)
+        spans.extend((row.id, row.stream, row.tick, row.samples) for row in self._newest)
+        table = np.array(spans, dtype=np.int64).reshape(len(spans), 4)
         return Spans(*table.T)
 
     def blocks(self, first: int = 0, last: int = _LAST) -> Iterator[tuple[int, Block | None]]:

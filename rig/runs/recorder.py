@@ -61,7 +61,7 @@ class RecordMeta:
             if not _STEP.match(text) or text == BETWEEN:
                 raise ValueError(f"{text!r} cannot name a record; use letters, digits, '_', '-'")
 
-    def as_dict(self, more: Mapping[str, Attribute] | None = None) -> dict[str, Any]:
+    def as_dict(self, further: Mapping[str, Attribute] | None = None) -> dict[str, Any]:
         """Return the description as plain data, with further attributes."""
         return {
             "name": self.name,
@@ -70,7 +70,7 @@ class RecordMeta:
             "locked": list(self.locked),
             "period": self.period,
             "lines": list(self.lines),
-            "attributes": {**self.attributes, **(more or {})},
+            "attributes": {**self.attributes, **(further or {})},
         }
 
 
@@ -190,8 +190,8 @@ class Recorder:
         if self._events is None:
             raise RecordingFailed(f"{self.folder}: the run is not open for recording")
         timed = None if tick is None else self.time_of(tick)
-        at = self._newest if timed is None else timed
-        self._events.append(event, tick, {"t": round(at, 6), **fields})
+        seconds = self._newest if timed is None else timed
+        self._events.append(event, tick, {"t": round(seconds, 6), **fields})
 
     def begin_record(self, meta: RecordMeta, start: int) -> int:
         """Open a record at a tick; raises ValueError if its name was used before."""

@@ -112,7 +112,7 @@ def _from_damaged(folder: Path, rig: Rig, state_before: str, damage: str) -> Rec
         written = finalise(journal, folder, rig.name, state)
     finally:
         journal.close()
-    kept = move_aside(path)
+    damaged_journal = move_aside(path)
     seconds = rebuilt.lost / rig.sample_rate
     loss = f"lost: {rebuilt.lost} samples ({seconds:.3f} s)" if rebuilt.lost else "no loss is known"
     # A full disk cuts the last write off; every block before it is there.
@@ -121,7 +121,7 @@ def _from_damaged(folder: Path, rig: Rig, state_before: str, damage: str) -> Rec
     message = (
         f"the journal {ends_early if early else f'is damaged: {damage}'}; read from it: "
         f"{rebuilt.samples} samples; {loss}; what came after its last readable sample cannot be "
-        f"counted; {_counts(written)}; the journal is kept as {kept.name}"
+        f"counted; {_counts(written)}; the journal is kept as {damaged_journal.name}"
     )
     if rebuilt.nameless:
         message += (
@@ -130,7 +130,7 @@ def _from_damaged(folder: Path, rig: Rig, state_before: str, damage: str) -> Rec
         )
     _note(folder, state, message)
     report = _report(folder, state, written, message)
-    damaged = None if early else kept
+    damaged = None if early else damaged_journal
     return replace(
         report, damaged_blocks=rebuilt.lost_blocks, damaged=damaged, missing=rebuilt.lost
     )

@@ -30,19 +30,19 @@ def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple
     """
     if not isinstance(name_or_path, str | Path):
         raise InputError(f"expected the name or the file of a rig, found {name_or_path!r:.60}")
-    wanted = os.fspath(name_or_path)
+    text = os.fspath(name_or_path)
     names = shipped_rigs()
-    if wanted in names:
-        entry = resources.files("rig").joinpath("shipped", f"{wanted}.yaml")
-        return entry.read_text(encoding="utf-8"), f"{wanted}.yaml (shipped)"
-    path = Path(wanted).expanduser()
+    if text in names:
+        entry = resources.files("rig").joinpath("shipped", f"{text}.yaml")
+        return entry.read_text(encoding="utf-8"), f"{text}.yaml (shipped)"
+    path = Path(text).expanduser()
     if relative_to is not None:
         path = relative_to / path
     try:
         return read_text(path, _WHAT), str(path)
     except InputError as error:
-        known = ", ".join(names)
-        raise InputError(f"{error}, or the name of a shipped rig: {known}") from error
+        shipped = ", ".join(names)
+        raise InputError(f"{error}, or the name of a shipped rig: {shipped}") from error
 
 
 def load_bench(name: str | Path) -> Rig:

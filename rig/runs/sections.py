@@ -78,12 +78,12 @@ def _runs(spans: Spans) -> list[_Run]:
     if len(spans.id) == 0:
         return []
     end = spans.tick + spans.samples
-    new = (spans.stream[1:] != spans.stream[:-1]) | (spans.tick[1:] != end[:-1])
-    first = np.concatenate(([0], np.flatnonzero(new) + 1))
-    last = np.concatenate((np.flatnonzero(new), [len(end) - 1]))
+    is_start = (spans.stream[1:] != spans.stream[:-1]) | (spans.tick[1:] != end[:-1])
+    starts = np.concatenate(([0], np.flatnonzero(is_start) + 1))
+    stops = np.concatenate((np.flatnonzero(is_start), [len(end) - 1]))
     return [
         _Run(int(spans.stream[a]), int(spans.tick[a]), int(end[b]))
-        for a, b in zip(first, last, strict=True)
+        for a, b in zip(starts, stops, strict=True)
     ]
 
 
@@ -105,9 +105,9 @@ def _record(mark: Mark, extent: dict[int, tuple[int, int]]) -> Section | None:
     ticks = min(wanted_end, high) - mark.start
     if ticks <= 0 or wanted_end <= low:
         return None
-    whole = mark.state == "complete" and high >= wanted_end
+    complete = mark.state == "complete" and high >= wanted_end
     name = str(mark.meta["name"])
-    return Section(name, mark.stream, mark.start, ticks, whole, mark.meta)
+    return Section(name, mark.stream, mark.start, ticks, complete, mark.meta)
 
 
 def _unmarked(runs: Sequence[_Run], records: Sequence[Section]) -> list[Section]:
@@ -147,9 +147,9 @@ def blocks_of(
     ]
     if len(inside) == 0:
         return
-    wanted = set(inside.tolist())
+    numbers = set(inside.tolist())
     for number, block in journal.blocks(int(inside[0]), int(inside[-1])):
-        if number not in wanted:
+        if number not in numbers:
             continue
         yield (block, *(overlap(section, block) if block else (slice(0, 0), slice(0, 0))))
 
@@ -159,20 +159,20 @@ def assemble(journal: Journal, spans: Spans, section: Section) -> Assembled:
     columns, measured = len(journal.meta("columns")), int(journal.meta("measured"))
     tick = 1.0 / float(journal.meta("sample_rate"))
     data = np.full((section.ticks, columns), np.nan)
-    here = np.zeros(section.ticks, dtype=bool)
+    arrived = np.zeros(section.ticks, dtype=bool)
     saturated = np.zeros(measured, dtype=np.int64)
     damaged = late = 0
     jitter = 0.0
-    for block, rows, part in blocks_of(journal, spans, section):
+    for block, rows, block_rows in blocks_of(journal, spans, section):
         if block is None:
             damaged += 1
             continue
-        data[rows], here[rows] = block.data[part], True
-        saturated += block.saturated[part].sum(axis=0)
+        data[rows], arrived[rows] = block.data[block_rows], True
+        saturated += block.saturated[block_rows].sum(axis=0)
         if block.late is not None:
             jitter = max(jitter, block.late)
             late += block.late > len(block.data) * tick
-    return Assembled(data, int((~here).sum()), damaged, int(late), jitter, saturated)
+    return Assembled(data, int((~arrived).sum()), damaged, int(late), jitter, saturated)
 
 
 def overlap(section: Section, block: Block) -> tuple[slice, slice]:

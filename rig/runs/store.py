@@ -215,8 +215,8 @@ def chosen_of(folder: Path, state: str, records: Sequence[T], partial: bool) -> 
     """Return the complete records, or all if `partial`; raises InputError if there are none."""
     chosen = tuple(r for r in records if partial or r.attributes["complete"])
     if not chosen:
-        kept = f"; it keeps {len(records)} unfinished one(s)" if records else ""
-        raise InputError(f"{folder}: {state} before any record was complete{kept}")
+        unfinished = f"; it keeps {len(records)} unfinished one(s)" if records else ""
+        raise InputError(f"{folder}: {state} before any record was complete{unfinished}")
     return chosen
 
 
@@ -240,24 +240,24 @@ def refuse_repeated(folders: Sequence[str | Path]) -> None:
 
     Folders that do not exist here (a cluster may read them elsewhere) are compared by name only.
     """
-    seen: dict[object, Path] = {}
+    known: dict[object, Path] = {}
     sized: dict[int, list[Path]] = {}
     for folder in map(Path, folders):
         keys: list[object] = [folder.resolve()]
         archive = folder / ARCHIVE
         if archive.is_file():
-            like = sized.setdefault(archive.stat().st_size, [])
-            for other in like:  # equal size: compare the contents
-                seen.setdefault(_digest(other / ARCHIVE), other)
-            keys += [_digest(archive)] if like else []
-            like.append(folder)
+            same_size = sized.setdefault(archive.stat().st_size, [])
+            for other in same_size:  # equal size: compare the contents
+                known.setdefault(_digest(other / ARCHIVE), other)
+            keys += [_digest(archive)] if same_size else []
+            same_size.append(folder)
         for key in keys:
-            if key in seen:
+            if key in known:
                 raise InputError(
-                    f"{folder}: is the same run as {seen[key]}; expected each run once, "
+                    f"{folder}: is the same run as {known[key]}; expected each run once, "
                     "since repeated samples add no information"
                 )
-            seen[key] = folder
+            known[key] = folder
 
 
 def _digest(path: Path) -> str:
@@ -275,7 +275,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 def _git(*words: str) -> str | None:
     try:
-        done = subprocess.run(
+        result = subprocess.run(
             ["git", "-C", str(_ROOT), *words],
             capture_output=True,
             text=True,
@@ -285,7 +285,7 @@ def _git(*words: str) -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()
+    return result.stdout.strip()
 
 
 def commit() -> str | None:

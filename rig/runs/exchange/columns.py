@@ -138,9 +138,9 @@ def _bad_cell(
             try:
                 float(cell)
             except ValueError:
-                what = f"found {cell[:40]!r}" if cell else "the cell is empty"
+                found = f"found {cell[:40]!r}" if cell else "the cell is empty"
                 return InputError(
-                    f"{path}:{row + 1}: column {names[column]!r}, row {row + 1}: {what}, "
+                    f"{path}:{row + 1}: column {names[column]!r}, row {row + 1}: {found}, "
                     "expected a number"
                 )
     return InputError(f"{path}: cannot be read as numbers: {reason}")
@@ -180,9 +180,9 @@ def _vector(path: Path, name: str, value: Any) -> Array:
             f"{path}: variable {name!r} has shape {value.shape}, expected a row or a column"
         )
     vector = np.ascontiguousarray(value.ravel(), dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(vector))
-    if len(bad):
-        row = int(bad[0])
+    invalid = np.flatnonzero(~np.isfinite(vector))
+    if len(invalid):
+        row = int(invalid[0])
         raise InputError(
             f"{path}: column {name!r}, row {row + 1}: found {vector[row]}, expected a finite number"
         )

@@ -27,7 +27,7 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
 
     Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
     """
-    said = []
+    sentences = []
     for name, values in channels.items():
         kind, joint = ch.kind_of(name)
         if kind in (ch.COMMAND, ch.TEMPERATURE) or joint in locked:
@@ -35,25 +35,25 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
         low, high = float(values.min()), float(values.max())
         unit = rig.unit_of(name)
         if low == high:
-            said.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
+            sentences.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
             continue
         if small := _too_small(rig, kind, name, low, high):
-            said += small
+            sentences += small
             continue
-        beyond = _beyond(rig, kind, name, low, high)
-        flat = [] if beyond or kind in _DRIVEN else _flat(name, values, unit)
-        said += beyond + flat
-        if joint is not None and kind in (ch.CAP, ch.ROD) and not beyond + flat:
-            said += _stuck(rig, name, values, channels[ch.channel(ch.PISTON, joint)])
-    return said
+        outside = _outside_range(rig, kind, name, low, high)
+        flat = [] if outside or kind in _DRIVEN else _flat(name, values, unit)
+        sentences += outside + flat
+        if joint is not None and kind in (ch.CAP, ch.ROD) and not outside + flat:
+            sentences += _stuck(rig, name, values, channels[ch.channel(ch.PISTON, joint)])
+    return sentences
 
 
 def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
-    """Say so where a pressure keeps one exact value while its piston moves."""
+    """Return a sentence where a pressure keeps one exact value while its piston moves."""
     changes = np.flatnonzero(np.diff(values)) + 1
-    begins, ends = np.r_[0, changes], np.r_[changes, len(values)]
-    k = int(np.argmax(ends - begins))
-    during = slice(int(begins[k]), int(ends[k]))
+    starts, stops = np.r_[0, changes], np.r_[changes, len(values)]
+    k = int(np.argmax(stops - starts))
+    during = slice(int(starts[k]), int(stops[k]))
     if np.ptp(piston[during]) <= EXCHANGE.stuck_travel * np.ptp(piston):
         return []
     return [
@@ -65,21 +65,21 @@ def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
 def _too_small(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
     ends, unit = rig.sensors.of(kind).range, rig.unit_of(name)
     if kind in _PRESSURES:  # a pressure may be constant, but is not near zero throughout
-        seen, words = max(abs(low), abs(high)), "stays below"
+        extent, words = max(abs(low), abs(high)), "stays below"
     elif kind in (ch.PISTON, ch.POSITION):
-        seen, words = high - low, "moves by"
+        extent, words = high - low, "moves by"
     else:
         return []
-    share = seen / (ends[1] - ends[0])
+    share = extent / (ends[1] - ends[0])
     if share >= EXCHANGE.least_part:
         return []
     return [
-        f"{name}: {words} {seen:.3g} {unit}, {100 * share:.2g} % of the range of "
+        f"{name}: {words} {extent:.3g} {unit}, {100 * share:.2g} % of the range of "
         "the rig's sensor; is the unit another?"
     ]
 
 
-def _beyond(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
+def _outside_range(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
     ends = rig.sensors.of(kind).range
     margin = EXCHANGE.end * (ends[1] - ends[0])
     if low > ends[0] + margin and high < ends[1] - margin:
@@ -98,12 +98,12 @@ def _flat(name: str, values: Array, unit: str) -> list[str]:
         return []
     flat = []
     for end, distance in (("top", values.max() - values), ("bottom", values - values.min())):
-        at = int(np.count_nonzero(distance < 0.5 * resolution))
+        at_level = int(np.count_nonzero(distance < 0.5 * resolution))
         near = int(np.count_nonzero(distance <= EXCHANGE.near * span))
-        if at >= EXCHANGE.least and at > EXCHANGE.share * near:
+        if at_level >= EXCHANGE.least and at_level > EXCHANGE.share * near:
             level = values.max() if end == "top" else values.min()
             flat.append(
-                f"{name}: {at} of {len(values)} samples are exactly {level:g} {unit}, its {end}; "
-                "is the sensor or its converter clipped?"
+                f"{name}: {at_level} of {len(values)} samples are exactly {level:g} {unit}, its "
+                f"{end}; is the sensor or its converter clipped?"
             )
     return flat

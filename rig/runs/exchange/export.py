@@ -75,7 +75,7 @@ def export_run(
             added = {} if more is None else more(record)
             WRITERS[kind](folder / names[-1], sheet(head.rig, record, added, began))
         if kind in ("csv", "mat"):
-            names += _way_back(run, folder, head, kind)
+            names += _write_manifest(run, folder, head, kind)
     return [out / name for name in names]
 
 
@@ -84,8 +84,8 @@ def _began(run: Path) -> datetime:
     clocks = stream_clocks(read_events(run))
     if not clocks:
         return datetime.fromisoformat(store.read_header(run).created)
-    first = clocks[min(clocks)]
-    return datetime.fromisoformat(first.host) - timedelta(seconds=first.began)
+    clock = clocks[min(clocks)]
+    return datetime.fromisoformat(clock.host) - timedelta(seconds=clock.began)
 
 
 def sheet(rig: Rig, record: Record, more: Mapping[str, Array], began: datetime) -> Sheet:
@@ -111,10 +111,10 @@ def sheet(rig: Rig, record: Record, more: Mapping[str, Array], began: datetime) 
         "period": record.period,
         "lines": list(record.lines),
     }
-    return Sheet(columns, units, {name: _plain(value) for name, value in about.items()})
+    return Sheet(columns, units, {name: _json_value(value) for name, value in about.items()})
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return value
@@ -170,7 +170,7 @@ WRITERS: Final[Mapping[str, Callable[[Path, Sheet], None]]] = {
 }
 
 
-def _way_back(run: Path, out: Path, head: RunHead, kind: str) -> list[str]:
+def _write_manifest(run: Path, out: Path, head: RunHead, kind: str) -> list[str]:
     """Write the rig and the manifest that `import` takes; returns their names."""
     header = store.read_header(run)
     resolved = {

@@ -94,10 +94,10 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     # A channel that the manifest maps is required, even if it is optional otherwise.
     needed = [n for n in (*required, *optional) if n in required or n in source.manifest.columns]
     timed = source.manifest.sample_rate is None or TIME in source.manifest.columns
-    every = (*required, *optional, TIME)
+    known = (*required, *optional, TIME)
     if timed:
         needed.append(TIME)
-    columns = _read_columns(source, file, every, needed)
+    columns = _read_columns(source, file, known, needed)
     by_channel = {}
     for name, raw in columns.items():
         scale, offset = source.maps.get(name, (1.0, 0.0))
@@ -108,8 +108,8 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     first, last = _common(file, rate, samples, delays)
     for name, delay in delays.items():
         by_channel[name] = _advanced(by_channel[name], delay, first, last)
-    part = _part(entry, file, rate, first, last)
-    channels = {n: by_channel[n][part] for n in every if n in by_channel}
+    part = _record_slice(entry, file, rate, first, last)
+    channels = {n: by_channel[n][part] for n in known if n in by_channel}
     return _Imported(entry, rate, start + part.start / rate, channels)
 
 
@@ -123,9 +123,9 @@ def _without_outliers(rig: Rig, imported: _Imported) -> _Imported:
     for name in filter(channels.__contains__, rig.channels):
         x, (low, high) = channels[name], rig.sensors.of(ch.kind_of(name)[0]).range
         margin = EXCHANGE.end * (high - low)
-        beyond = (x < low - margin) | (x > high + margin)
-        if 0 < np.count_nonzero(beyond) <= EXCHANGE.outliers * len(x):
-            channels[name] = np.where(beyond, np.nan, x)
+        outside = (x < low - margin) | (x > high + margin)
+        if 0 < np.count_nonzero(outside) <= EXCHANGE.outliers * len(x):
+            channels[name] = np.where(outside, np.nan, x)
     return replace(imported, channels=channels)
 
 
@@ -199,10 +199,10 @@ def _common(
 
 def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
     """Return a column (n,) advanced by its delay [samples]; 0 outside [first, last)."""
-    whole = round(delay)
+    samples = round(delay)
     out = np.zeros_like(values)
-    if abs(delay - whole) < EXCHANGE.whole:
-        out[first:last] = values[first + whole : last + whole]
+    if abs(delay - samples) < EXCHANGE.whole:
+        out[first:last] = values[first + samples : last + samples]
         return out
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415 - loads slowly
 
@@ -211,7 +211,7 @@ def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
     return out
 
 
-def _part(entry: ManifestRecord, file: Path, rate: float, first: int, last: int) -> slice:
+def _record_slice(entry: ManifestRecord, file: Path, rate: float, first: int, last: int) -> slice:
     """Return the samples between the entry's `begin` and `end`; raises InputError if none are.
 
     Both count from the file's first sample; [first, last) are the samples common to all columns.
@@ -219,9 +219,9 @@ def _part(entry: ManifestRecord, file: Path, rate: float, first: int, last: int)
     begin = max(first, round(entry.begin * rate))
     end = last if entry.end is None else round(entry.end * rate)
     if begin >= last - 1 or end > last:
-        wanted = f"{entry.begin:g} s to {'the end' if entry.end is None else f'{entry.end:g} s'}"
+        stated = f"{entry.begin:g} s to {'the end' if entry.end is None else f'{entry.end:g} s'}"
         has = f"{last / rate:g} s of samples" + ("" if not first else f" from {first / rate:g} s")
-        raise InputError(f"{file}: has {has}; the record asks for {wanted}")
+        raise InputError(f"{file}: has {has}; the record asks for {stated}")
     return slice(begin, end)
 
 
@@ -230,9 +230,9 @@ def _read_columns(
 ) -> dict[str, Array]:
     """Return a file's columns (n,) by channel; raises InputError if a needed one is missing."""
     names = {channel: source.column(channel) for channel in channels}
-    wanted = list(dict.fromkeys(names.values()))
+    columns = list(dict.fromkeys(names.values()))
     try:
-        table = read_table(file, wanted, [names[channel] for channel in needed])
+        table = read_table(file, columns, [names[channel] for channel in needed])
     except InputError as error:
         no_time = f"has no column {names[TIME]!r}"
         if source.manifest.sample_rate is not None or no_time not in str(error):
@@ -246,19 +246,19 @@ def _read_columns(
 
 def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, float]:
     """Return (sample rate [Hz], time of the first sample [s]); refuses uneven time."""
-    given = source.manifest.sample_rate
+    stated = source.manifest.sample_rate
     if time is None:
-        return float(given or 0.0), 0.0
+        return float(stated or 0.0), 0.0
     column = source.column(TIME)
-    first = 1 if file.suffix.lower() == ".mat" else 2  # the row of the first sample
+    first_row = 1 if file.suffix.lower() == ".mat" else 2  # the row of the first sample
     if len(time) < 2:
         raise InputError(f"{file}: column {column!r} has one row only; expected a time series")
     steps = np.diff(time)
-    back = np.flatnonzero(steps <= 0)
-    if len(back):
-        row = int(back[0]) + 1
+    decreasing = np.flatnonzero(steps <= 0)
+    if len(decreasing):
+        row = int(decreasing[0]) + 1
         raise InputError(
-            f"{file}:{row + first}: column {column!r}, row {row + first}: time goes from "
+            f"{file}:{row + first_row}: column {column!r}, row {row + first_row}: time goes from "
             f"{time[row - 1]:.9g} to {time[row]:.9g} s; expected it to increase"
         )
     step = float(np.median(steps))
@@ -266,17 +266,17 @@ def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, 
     if len(uneven):
         row = int(uneven[0]) + 1
         raise InputError(
-            f"{file}:{row + first}: column {column!r}, row {row + first}: a step of "
+            f"{file}:{row + first_row}: column {column!r}, row {row + first_row}: a step of "
             f"{steps[row - 1]:.6g} s among steps of {step:.6g} s; expected even sampling"
         )
     mean = float((time[-1] - time[0]) / (len(time) - 1))
     rate = float(f"{1.0 / mean:.6g}")  # rounded time stamps are not more accurate
-    if given is not None and abs(rate - given) > 1e-3 * given:
+    if stated is not None and abs(rate - stated) > 1e-3 * stated:
         raise InputError(
             f"{file}: column {column!r} steps at {rate:.6g} Hz, but the manifest's sample_rate is "
-            f"{given:.6g} Hz"
+            f"{stated:.6g} Hz"
         )
-    return given or rate, float(time[0])
+    return stated or rate, float(time[0])
 
 
 def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
@@ -285,8 +285,8 @@ def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
     for name in rig.channels:
         lacking = [r.entry.file for r in records if name not in r.channels]
         if lacking:
-            more = "" if len(lacking) == len(records) else f" in {len(lacking)} file(s)"
-            warnings.append(f"{name}: the rig has it, the data does not{more}; imported without")
+            where = "" if len(lacking) == len(records) else f" in {len(lacking)} file(s)"
+            warnings.append(f"{name}: the rig has it, the data does not{where}; imported without")
     for rate in sorted({r.sample_rate for r in records}):
         if abs(rate - rig.sample_rate) > 1e-6 * rig.sample_rate:
             warnings.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")

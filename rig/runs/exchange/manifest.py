@@ -105,22 +105,22 @@ def load_manifest(path: Path) -> tuple[Manifest, dict[tuple[str | int, ...], int
 def _refuse_duplicates(
     records: Sequence[ManifestRecord], lines: dict[tuple[str | int, ...], int], path: Path
 ) -> None:
-    seen: dict[tuple[str, int], int] = {}
+    line_of_repeat: dict[tuple[str, int], int] = {}
     names: set[str] = set()
     for index, entry in enumerate(records):
         line = lines.get(("records", index), 1)
         key = (entry.step, entry.repeat)
-        if key in seen:
+        if key in line_of_repeat:
             raise InputError(
                 f"{path}:{line}: records: step {entry.step!r} repeat {entry.repeat} is already in "
-                f"line {seen[key]}; expected another repeat"
+                f"line {line_of_repeat[key]}; expected another repeat"
             )
         name = entry.meta().name
         if name in names:
             raise InputError(
                 f"{path}:{line}: records: name {name!r} occurs twice; expected distinct names"
             )
-        seen[key] = line
+        line_of_repeat[key] = line
         names.add(name)
 
 
@@ -134,9 +134,9 @@ def _with_every_load(
     if all(entry.loaded is None for entry in manifest.records):
         return manifest
     records = tuple(r.model_copy(update={LOADED: bool(r.loaded)}) for r in manifest.records)
-    first: dict[str, bool | None] = {}
+    load_of_step: dict[str, bool | None] = {}
     for index, entry in enumerate(records):
-        if entry.loaded is not first.setdefault(entry.step, entry.loaded):
+        if entry.loaded is not load_of_step.setdefault(entry.step, entry.loaded):
             line = lines.get(("records", index, LOADED), lines.get(("records", index), 1))
             raise InputError(
                 f"{path}:{line}: records.{index}.loaded: found {str(entry.loaded).lower()}, "
@@ -160,20 +160,20 @@ def check_against_rig(
                 f"different joints of rig {rig.name!r}, 1 to {joints}"
             )
     maps = {}
-    known = (TIME, *_all_channels(rig))
+    allowed = (TIME, *_all_channels(rig))
     for name, column in manifest.columns.items():
         line = lines.get(("columns", name), 1)
-        if name not in known:
+        if name not in allowed:
             raise InputError(
                 f"{path}:{line}: columns.{name}: no channel of rig {rig.name!r}; expected one of: "
-                f"{', '.join(known)}"
+                f"{', '.join(allowed)}"
             )
         si = "s" if name == TIME else rig.unit_of(name)
         try:
             factor, shift = unit_map(si if column.unit is None else column.unit, si)
         except UnitError as error:
-            at = lines.get(("columns", name, "unit"), line)
-            raise InputError(f"{path}:{at}: columns.{name}.unit: {error}") from error
+            unit_line = lines.get(("columns", name, "unit"), line)
+            raise InputError(f"{path}:{unit_line}: columns.{name}.unit: {error}") from error
         if name == TIME and column.delay:
             raise InputError(
                 f"{path}:{line}: columns.{name}.delay: time has no delay; expected the delay of "

@@ -114,10 +114,10 @@ def describe(
 
 def _description(head: RunHead, header: Header) -> str:
     protocol = str((header.protocol or {}).get("name", "")) or header.source or "no protocol"
-    whole = sum(bool(record.attributes["complete"]) for record in head.records)
+    complete = sum(bool(record.attributes["complete"]) for record in head.records)
     return (
-        f"{whole} complete and {len(head.records) - whole} unfinished records of {protocol} at "
-        f"{header.rig.sample_rate:g} Hz; the run ended as {head.state}"
+        f"{complete} complete and {len(head.records) - complete} unfinished records of {protocol} "
+        f"at {header.rig.sample_rate:g} Hz; the run ended as {head.state}"
     )
 
 
@@ -153,8 +153,8 @@ def _action(folder: Path, head: RunHead, header: Header, names: list[str]) -> En
     }
     if failed:
         ends = [e for e in events if e.get("event") in ("trip", "end", "recovered")]
-        last = str(ends[-1].get("message", "")) if ends else ""
-        action["error"] = last or (ABORTED if head.state == ABORTED else head.state)
+        message = str(ends[-1].get("message", "")) if ends else ""
+        action["error"] = message or (ABORTED if head.state == ABORTED else head.state)
     return action
 
 

@@ -50,8 +50,8 @@ def _around(file: h5py.File, tick: int) -> tuple[list[str], NDArray[np.float64]]
     """Return (names with units, rows) of the samples of the last stream around a tick."""
     groups = [group for name, group in file.items() if name != BETWEEN]
     groups += list(file[BETWEEN].values()) if BETWEEN in file else []
-    last = max(int(group.attrs["stream"]) for group in groups)
-    groups = [group for group in groups if int(group.attrs["stream"]) == last]
+    last_stream = max(int(group.attrs["stream"]) for group in groups)
+    groups = [group for group in groups if int(group.attrs["stream"]) == last_stream]
     channels = list(groups[0])
     names = [f"{name} [{groups[0][name].attrs['units']}]" for name in channels]
     parts = []
@@ -68,5 +68,5 @@ def _around(file: h5py.File, tick: int) -> tuple[list[str], NDArray[np.float64]]
     table = np.concatenate(parts)
     table = table[np.isfinite(table[:, 2:]).any(axis=1)]
     # A sample may be in two records; it is written once, in order of time.
-    _, first = np.unique(table[:, 1], return_index=True)
-    return names, table[first]
+    _, distinct = np.unique(table[:, 1], return_index=True)
+    return names, table[distinct]

@@ -102,35 +102,35 @@ def _removed(path: Path) -> bool:
 
 
 def _read(db: sqlite3.Connection, folders: list[Path]) -> list[RunSummary]:
-    kept = {name: (signature, line) for name, signature, line in
+    stored = {name: (signature, line) for name, signature, line in
             db.execute("SELECT name, signature, line FROM run")}  # fmt: skip
-    summaries, fresh = [], []
+    summaries, changed = [], []
     for folder in folders:
         signature = _signature(folder)
-        known = kept.get(folder.name)
-        if known is not None and known[0] == signature:
-            summaries.append(_summary(folder, known[1]))
+        entry = stored.get(folder.name)
+        if entry is not None and entry[0] == signature:
+            summaries.append(_summary(folder, entry[1]))
             continue
         summary = summarise(folder)
         summaries.append(summary)
         if summary.state != RUNNING:  # its writer may die without changing a file
-            fresh.append((signature, summary))
-    gone = set(kept) - {folder.name for folder in folders}
-    if fresh or gone:
-        _write(db, fresh, gone)
+            changed.append((signature, summary))
+    removed = set(stored) - {folder.name for folder in folders}
+    if changed or removed:
+        _write(db, changed, removed)
     return summaries
 
 
 def _write(
-    db: sqlite3.Connection, fresh: list[tuple[str, RunSummary]], gone: set[str]
+    db: sqlite3.Connection, changed: list[tuple[str, RunSummary]], removed: set[str]
 ) -> None:  # fmt: skip
     db.execute("BEGIN IMMEDIATE")
-    db.executemany("DELETE FROM run WHERE name = ?", [(name,) for name in gone])
+    db.executemany("DELETE FROM run WHERE name = ?", [(name,) for name in removed])
     db.executemany(
         "INSERT OR REPLACE INTO run VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
         [
             (s.path.name, signature, s.state, s.rig, s.protocol, s.created, s.samples, _line(s))
-            for signature, s in fresh
+            for signature, s in changed
         ],
     )
     db.execute("COMMIT")

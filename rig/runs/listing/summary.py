@@ -58,20 +58,20 @@ def summarise(folder: Path) -> RunSummary:
     except (InputError, OSError, sqlite3.Error) as error:
         message = f"{message}; {error}".removeprefix("; ")
     total = counted.samples + counted.lost_samples + counted.outside
-    known = counted.samples >= 0
+    is_known = counted.samples >= 0
     return RunSummary(
         path=folder,
         state=state,
         rig=header.rig.name,
         protocol=str((header.protocol or {}).get("name", "")) or header.source,
         created=header.created,
-        records=counted.records - counted.partial if known else -1,
+        records=counted.records - counted.partial if is_known else -1,
         message=message,
         partial=counted.partial,
         samples=counted.samples,
         lost_samples=counted.lost_samples,
         outside=counted.outside,
-        seconds=total / header.rig.sample_rate if known else -1.0,
+        seconds=total / header.rig.sample_rate if is_known else -1.0,
         recovered=recovered,
         operator=header.operator,
     )
@@ -80,14 +80,15 @@ def summarise(folder: Path) -> RunSummary:
 def _end_of_run(events: list[dict[str, Any]], state: str, folder: Path) -> tuple[bool, str]:
     """Return whether a run was recovered, and the message of its latest end."""
     ends = [e for e in events if e.get("event") in ("end", "recovered")]
-    waiting = (folder / JOURNAL).exists()
-    if state != RUNNING and waiting:
+    has_journal = (folder / JOURNAL).exists()
+    if state != RUNNING and has_journal:
         return False, f"finalise it with `bramah recover {folder}`"
     recovered = any(e["event"] == "recovered" for e in ends)
     if state == INTERRUPTED and not ends:
         return False, f"finalise it with `bramah recover {folder}`"
-    last = str(ends[-1].get("message", "")) if ends else ""
-    return recovered, f"recovered: {last}" if ends and ends[-1]["event"] == "recovered" else last
+    message = str(ends[-1].get("message", "")) if ends else ""
+    is_last = bool(ends) and ends[-1]["event"] == "recovered"
+    return recovered, f"recovered: {message}" if is_last else message
 
 
 def _count(folder: Path, events: list[dict[str, Any]]) -> Written:
@@ -116,14 +117,14 @@ def _count_journal(path: Path) -> Written:
     blocks += [(row.stream, row.tick, row.samples, row.id) for row in tail]
     inside = lost = 0
     for stream, start, ticks, _ in marks:
-        ends = [tick + count for of, tick, count, _ in blocks if of == stream]
-        end = max(ends, default=start) if ticks is None else start + ticks
-        here = sum(
+        block_ends = [tick + count for number, tick, count, _ in blocks if number == stream]
+        end = max(block_ends, default=start) if ticks is None else start + ticks
+        present = sum(
             max(0, min(end, tick + count) - max(start, tick))
-            for of, tick, count, _ in blocks
-            if of == stream
+            for number, tick, count, _ in blocks
+            if number == stream
         )
-        inside, lost = inside + here, lost + max(0, end - start - here)
+        inside, lost = inside + present, lost + max(0, end - start - present)
     total = sum(count for _, _, count, _ in blocks)
     partial = sum(state != "complete" for *_, state in marks)
     return Written(len(marks), partial, inside, lost, 0, total - inside)

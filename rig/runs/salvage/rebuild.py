@@ -85,13 +85,13 @@ def _open(path: Path) -> sqlite3.Connection:
 
 def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tuple[int, int]:
     """Return the damage of the rows in words, or the newest block as (stream, tick)."""
-    for key, value, what in (
+    for key, value, fault in (
         ("columns", list(rig.recorded), "its columns are not those"),
         ("measured", len(rig.channels), "its count of sensors is not that"),
         ("sample_rate", rig.sample_rate, "its sample rate is not that"),
     ):
         if journal.meta(key) != value:
-            return f"{what} of the run's rig"
+            return f"{fault} of the run's rig"
     if not all(describes_record(mark.meta) for mark in journal.marks()):
         return "the description of a record cannot be read"
     newest, count = (-1, -1), 0
@@ -101,8 +101,8 @@ def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tup
         if (block.stream, block.tick) <= newest:
             return "its blocks are out of order"
         newest, count = (block.stream, block.tick), count + 1
-    (held, last) = db.execute("SELECT count(*), max(id) FROM block").fetchone()
-    if not held == count == (last or 0):
+    (rows, highest) = db.execute("SELECT count(*), max(id) FROM block").fetchone()
+    if not rows == count == (highest or 0):
         return "blocks are missing"
     return _check_tail(journal.path, rig, newest, count)
 
@@ -140,30 +140,30 @@ def rebuild(path: Path, rig: Rig) -> tuple[Journal, Salvage]:
 
     Raises RecordingFailed if the disk fails.
     """
-    fresh = path.with_name(REBUILT)
+    target = path.with_name(REBUILT)
     for suffix in JOURNAL_FILES:
-        fresh.with_name(fresh.name + suffix).unlink(missing_ok=True)
-    made = Journal.create(fresh, rig.recorded, len(rig.channels), rig.sample_rate)
+        target.with_name(target.name + suffix).unlink(missing_ok=True)
+    journal = Journal.create(target, rig.recorded, len(rig.channels), rig.sample_rate)
     places: dict[tuple[int, int], tuple[int, int]] = {}  # block -> its length, its number
-    kept_marks: list[Mark] = []
+    found_marks: list[Mark] = []
     for suffix in ("", "-wal"):
         raw = raw_bytes(path.with_name(path.name + suffix))
-        kept_marks += marks(raw)
+        found_marks += marks(raw)
         for row in block_rows(raw):
-            _keep(made, _as_block(row.values, rig), row.number, places)
+            _keep(journal, _as_block(row.values, rig), row.number, places)
     for values in itertools.chain(_rows_by_number(path), _tail_rows(path)):
-        _keep(made, _as_block(values, rig), int(values[0]), places)
-    chosen = best_marks(kept_marks)
+        _keep(journal, _as_block(values, rig), int(values[0]), places)
+    chosen = best_marks(found_marks)
     for mark in chosen:
-        number = made.begin_mark(mark.stream, mark.start, mark.meta)
+        number = journal.begin_mark(mark.stream, mark.start, mark.meta)
         if mark.state != "open" and mark.ticks is not None:
-            made.end_mark(number, mark.ticks, mark.state, mark.meta)
-    made.in_order()
-    return made, _account(path.parent, places, chosen)
+            journal.end_mark(number, mark.ticks, mark.state, mark.meta)
+    journal.in_order()
+    return journal, _account(path.parent, places, chosen)
 
 
 def _keep(
-    made: Journal,
+    journal: Journal,
     block: Block | None,
     number: int | None,
     places: dict[tuple[int, int], tuple[int, int]],
@@ -175,7 +175,7 @@ def _keep(
         sample_block = SampleBlock(
             block.sequence, block.tick, block.data, block.saturated, 0, False
         )
-        made.append(block.stream, sample_block, block.late)
+        journal.append(block.stream, sample_block, block.late)
         places[key] = (len(block.data), number or 0)
 
 
@@ -195,9 +195,9 @@ def _rows_by_number(path: Path) -> Iterator[tuple[Any, ...]]:
     )
     try:
         with closing(_open(path)) as db:
-            (last,) = db.execute("SELECT max(id) FROM block").fetchone()
-            for first in range(1, int(last or 0) + 1, _AT_ONCE):
-                for row in _readable(db, sql, first, first + _AT_ONCE - 1):
+            (highest,) = db.execute("SELECT max(id) FROM block").fetchone()
+            for start in range(1, int(highest or 0) + 1, _AT_ONCE):
+                for row in _readable(db, sql, start, start + _AT_ONCE - 1):
                     yield tuple(row)
     except _UNREADABLE as error:
         log.info("%s: %s", path, error)
@@ -231,11 +231,11 @@ def _account(
     gaps = np.where(streams[1:] == streams[:-1], ticks[1:] - ends[:-1], 0)
     wire = sum(int(e["lost"]) for e in events if isinstance(e.get("lost"), int))
     lost = max(0, int(gaps[gaps > 0].sum()) - wire)
-    usual = int(np.median(ends - ticks))
+    block_length = int(np.median(ends - ticks))
     numbers = sorted(number for _, number in places.values() if number)
     lost_blocks = 0 if not numbers else max(0, numbers[-1] - len(places))
     if numbers and places[keys[0]][1] > 1:
-        lost += (places[keys[0]][1] - 1) * usual
+        lost += (places[keys[0]][1] - 1) * block_length
     # A mark may be written before the record's first sample.
     other_events = [e for e in events if e.get("event") != "record begins"]
     known = [int(e["tick"]) for e in other_events if isinstance(e.get("tick"), int)]

@@ -65,10 +65,10 @@ def marks(raw: Bytes) -> Iterator[Mark]:
         _, stream, start, ticks, state, text = row.values
         try:
             meta = json.loads(text)
-            known = describes_record(meta)
+            is_record = describes_record(meta)
         except (ValueError, TypeError):
             continue
-        if known and state in _STATES and isinstance(stream, int) and isinstance(start, int):
+        if is_record and state in _STATES and isinstance(stream, int) and isinstance(start, int):
             yield Mark(row.number or 0, stream, start, ticks, state, meta)
 
 
@@ -78,53 +78,53 @@ def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[Salvaged
     `like` tests the types of the first `short` columns, each one byte in the header.
     """
     for begin in range(0, len(raw), _CHUNK):
-        part = np.asarray(raw[begin : begin + _CHUNK + _OVERLAP])
-        most = min(_CHUNK, len(part) - columns - 1)
-        if most <= 0:
+        chunk = np.asarray(raw[begin : begin + _CHUNK + _OVERLAP])
+        count = min(_CHUNK, len(chunk) - columns - 1)
+        if count <= 0:
             continue
-        head = part[:most]
-        fits = (head > columns) & (head <= columns + 9) & (part[1 : most + 1] == _NULL)
-        places = np.flatnonzero(fits)
-        if not len(places):
+        head = chunk[:count]
+        matches = (head > columns) & (head <= columns + 9) & (chunk[1 : count + 1] == _NULL)
+        offsets = np.flatnonzero(matches)
+        if not len(offsets):
             continue
-        types = [part[places + 1 + k] for k in range(short)]
-        for place in places[like(types)].tolist():
-            row = _row(part, place, columns)
+        types = [chunk[offsets + 1 + k] for k in range(short)]
+        for offset in offsets[like(types)].tolist():
+            row = _row(chunk, offset, columns)
             if row is not None:
                 yield SalvagedRow(*row)
 
 
-def _row(part: Bytes, place: int, columns: int) -> tuple[int | None, tuple[Any, ...]] | None:
-    end = place + int(part[place])
-    at = place + 1
+def _row(chunk: Bytes, offset: int, columns: int) -> tuple[int | None, tuple[Any, ...]] | None:
+    end = offset + int(chunk[offset])
+    position = offset + 1
     types: list[int] = []
-    while at < end and len(types) < columns:
-        value, at = _varint(part, at)
+    while position < end and len(types) < columns:
+        value, position = _varint(chunk, position)
         types.append(value)
-    if at != end or len(types) != columns:
+    if position != end or len(types) != columns:
         return None
     sizes = [_size(kind) for kind in types]
     if any(size is None for size in sizes):
         return None
-    whole = end + sum(size or 0 for size in sizes)
-    if whole > len(part):
+    row_end = end + sum(size or 0 for size in sizes)
+    if row_end > len(chunk):
         return None
     values = []
     for kind, size in zip(types, sizes, strict=True):
-        values.append(_value(kind, part[end : end + (size or 0)].tobytes()))
+        values.append(_value(kind, chunk[end : end + (size or 0)].tobytes()))
         end += size or 0
-    return _number(part, place, whole - place), tuple(values)
+    return _number(chunk, offset, row_end - offset), tuple(values)
 
 
-def _varint(part: Bytes, at: int) -> tuple[int, int]:
+def _varint(chunk: Bytes, position: int) -> tuple[int, int]:
     """Return a number of seven bits per byte, most significant first, and its end."""
     value = 0
-    for k in range(at, min(at + 9, len(part))):
-        byte = int(part[k])
+    for k in range(position, min(position + 9, len(chunk))):
+        byte = int(chunk[k])
         value = (value << 7) | (byte & 0x7F)
         if byte < 0x80:
             return value, k + 1
-    return value, len(part) + 1
+    return value, len(chunk) + 1
 
 
 def _as_varint(value: int) -> bytes:
@@ -155,15 +155,15 @@ def _value(kind: int, raw: bytes) -> Any:
     return raw if kind % 2 == 0 else raw.decode("utf-8", errors="replace")
 
 
-def _number(part: Bytes, place: int, payload: int) -> int | None:
+def _number(chunk: Bytes, offset: int, payload: int) -> int | None:
     """Return the rowid, stored between the payload's length and the payload."""
     length = _as_varint(payload)
     for size in range(1, 6):
-        begin = place - size - len(length)
-        if begin < 0 or part[begin : begin + len(length)].tobytes() != length:
+        begin = offset - size - len(length)
+        if begin < 0 or chunk[begin : begin + len(length)].tobytes() != length:
             continue
-        value, end = _varint(part, place - size)
-        if end == place:
+        value, end = _varint(chunk, offset - size)
+        if end == offset:
             return value
     return None
 
