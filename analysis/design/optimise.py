@@ -219,7 +219,7 @@ class _Search:
     def child(
         self, parent: Candidate, joint: int, tilt: float | None, early: bool
     ) -> tuple[Candidate | None, int]:
-        """Return a changed copy of one step that keeps the limits, or None, and its cost.
+        """Return a changed copy of one step within the limits, or None, and the simulations spent.
 
         With a `tilt` all lines are used, amplitudes f^-tilt; without, the change is random. The
         forecast is renewed from each simulation, because the twin is not linear.

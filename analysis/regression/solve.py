@@ -1,4 +1,4 @@
-"""Coupled least squares by QR of clusters of rows: triangles merge, rows need not be kept.
+"""Coupled least squares by QR of clusters of rows: only their triangles R are kept.
 
 The rows of all records are stacked and solved once, so that a parameter that appears in several
 steps has one value (Sakai and Maeshima's STEP4). Each cluster of rows is reduced to

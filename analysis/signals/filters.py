@@ -110,13 +110,13 @@ def _kernel(t: Array, cutoff: float, half_width: float, beta: float) -> Array:
 
 @functools.lru_cache(maxsize=64)
 def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
-    """Return a Kaiser-windowed sinc: flat to `cutoff` [Hz], closed beyond cutoff + transition.
+    """Return a Kaiser-windowed sinc: it passes up to `cutoff`, stops from cutoff + transition [Hz].
 
     Raises InputError where the sample rate does not reach that far. Source: Kaiser's window.
     """
     if cutoff + transition > 0.5 * rate:
         raise InputError(
-            f"a filter open to {cutoff:g} Hz needs a sample rate above "
+            f"a filter that passes {cutoff:g} Hz needs a sample rate above "
             f"{2 * (cutoff + transition):g} Hz, not {rate:g} Hz"
         )
     # Kaiser's formulas (Oppenheim and Schafer, Discrete-Time Signal Processing, section 7.6).
@@ -176,7 +176,7 @@ def channel_filter(rate: float) -> FirSmoother:
 
 
 def row_filter(rate: float, cutoff: float) -> FirSmoother:
-    """Return the low-pass of whole rows: flat to `cutoff` [Hz], closed at 1.6 times that."""
+    """Return the low-pass of whole rows: passes up to `cutoff` [Hz], stops from 1.6 times that."""
     cutoff = min(cutoff, 0.25 * rate)
     return windowed_sinc(rate, cutoff, 0.6 * cutoff)
 

@@ -1,4 +1,4 @@
-"""Which joints move, decided once for all repeats of a step, and where the others stand.
+"""Classifies joints as moving or locked, once for all repeats of a step.
 
 A locked joint may still move a little. Measured on a finer plant, leaving out the motion of
 a joint held by a closed valve made M2 47 % and Fv2 190 % too large, and that of an end-stop contact

@@ -265,7 +265,7 @@ def _balance(body: _Lines, electric: Sequence[bool]) -> None:
 
 
 def _solve(body: _Lines, N: int) -> None:
-    """Write M q'' = torques by L D L', the rows of held joints replaced by their given q''."""
+    """Write M q'' = torques by L D L', locked joints' rows replaced by their given q''."""
     for i in range(N):
         body.add(f"if held{i}:")
         for j in range(N):

@@ -106,7 +106,7 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
 
 @njit(cache=True, error_model="numpy")
 def _impose(M, load, locked, q_dd):  # type: ignore[no-untyped-def]
-    """Replace the rows of locked joints by their given q'', and its effect on others by loads."""
+    """Replace locked joints' rows by their given q'', and move its torque on others to `load`."""
     for i in range(len(load)):
         if locked[i]:
             for j in range(len(load)):
@@ -214,7 +214,7 @@ def _rates(t, y_at, dy_at, inputs_at, n, rate, locked_at, geometry_at, par_at, c
 
 @functools.cache
 def compiled_rates() -> Any:
-    """Return the compiled right-hand side, or that of numba's cache; it has an `address`."""
+    """Return the right-hand side compiled, or from numba's cache; it has an `address`."""
     return cfunc(eq.RATES_SIGNATURE, cache=True, error_model="numpy")(_rates)
 
 
