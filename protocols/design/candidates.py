@@ -52,7 +52,7 @@ def _places(count: int) -> Iterator[tuple[str, ...]]:
     """Yield the positions of `count` joints, end stops first."""
     for places in itertools.product((END_MIN, END_MAX, CLOSED), repeat=count):
         at_ends = sum(place != CLOSED for place in places)
-        if count <= DESIGN.all_poses or at_ends <= DESIGN.displaced:
+        if count <= DESIGN.exhaustive_joints or at_ends <= DESIGN.most_at_ends:
             yield places
 
 
@@ -126,15 +126,15 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
     """
     by_amplitude: dict[float, tuple[Step, Mapping[str, Array]]] = {}
     for tilt in DESIGN.tilts:
-        for size in range(DESIGN.sizes):
-            tried = played(step, DESIGN.amplitude * DESIGN.smaller**size, tilt, seed)
+        for size in range(DESIGN.amplitude_tries):
+            tried = played(step, DESIGN.amplitude * DESIGN.amplitude_factor**size, tilt, seed)
             moved = motion_within(tried, rig, twin)
             if moved is not None:
                 signal = tried.excite[0].signal
                 assert isinstance(signal, Multisine)  # as `played` makes them
                 by_amplitude.setdefault(signal.amplitude, (tried, moved))
                 break
-        if by_amplitude and max(by_amplitude) >= DESIGN.modest:
+        if by_amplitude and max(by_amplitude) >= DESIGN.low_amplitude:
             break
     if not by_amplitude:
         log.info("left out: %s", described(step))

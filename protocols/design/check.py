@@ -234,7 +234,7 @@ def _joint_lines(
     wave = np.resize(part.wave.samples, len(piston)) + bias
     pull = loop * max(follow(wave, piston, rig.sample_rate).gain, 1e-6)
     looped = under_loop(piston, pull, rig.sample_rate) + part.centre
-    if np.ptp(looped) > DESIGN.wider * np.ptp(piston):
+    if np.ptp(looped) > DESIGN.largest_widening * np.ptp(piston):
         low, high = float(looped.min()) - offset, float(looped.max()) + offset
         lines.append(
             MotionPrediction("piston under the loop", name, low, high, *limits.piston, "m")

@@ -134,7 +134,7 @@ def _why(before: Verdicts, after: Verdicts) -> str:
             gained = verdict.rank - earlier.rank
             plural = "s" if gained > 1 else ""
             words.append(f"{gained} more combination{plural} of {family} parameters")
-        elif earlier.complete and verdict.condition < DESIGN.worth * earlier.condition:
+        elif earlier.complete and verdict.condition < DESIGN.condition_ratio * earlier.condition:
             words.append(f"{family} condition {earlier.condition:.3g} to {verdict.condition:.3g}")
     words = [f"determines {' '.join(learned)}"] * bool(learned) + words
     return "; ".join(words) or "no new parameter or combination"
@@ -173,9 +173,9 @@ def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
 def _sized_sines(
     name: str, moving: tuple[int, ...], frequency: float, rig: Rig, twin: Twin
 ) -> Step:
-    for size in range(DESIGN.sizes):
+    for size in range(DESIGN.amplitude_tries):
         peak = DESIGN.sine_alone if len(moving) == 1 else DESIGN.sine_together
-        amplitude = peak * DESIGN.smaller**size
+        amplitude = peak * DESIGN.amplitude_factor**size
         step = _sines(name, moving, frequency, float(f"{amplitude:.3g}"), len(rig.joints))
         if motion_within(step, rig, twin, ROOM) is not None:
             return step

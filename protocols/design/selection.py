@@ -54,7 +54,7 @@ def extended(
             }
             best = max(
                 remaining,
-                key=lambda candidate: gain[id(candidate)] - DESIGN.closed_price * _cost(candidate),
+                key=lambda step: gain[id(step)] - DESIGN.closed_valve_cost * _closed_beyond(step),
             )
             if gain[id(best)] < 1.0:
                 break  # no step adds a direction
@@ -63,7 +63,7 @@ def extended(
                 break
             trials = {id(c): condition_of(_verdicts([*chosen, c], judge)) for c in remaining}
             best = min(remaining, key=lambda candidate: trials[id(candidate)])
-            if trials[id(best)] > DESIGN.worth * condition_of(verdicts):
+            if trials[id(best)] > DESIGN.condition_ratio * condition_of(verdicts):
                 break
         chosen.append(best)
     return chosen
@@ -83,7 +83,7 @@ def _pruned(chosen: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
     kept = list(chosen)
     initial = _verdicts(kept, judge)
     allowed = max(DESIGN.condition, condition_of(initial))
-    for step in sorted(chosen, key=_cost, reverse=True):
+    for step in sorted(chosen, key=_closed_beyond, reverse=True):
         fewer = [other for other in kept if other is not step]
         verdicts = _verdicts(fewer, judge)
         equal_rank = all(verdicts[family].rank == initial[family].rank for family in verdicts)
@@ -105,7 +105,7 @@ def _exchanged(
             if other not in current
         ]
         best = min(trials, key=lambda steps: _log_cost(steps, judge), default=current)
-        if not _log_cost(best, judge) < _log_cost(current, judge) + np.log(DESIGN.worth):
+        if not _log_cost(best, judge) < _log_cost(current, judge) + np.log(DESIGN.condition_ratio):
             break
         current = best
     return current
@@ -116,12 +116,11 @@ def _log_cost(steps: Sequence[SizedStep], judge: Judge) -> float:
     verdicts = _verdicts(steps, judge)
     if not complete(verdicts):
         return float("inf")
-    return float(
-        np.log(condition_of(verdicts)) - np.log(DESIGN.worth) * sum(_cost(step) for step in steps)
-    )
+    closed = sum(_closed_beyond(step) for step in steps)
+    return float(np.log(condition_of(verdicts)) - np.log(DESIGN.condition_ratio) * closed)
 
 
-def _cost(step: SizedStep) -> int:
+def _closed_beyond(step: SizedStep) -> int:
     """Return the number of valves closed beyond the excited joint, whose oil yields under load."""
     excited = min(part.joint for part in step.step.excite)
     return sum(lock.at == CLOSED and lock.joint > excited for lock in step.step.lock)
@@ -146,5 +145,5 @@ def _score(steps: Sequence[SizedStep], scales: Mapping[str, Array]) -> float:
         sigma = np.zeros(len(scale))
         singular = np.linalg.svd(rows, compute_uv=False)
         sigma[: len(singular)] = singular
-        total += float(np.sum(np.log(sigma**2 + DESIGN.visible**2)))
+        total += float(np.sum(np.log(sigma**2 + DESIGN.singular_floor**2)))
     return total

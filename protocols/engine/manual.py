@@ -98,7 +98,7 @@ class Manual:
     def _lock(self, joint: int, words: list[str]) -> str | None:
         piston = float(self._piston[joint])
         if not np.isfinite(piston):
-            return f"lock: where the piston of joint {joint + 1} stands is not known"
+            return f"lock: the piston position of joint {joint + 1} is not known"
         if self._jog is not None and self._jog[0] == joint:
             self._jog = None
         self._locked[joint] = piston

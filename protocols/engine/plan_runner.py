@@ -315,7 +315,7 @@ class PlanRunner:
         requests = self.inputs.control.requests
         if not requests.pause:
             return
-        self.rest_now("a pause was asked for")
+        self.rest_now("a pause was requested")
         requests.pause = requests.resume = False
         self.machine.to(EngineState.PAUSED, "until someone resumes")
         self.report_phase("pause", "paused", 0, 0, "outputs at zero until someone resumes")
@@ -327,7 +327,7 @@ class PlanRunner:
                 )
             self.session.wait(ENGINE.look_seconds)
         requests.resume = False
-        self.machine.to(EngineState.IDLE, "resumed; places and locks are made anew")
+        self.machine.to(EngineState.IDLE, "resumed; joints are positioned and locked again")
 
     def _skipped(self, name: str) -> bool:
         requests = self.inputs.control.requests

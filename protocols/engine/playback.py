@@ -195,8 +195,8 @@ class Playback:
         """Lower the position gain to the slow loop's, no faster than the loop settles."""
         loop, loose = firm, self._slow_gain()
         slowest = min(d.gain for d in self.joints)
-        while loop * ENGINE.looser > loose:
-            loop *= ENGINE.looser
+        while loop * ENGINE.loosening_factor > loose:
+            loop *= ENGINE.loosening_factor
             self._play(loop=loop)
             self.go_on(0.5 / (slowest * loop))
 

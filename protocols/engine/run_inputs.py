@@ -92,7 +92,7 @@ class RunControl:
 
     def _skip(self, command: Command, state: EngineState) -> str | None:
         if state is EngineState.CHECKING:
-            return "nothing runs yet that could be skipped"
+            return "nothing can be skipped before the first step"
         self.requests.skip = True
         return None
 

@@ -113,7 +113,7 @@ class Session:
         Raises RuntimeError for any law but zero while the engine is at rest.
         """
         if not self._machine.energised and any(law.limit > 0.0 for law in changes.values()):
-            raise RuntimeError(f"an output law was asked for in state {self._machine.state}")
+            raise RuntimeError(f"an output law was requested in state {self._machine.state}")
         for joint, law in changes.items():
             self.laws[joint] = law
         return self.bench.apply(tuple(self.laws), restart)

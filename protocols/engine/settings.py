@@ -38,7 +38,7 @@ class EngineSettings:
     ramp_step: float = 0.05  # [s] between two sizes of the growing waveform
     ramp_down: float = 0.5  # [s] of shrinking: closing the valve at once would shock a moving arm
     warm_ups: int = 3  # at most; more than one only if the first left the piston off centre
-    looser: float = 0.8  # factor between two position gains while the loop is loosened
+    loosening_factor: float = 0.8  # factor between two position gains while the loop is loosened
     look_ahead: float = 0.1  # [s] between two forecasts
     released_share: float = 0.25  # of the offset allowed, within which the loop is opened
 
