@@ -110,7 +110,7 @@ class Recorder:
 
     @property
     def is_open(self) -> bool:
-        """Whether blocks can be kept."""
+        """Whether the journal is open, so that blocks can be recorded."""
         return self._journal is not None
 
     @property

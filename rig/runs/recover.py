@@ -24,7 +24,7 @@ FINALISED: Final = "was finalised already; there is nothing to recover"
 
 @dataclass(frozen=True, kw_only=True)
 class RecoverReport(Written):
-    """Result of `recover`: counts of the records, and what a person is told.
+    """Result of `recover`: counts of the records, and messages to the user.
 
     `damaged` is the path of a damaged journal, from which at least `missing` samples are lost.
     """

@@ -153,12 +153,12 @@ def is_run(folder: Path) -> bool:
 
 
 def is_crate(folder: Path) -> bool:
-    """Whether a folder holds the copy of a run that `bramah export --format ro-crate` makes."""
+    """Return whether a folder holds a copy of a run made by `bramah export --format ro-crate`."""
     return (folder / CRATE_METADATA).is_file()
 
 
 def is_file_of_run(path: Path) -> bool:
-    """Whether a file holds what a run has recorded or how it was taken."""
+    """Return whether a file holds what a run recorded or how it was taken."""
     return path.name in _OWN_FILES and is_run(path.parent)
 
 

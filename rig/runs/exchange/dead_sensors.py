@@ -63,15 +63,15 @@ def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:
 
 
 def _too_small(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
-    ends, unit = rig.sensors.of(kind).range, rig.unit_of(name)
+    (bottom, top), unit = rig.sensors.of(kind).range, rig.unit_of(name)
     if kind in _PRESSURES:  # a pressure may be constant, but is not near zero throughout
         extent, words = max(abs(low), abs(high)), "stays below"
     elif kind in (ch.PISTON, ch.POSITION):
         extent, words = high - low, "moves by"
     else:
         return []
-    share = extent / (ends[1] - ends[0])
-    if share >= EXCHANGE.least_part:
+    share = extent / (top - bottom)
+    if share >= EXCHANGE.smallest_span:
         return []
     return [
         f"{name}: {words} {extent:.3g} {unit}, {100 * share:.2g} % of the range of "
@@ -80,13 +80,13 @@ def _too_small(rig: Rig, kind: str, name: str, low: float, high: float) -> list[
 
 
 def _outside_range(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
-    ends = rig.sensors.of(kind).range
-    margin = EXCHANGE.end * (ends[1] - ends[0])
-    if low > ends[0] + margin and high < ends[1] - margin:
+    bottom, top = rig.sensors.of(kind).range
+    margin = EXCHANGE.end_share * (top - bottom)
+    if low > bottom + margin and high < top - margin:
         return []
     return [
         f"{name}: goes from {low:g} to {high:g} {rig.unit_of(name)}, to an end of the range "
-        f"{ends[0]:g} to {ends[1]:g} of the rig's sensor; is it clipped, or is the unit another? A "
+        f"{bottom:g} to {top:g} of the rig's sensor; is it clipped, or is the unit another? A "
         "few samples beyond it are taken as lost"
     ]
 
@@ -94,13 +94,13 @@ def _outside_range(rig: Rig, kind: str, name: str, low: float, high: float) -> l
 def _flat(name: str, values: Array, unit: str) -> list[str]:
     span = float(np.ptp(values))
     resolution = float(np.diff(np.unique(values)).min())
-    if resolution > span / EXCHANGE.levels:
+    if resolution > span / EXCHANGE.fewest_levels:
         return []
     flat = []
     for end, distance in (("top", values.max() - values), ("bottom", values - values.min())):
         at_level = int(np.count_nonzero(distance < 0.5 * resolution))
-        near = int(np.count_nonzero(distance <= EXCHANGE.near * span))
-        if at_level >= EXCHANGE.least and at_level > EXCHANGE.share * near:
+        near = int(np.count_nonzero(distance <= EXCHANGE.near_extreme * span))
+        if at_level >= EXCHANGE.fewest_equal and at_level > EXCHANGE.clipped_share * near:
             level = values.max() if end == "top" else values.min()
             flat.append(
                 f"{name}: {at_level} of {len(values)} samples are exactly {level:g} {unit}, its "

@@ -122,9 +122,9 @@ def _without_outliers(rig: Rig, imported: _Imported) -> _Imported:
     channels = dict(imported.channels)
     for name in filter(channels.__contains__, rig.channels):
         x, (low, high) = channels[name], rig.sensors.of(ch.kind_of(name)[0]).range
-        margin = EXCHANGE.end * (high - low)
+        margin = EXCHANGE.end_share * (high - low)
         outside = (x < low - margin) | (x > high + margin)
-        if 0 < np.count_nonzero(outside) <= EXCHANGE.outliers * len(x):
+        if 0 < np.count_nonzero(outside) <= EXCHANGE.outlier_share * len(x):
             channels[name] = np.where(outside, np.nan, x)
     return replace(imported, channels=channels)
 
@@ -174,10 +174,10 @@ def _bandwidth(position: Array, rate: float) -> float:
     power = np.abs(np.fft.rfft((position - np.mean(position)) * np.hanning(len(position)))) ** 2
     f = np.fft.rfftfreq(len(position), 1.0 / rate)
     noise = float(np.median(power[f > 0.25 * rate])) / np.log(2.0)
-    inside = f <= EXCHANGE.highest
+    inside = f <= EXCHANGE.highest_bandwidth
     seen = np.where(power > EXCHANGE.above_noise * noise, power, 0.0)[inside]
     if not seen.any():
-        return EXCHANGE.highest
+        return EXCHANGE.highest_bandwidth
     velocity = np.cumsum(seen * f[inside] ** 2)
     return float(f[inside][np.searchsorted(velocity, EXCHANGE.velocity_share * velocity[-1])])
 
@@ -186,8 +186,8 @@ def _common(
     file: Path, rate: float, samples: int, delays: Mapping[str, float]
 ) -> tuple[int, int]:  # fmt: skip
     """Return the samples [first, last) common to all columns without their delays [samples]."""
-    least, most = min((0.0, *delays.values())), max((0.0, *delays.values()))
-    first, last = math.ceil(-least - EXCHANGE.whole), samples - math.ceil(most - EXCHANGE.whole)
+    first = math.ceil(-min((0.0, *delays.values())) - EXCHANGE.delay_tolerance)
+    last = samples - math.ceil(max((0.0, *delays.values())) - EXCHANGE.delay_tolerance)
     if last - first < 2:
         name = max(delays, key=lambda n: abs(delays[n]))
         raise InputError(
@@ -201,7 +201,7 @@ def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
     """Return a column (n,) advanced by its delay [samples]; 0 outside [first, last)."""
     samples = round(delay)
     out = np.zeros_like(values)
-    if abs(delay - samples) < EXCHANGE.whole:
+    if abs(delay - samples) < EXCHANGE.delay_tolerance:
         out[first:last] = values[first + samples : last + samples]
         return out
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415 - loads slowly
@@ -262,7 +262,7 @@ def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, 
             f"{time[row - 1]:.9g} to {time[row]:.9g} s; expected it to increase"
         )
     step = float(np.median(steps))
-    uneven = np.flatnonzero(np.abs(steps - step) > EXCHANGE.uneven * step)
+    uneven = np.flatnonzero(np.abs(steps - step) > EXCHANGE.step_deviation * step)
     if len(uneven):
         row = int(uneven[0]) + 1
         raise InputError(

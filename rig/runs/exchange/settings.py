@@ -15,28 +15,28 @@ class ExchangeSettings:
     """Numbers without unit are shares or counts."""
 
     file_bytes: int = 4 << 30  # [bytes], largest size of a file of columns
-    whole: float = 1e-6  # of a sample, within which a delay counts as whole samples
-    uneven: float = 0.1  # of the mean step: allowed deviation of rounded time stamps
+    delay_tolerance: float = 1e-6  # of a sample, within which a delay counts as whole samples
+    step_deviation: float = 0.1  # of the mean step: allowed deviation of rounded time stamps
     trip_seconds: float = 2.0  # [s] before the offending sample, and after it
 
     # Bandwidth of the motion in records without excited lines: the share of the velocity's power
     # below it, how many times the noise's mean power a spectral line must have (noise exceeds 10
-    # times once in 22 000 lines), the highest frequency looked at [Hz], and the shortest record [s]
+    # times once in 22 000 lines), the highest frequency examined [Hz], and the shortest record [s]
     # that states one.
     velocity_share: float = 0.998
     above_noise: float = 10.0
-    highest: float = 30.0
+    highest_bandwidth: float = 30.0
     bandwidth_seconds: float = 6.0
 
     # Clipped, stuck and constant sensors.
-    levels: int = 500  # of resolution within the range; a coarser channel has flat tops anyway
-    near: float = 0.02  # of the channel's range, counted from its extreme
-    share: float = 0.5  # of the samples near an extreme with its exact value; a parabola: a third
-    least: int = 10  # samples at one value before it is reported
-    end: float = 1e-3  # of a sensor's range, from its end
-    outliers: float = 0.01  # of a channel's samples: so few beyond the range are taken as lost
+    fewest_levels: int = 500  # in the range; a channel with fewer has flat tops anyway
+    near_extreme: float = 0.02  # of the channel's range, counted from its extreme
+    clipped_share: float = 0.5  # of samples near an extreme equal to it; a parabola: a third
+    fewest_equal: int = 10  # samples at one value before it is reported
+    end_share: float = 1e-3  # of a sensor's range, from its end
+    outlier_share: float = 0.01  # of a channel's samples: up to this, those out of range are lost
     stuck_travel: float = 0.2  # of the piston's travel, while a pressure keeps one exact value
-    least_part: float = 2e-3  # of a sensor's range: free joints move, pressures are higher
+    smallest_span: float = 2e-3  # of a sensor's range: free joints move, pressures are higher
 
 
 EXCHANGE: Final = ExchangeSettings()
