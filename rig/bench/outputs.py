@@ -167,9 +167,9 @@ class Outputs:
         return not moving
 
     def close(self, *, tripped: bool = False) -> bool:
-        """Zero again, stop the stream, close the wire; return whether zero is sure; never raise.
+        """Zero again, stop the stream, close the wire; return whether zero was confirmed.
 
-        After a trip the driver, if it can, closes the wire so that the device latches the trip too.
+        Never raises. After a trip a driver that can closes the wire so that the device latches it.
         """
         zeroed = self.surely_zero()
         if tripped and not self._silent and isinstance(self.driver, LatchesTrip):

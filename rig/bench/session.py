@@ -176,7 +176,7 @@ class Bench:
             raise DeviceLost(f"{UNSURE}; the run itself was complete")
 
     def _leave(self, error: BaseException | None) -> bool:
-        """Zero the outputs, prove it, close the wire, flush, report; return whether zero is sure.
+        """Zero the outputs, close the wire, flush, report; return whether zero was confirmed.
 
         The signal handlers are restored last.
         """

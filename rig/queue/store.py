@@ -237,7 +237,7 @@ class QueueStore:
                 self._enter(item, CANCELLED, f"cancelled by {who}")
             else:
                 self._db.execute("UPDATE item SET cancel = 1 WHERE id = ?", (number,))
-                self._note(number, item.attempt, "cancel wished", f"by {who}")
+                self._note(number, item.attempt, "cancel requested", f"by {who}")
         return self.item(number)
 
     def retry(self, number: int, who: str) -> Item:
