@@ -140,11 +140,9 @@ class _Search:
                 "add a step that excites the joint concerned"
             )
         finite = {n: e for n, e in errors.items() if math.isfinite(e)}
-        means = {
-            "D": float(np.exp(np.mean(np.log(list(finite.values()))))),
-            "E": max(finite.values()),
-        }
-        start = means.get(self.criterion, finite.get(self.criterion, 0.0))
+        sizes = list(finite.values())
+        overall = {"D": float(np.exp(np.mean(np.log(sizes)))), "E": max(sizes)}
+        start = overall.get(self.criterion, finite.get(self.criterion, 0.0))
         self.allowed = {n: max(DESIGN.kept_error * e, start) for n, e in finite.items()}
 
     def allow(self, steps: Sequence[StepInformation]) -> None:

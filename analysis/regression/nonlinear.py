@@ -81,14 +81,12 @@ def _transform(
     reduction: ParameterReduction, places: Sequence[int], others: Sequence[int], p: Array
 ) -> Array:
     """Return S (k+1, m+1) at the parameters p (m,)."""
-    k, unchanged = len(places) + len(others), len(others)
+    k, count = len(places) + len(others), len(others)
     slope = np.zeros((k, len(p)))
-    slope[others, np.arange(unchanged)] = 1.0
-    slope[np.ix_(places, range(unchanged, len(p)))] = reduction.slope(p[unchanged:])
+    slope[others, np.arange(count)] = 1.0
+    slope[np.ix_(places, range(count, len(p)))] = reduction.slope(p[count:])
     constant = np.zeros(k)
-    constant[places] = (
-        reduction.value(p[unchanged:]) - reduction.slope(p[unchanged:]) @ p[unchanged:]
-    )
+    constant[places] = reduction.value(p[count:]) - reduction.slope(p[count:]) @ p[count:]
     S = np.zeros((k + 1, len(p) + 1))
     S[:k, :-1], S[:k, -1], S[k, -1] = slope, -constant, 1.0
     return S

@@ -109,9 +109,7 @@ class Accumulator:
     def fold(self, matrix: Array, rhs: Array) -> None:
         """Add rows (m, k), (m,); raises ValueError for other shapes."""
         if matrix.shape != (len(rhs), self._width - 1):
-            raise ValueError(
-                f"rows {matrix.shape}, {rhs.shape} do not have {self._width - 1} columns"
-            )
+            raise ValueError(f"rows {matrix.shape}, {rhs.shape}: need {self._width - 1} columns")
         for start in range(0, len(rhs), self._block):
             block = slice(start, start + self._block)
             count = len(rhs[block])

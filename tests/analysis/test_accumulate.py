@@ -73,7 +73,7 @@ def test_any_cut_of_the_rows_gives_the_same_normal_matrix(
 
 
 def test_rows_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="do not have 3 columns"):
+    with pytest.raises(ValueError, match="need 3 columns"):
         Accumulator(3).fold(np.ones((5, 2)), np.ones(5))
 
 
