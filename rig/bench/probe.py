@@ -73,9 +73,8 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
     finally:
         driver.close()
     samples = np.concatenate(late) if late else np.empty(0)
-    n, timing = len(samples), None
-    if n:
-        timing = Lateness(n, float(samples.mean()), float(samples.std()))
+    n = len(samples)
+    timing = Lateness(n, float(samples.mean()), float(samples.std())) if n else None
     marked = [
         replace(reading, mark=doubts.get(reading.channel, reading.mark))
         for reading in readings(block, rig)

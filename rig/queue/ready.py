@@ -48,30 +48,27 @@ def dependence(item: Item, items: Mapping[int, Item]) -> Readiness:
     wanted = item.job.wanted
     if item.job.after is None:
         return Readiness(True)
-    earlier = items[item.job.after]
-    if not earlier.over:
-        return _wait(f"item {earlier.id} is {earlier.state}")
-    if wanted in (ENDED, earlier.state):
+    prior = items[item.job.after]
+    if not prior.over:
+        return _wait(f"item {prior.id} is {prior.state}")
+    if wanted in (ENDED, prior.state):
         return Readiness(True)
-    if wanted in OVER or earlier.state != DONE:
+    if wanted in OVER or prior.state != DONE:
         expected = wanted if wanted in OVER else DONE
-        reason = f"item {earlier.id} is {earlier.state}; wanted: {expected}"
-        return Readiness(False, reason, SKIPPED)
-    return _compared(wanted, earlier)
+        return Readiness(False, f"item {prior.id} is {prior.state}; wanted: {expected}", SKIPPED)
+    return _compared(wanted, prior)
 
 
-def _compared(wanted: str, earlier: Item) -> Readiness:
+def _compared(wanted: str, prior: Item) -> Readiness:
     condition = result_condition(wanted)
-    value = result_value(earlier.results, condition)
+    value = result_value(prior.results, condition)
     if value is None:
-        why = earlier.results.get("error", f"{condition.name} was not identified")
-        reason = f"{wanted!r} of item {earlier.id} cannot be judged: {why}"
-        return Readiness(False, reason, SKIPPED)
+        why = prior.results.get("error", f"{condition.name} was not identified")
+        return Readiness(False, f"{wanted!r} of item {prior.id} cannot be judged: {why}", SKIPPED)
     if condition.holds(value):
         return Readiness(True)
     part = f"{condition.name}.{condition.part}"
-    reason = f"{part} of item {earlier.id} is {value:.4g}; wanted: {wanted}"
-    return Readiness(False, reason, SKIPPED)
+    return Readiness(False, f"{part} of item {prior.id} is {value:.4g}; wanted: {wanted}", SKIPPED)
 
 
 def judge(
