@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -28,6 +29,9 @@ from analysis.terms.base import (
 from analysis.terms.hydraulics import root_of_drop, signed_root
 from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
+
+MOST_OVERLAP: Final = 0.07  # of the stroke: a third of the largest rounding, which keeps it open
+CLOSED: Final = 0.25  # of an overlap: less is open at the null where clearance alone rounds edges
 
 
 @kernel
@@ -54,7 +58,8 @@ class UnderlapLeakage(ValveEffect):
     Openings added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
     d- = max(w - u, 0) - max(-u, 0), edges rounded as those of `valve_deadband`, each times its own
     gain and root (Merritt 1967, chapter 5, open-centre valve). The gains are those of the orifices,
-    whose columns they add to.
+    whose columns they add to. A negative w is an overlap that is less than what the rounding leaves
+    open at the null.
     """
 
     name = "underlap_leakage"
@@ -80,7 +85,15 @@ class UnderlapLeakage(ValveEffect):
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke, 0.1 * stroke)
         lap, r, c = self.shape_names()
-        return Shape(lap, "V", 0.0, 0.5 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
+        low, high = -MOST_OVERLAP * stroke, 0.5 * stroke
+        return Shape(lap, "V", low, high, grid, 0.0), rounding(r, stroke), corner(c)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Reject an overlap that leaves less than `CLOSED` of itself open at the null."""
+        w, r, c = self.full_shape(rig, shape)
+        if w < 0.0 and edge(w, r, c) < CLOSED * -w:
+            return f"an overlap of {-w:.3g} V closes the edges at the null: that is a dead band"
+        return super().problem(rig, values, shape)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the additional openings times the roots, under the orifices' own names."""

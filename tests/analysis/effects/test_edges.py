@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from analysis.effects.edges import edge, opened
 from analysis.effects.underlap import UnderlapLeakage
 from analysis.effects.valve import ValveDeadband
 from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
 
 ROUNDING = 4e-3  # [V]
 
@@ -44,6 +48,33 @@ def test_a_worn_corner_is_straight_again_sooner_than_a_clearance() -> None:
         for c in (0.0, 2.0)
     ]
     assert off[1] < 0.3 * off[0]
+
+
+def test_an_overlap_within_worn_corners_leaves_the_valve_open_at_its_null(rig: Rig) -> None:
+    """Corners worn by 20 mV either side of edges that overlap by 5 mV: an underlap below 0."""
+    u = np.linspace(-0.06, 0.06, 601)
+
+    def worn(x: Array) -> Array:
+        inside = (x + 0.02) ** 2 / 0.08
+        return np.where(np.abs(x) < 0.02, inside, np.maximum(x, 0.0))
+
+    def misfit(shape: Array) -> Array:
+        w, r, c = shape
+        return np.concatenate([
+            opened(u + w, r, c) - worn(u - 5e-3), opened(w - u, r, c) - worn(-u - 5e-3)
+        ])  # fmt: skip
+
+    effect = UnderlapLeakage("joint 2")
+    lows, highs = zip(*((s.low, s.high) for s in effect.shapes(rig)), strict=True)
+    start, scale = (0.0, 0.02, 1.0), (0.01, 0.02, 1.0)
+    free = least_squares(misfit, start, bounds=(lows, highs), x_scale=scale)
+    above = least_squares(misfit, start, bounds=((-1e-12, *lows[1:]), highs), x_scale=scale)
+    assert free.x[0] == pytest.approx(-5e-3, abs=1e-3)
+    assert free.cost < 0.1 * above.cost
+    values = dict.fromkeys((c.parameter for c in effect.coefficients(rig)), 1e-8)
+    assert effect.problem(rig, values, free.x.tolist()) == ""
+    # Sharper corners close, and then the valve has a dead band.
+    assert "that is a dead band" in effect.problem(rig, values, (-5e-3, 4e-3, 0.0))
 
 
 @pytest.mark.parametrize("kind", [ValveDeadband, UnderlapLeakage])
