@@ -353,6 +353,10 @@ class Effect(Term):
         """Return the shape with missing details, once for each start of their search."""
         return ((*shape, *(s.middle for s in self.shapes(rig)[len(shape) :])),)
 
+    def instead_of_detail(self) -> tuple[Effect, ...]:
+        """Return effects that are likelier than a detail of the form where both fit as well."""
+        return ()
+
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return shapes from which a search finds other forms of the same effect."""
         return ()

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.effects.base import Array, Shape
+from analysis.effects.base import Array, Effect, Shape
 from analysis.effects.measurement import KINDS, Sensor
 from analysis.signals.conditioning import Signals
 from rig.model import channels as ch
@@ -93,6 +93,10 @@ class SensorGain(Sensor):
     variable = "the channel itself"
     confounders = ("sensor_offset", "supply_sag", "tank_pressure", "pressure_dependent_friction")
     separated_by = "two amplitudes and two working points: an offset does not grow with either"
+
+    def instead_of_detail(self) -> tuple[Effect, ...]:
+        """Return the channel's offset: a sensor has one more often than it is bent."""
+        return (SensorOffset(self.where),)
 
     def absorbed(self, rig: Rig) -> str:
         """Return that the flow gains absorb a spool's gain."""

@@ -116,8 +116,24 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         return fit
     # A form that fitted better without the details need not do so with them.
     more = _in_best_form(data, more, place, steps)
-    earned = fit.energy - more.energy > asked
+    earned = fit.energy - more.energy > asked and not _replaces_detail(data, fit, more, used, steps)
     return more if earned and _determines_shapes(data, more, more.terms[place], used) else fit
+
+
+def _replaces_detail(
+    data: RegressionData, fit: ExactFit, detailed: ExactFit, used: Used, steps: int
+) -> bool:
+    """Return whether another effect beside `used` leaves as little as details of its form.
+
+    Over part of its range, a sensor with a gain and an offset looks like a bent one.
+    """
+    present = {u.term for u in fit.terms}
+    others = [effect for effect in effect_in(used).instead_of_detail() if effect not in present]
+    beside = (
+        _with_searched_shapes(data, (*fit.terms, at_start(data.rig, effect)), steps)
+        for effect in others
+    )
+    return any(model.energy <= detailed.energy + SEARCH.number_price for model in beside)
 
 
 def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, before: Used) -> bool:
