@@ -240,8 +240,8 @@ class Effect(Term):
         """Return why the baseline's free parameters hide it completely ('' if they do not)."""
         return ""
 
-    def inseparable(self) -> tuple[tuple[str, str], ...]:
-        """Return (name, where) of effects that no data of this rig can separate from it."""
+    def inseparable(self, shape: Sequence[float] = ()) -> tuple[tuple[str, str], ...]:
+        """Return (name, where) of effects that no data can separate from it at a shape."""
         return ()
 
     @classmethod
@@ -356,6 +356,10 @@ class Effect(Term):
     def instead_of_detail(self) -> tuple[Effect, ...]:
         """Return effects that are likelier than a detail of the form where both fit as well."""
         return ()
+
+    def goes_with(self, other: Effect) -> bool:
+        """Return whether either of two effects may take the place of a detail of the other."""
+        return self in other.instead_of_detail() or other in self.instead_of_detail()
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return shapes from which a search finds other forms of the same effect."""

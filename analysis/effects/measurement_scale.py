@@ -188,7 +188,7 @@ class SensorOffset(Sensor):
         kind = ch.kind_of(self.channel)[0]
         return {ch.PISTON: (0.3e-3,), ch.SPOOL: (), ch.TEMPERATURE: ()}.get(kind, (0.03e6,))
 
-    def inseparable(self) -> tuple[tuple[str, str], ...]:
+    def inseparable(self, shape: Sequence[float] = ()) -> tuple[tuple[str, str], ...]:
         """Return the null's offset for a spool: data cannot separate valve and sensor."""
         return (("spool_offset", self.place),) if self.side == "spool" else ()
 

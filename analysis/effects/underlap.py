@@ -31,6 +31,7 @@ from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
 
 MOST_OVERLAP: Final = 0.07  # of the stroke: a third of the largest rounding, which keeps it open
+OVERLAPS: Final = 0.02  # of the rounding: with less the edges meet at the null
 CLOSED: Final = 0.25  # of an overlap: less is open at the null where clearance alone rounds edges
 
 
@@ -87,6 +88,11 @@ class UnderlapLeakage(ValveEffect):
         lap, r, c = self.shape_names()
         low, high = -MOST_OVERLAP * stroke, 0.5 * stroke
         return Shape(lap, "V", low, high, grid, 0.0), rounding(r, stroke), corner(c)
+
+    def inseparable(self, shape: Sequence[float] = ()) -> tuple[tuple[str, str], ...]:
+        """Return the dead band of edges that overlap by over `OVERLAPS` of their rounding."""
+        worn = len(shape) > 1 and shape[0] < -OVERLAPS * shape[1]
+        return (("valve_deadband", self.place),) if worn else ()
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject an overlap that leaves less than `CLOSED` of itself open at the null."""

@@ -173,7 +173,7 @@ class SpoolOffset(ValveEffect):
         """Subtract the null from the spool's signal."""
         return self.with_opening(signals, signals.u[:, self.joint] - self.shape_of(rig, shape)[0])
 
-    def inseparable(self) -> tuple[tuple[str, str], ...]:
+    def inseparable(self, shape: Sequence[float] = ()) -> tuple[tuple[str, str], ...]:
         """Return the LVDT's own offset: data cannot separate valve and sensor."""
         return (("sensor_offset", f"joint {self.joint + 1} spool"),)
 

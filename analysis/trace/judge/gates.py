@@ -111,7 +111,7 @@ def judge_effects(
         unphysical = hypotheses.physical_problem(winner, used)
         inseparable = [
             Rival(name, rivals.place_of(effect_of(name, at)), 1.0, 1.0, True, at)
-            for name, at in effect.inseparable()
+            for name, at in effect.inseparable(used.shape)
         ]
         removes = removed.share >= TRACE.least_removed and not disturbed
         significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown else "")

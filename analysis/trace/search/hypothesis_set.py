@@ -329,7 +329,8 @@ class HypothesisSet:
         and a name of it are not combined at one place: one would be the other's form error.
         """
         data, taken, laws = rebased(self.train_data, now.fit), now.keys, now.laws
-        curves = {law_of(e) for e in effects_among(now.effects) if e.free}
+        own = effects_among(now.effects)
+        curves = {law_of(e) for e in own if e.free}
         tried = [
             used
             for used in self.variants_of(data, now.fit.residual)
@@ -358,6 +359,11 @@ class HypothesisSet:
         if free:
             return larger
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
+        # A sensor's gain alone is fitted far from its size beside an offset, and so is the offset.
+        for effect in self.effects if may_grow(now.effects) else ():
+            if effect.key not in taken and any(map(effect.goes_with, own)):
+                grown = (*now.effects, at_start(self.train_data.rig, effect))
+                with_parts[keys_of(grown)] = grown
         for hypothesis in (now, *filter(self.physical_problem, larger)):
             for effects in self.with_parts_beside(hypothesis, equations):
                 with_parts.setdefault(keys_of(effects), effects)

@@ -73,6 +73,8 @@ def test_an_overlap_within_worn_corners_leaves_the_valve_open_at_its_null(rig: R
     assert free.cost < 0.1 * above.cost
     values = dict.fromkeys((c.parameter for c in effect.coefficients(rig)), 1e-8)
     assert effect.problem(rig, values, free.x.tolist()) == ""
+    assert effect.inseparable(free.x.tolist()) == (("valve_deadband", "joint 2"),)
+    assert effect.inseparable((1e-3, 0.02, 1.0)) == effect.inseparable() == ()
     # Sharper corners close, and then the valve has a dead band.
     assert "that is a dead band" in effect.problem(rig, values, (-5e-3, 4e-3, 0.0))
 
