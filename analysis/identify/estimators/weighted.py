@@ -47,28 +47,26 @@ def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
     ]
     place = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
 
-    def other_chamber(b: RepeatBlock) -> int | None:
-        """Return the place of the other chamber's block where it has the same rows."""
-        kind, joint = b.equation.rsplit("_", 1)
+    def with_other_chamber(i: int) -> list[int]:
+        """Return a block's place, and that of the other chamber where that has the same rows."""
+        kind, joint = blocks[i].equation.rsplit("_", 1)
         other = {"flow_cap": "flow_rod", "flow_rod": "flow_cap"}.get(kind)
-        i = place.get((b.run, b.record, f"{other}_{joint}"))
-        return i if i is not None and len(blocks[i].y) == len(b.y) else None
+        k = place.get((blocks[i].run, blocks[i].record, f"{other}_{joint}"))
+        return [i] if k is None or len(blocks[k].y) != len(blocks[i].y) else [i, k]
 
+    pairs = [with_other_chamber(i) for i in range(len(blocks))]
     factors: dict[tuple[tuple[int, str, str], int], Array] = {}
     out = list(blocks)
-    for i, b in enumerate(blocks):
-        other = other_chamber(b)
-        if other is not None and b.equation.startswith("flow_rod"):
+    for b, pair in zip(blocks, pairs, strict=True):
+        if len(pair) > 1 and b.equation.startswith("flow_rod"):
             continue  # mixed with its cap chamber
-        pair = [i] if other is None else [i, other]
         key = b.shared, len(pair)
         if key not in factors:
-            alike = [(m, other_chamber(c)) for m, c in enumerate(blocks) if c.shared == b.shared]
             # A repeat may lack the other chamber: one of its pressures is masked throughout.
-            members = [pair_of for pair_of in alike if None not in pair_of[: len(pair)]]
             stacked = [
-                np.column_stack([deviation[j] for j in pair_of[: len(pair)] if j is not None])
-                for pair_of in members
+                np.column_stack([deviation[k] for k in repeat[: len(pair)]])
+                for c, repeat in zip(blocks, pairs, strict=True)
+                if c.shared == b.shared and len(repeat) >= len(pair)
             ]
             factors[key] = _whitener(np.concatenate(stacked), b)
         L = factors[key]
