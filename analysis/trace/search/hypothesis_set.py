@@ -361,7 +361,7 @@ class HypothesisSet:
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
         # A sensor's gain alone is fitted far from its size beside an offset, and so is the offset.
         for effect in self.effects if may_grow(now.effects) else ():
-            if effect.key not in taken and any(map(effect.goes_with, own)):
+            if effect.key not in {*taken, *out} and any(map(effect.goes_with, own)):
                 grown = (*now.effects, at_start(self.train_data.rig, effect))
                 with_parts[keys_of(grown)] = grown
         for hypothesis in (now, *filter(self.physical_problem, larger)):

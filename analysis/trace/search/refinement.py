@@ -116,8 +116,9 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         return fit
     # A form that fitted better without the details need not do so with them.
     more = _in_best_form(data, more, place, steps)
-    earned = fit.energy - more.energy > asked and not _replaces_detail(data, fit, more, used, steps)
-    return more if earned and _determines_shapes(data, more, more.terms[place], used) else fit
+    earned = fit.energy - more.energy > asked
+    sure = earned and _determines_shapes(data, more, more.terms[place], used)
+    return more if sure and not _replaces_detail(data, fit, more, used, steps) else fit
 
 
 def _replaces_detail(
