@@ -148,6 +148,12 @@ def mass_matrix(R: Array, q: Array) -> Array:
     return np.asarray(partial[::-1, ::-1])
 
 
+def _one_per_joint(rig: Rig, stem: str) -> tuple[Coefficient, ...]:
+    """Return the coefficients of the torque rows that are named `stem` and 1 .. N."""
+    names = (f"{stem}{i}" for i in range(1, len(rig.joints) + 1))
+    return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
+
+
 @kernel
 def _viscous_friction(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
@@ -164,8 +170,7 @@ class ViscousFriction(Term):
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return Fv_1 .. Fv_N [N m s/rad]."""
-        names = (f"Fv{i}" for i in range(1, len(rig.joints) + 1))
-        return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
+        return _one_per_joint(rig, "Fv")
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q_i' in the rows of joint i."""
@@ -193,8 +198,7 @@ class Gravity(Term):
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return W_1 .. W_N [kg m]."""
-        names = (f"W{i}" for i in range(1, len(rig.joints) + 1))
-        return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
+        return _one_per_joint(rig, "W")
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return g sin(theta_k) in the rows of joints 1 .. k."""
