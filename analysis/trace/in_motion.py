@@ -34,8 +34,8 @@ def find(
     """Return what the model lacks: `search_and_judge`, in motion only where that is needed.
 
     No curve of the speed meets the rows of a joint that rests: there free forms are tried in motion
-    first. Torques at `records.lines` are judged beside the effects found. Where one is refused,
-    nothing is taken out of the rows, and all is searched again.
+    first. Torques at `records.lines` are judged beside the effects found. Where one is refused, it
+    is left in the rows, and all is searched again.
     """
     joints = {e.joint for e in candidates.named if e.family == "friction"}
     rest = any(_rests(rows.train.records, joint) for joint in joints)
@@ -49,8 +49,9 @@ def find(
     judged = _judged_lines(records, found)
     refused = gates.refused_effects(judged)
     if refused:
-        whole = replace(records, lines=())
-        found = find(whole, trace_rows(whole), candidates, done)
+        kept = [line for line, e in zip(records.lines, judged, strict=True) if e not in refused]
+        fewer = replace(records, lines=tuple(kept))
+        found = find(fewer, trace_rows(fewer), candidates, done)
         return replace(found, effects=(*found.effects, *refused))
     verdict = EXPLAINED if found.verdict == CLEAN else found.verdict
     return replace(found, effects=(*found.effects, *judged), verdict=verdict)

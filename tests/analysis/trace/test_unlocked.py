@@ -19,6 +19,7 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 from tests.analysis.carriage import Carriage, moves, record
+from tests.studies.machines import electric_plant
 
 AMPLITUDE, FREQUENCY = 3.0, 3.3  # [N], [Hz]
 
@@ -66,6 +67,30 @@ def test_a_force_that_the_held_out_records_lack_is_refused() -> None:
     result = trace([shaken(1, 0.25, 3, AMPLITUDE)], [shaken(2, 0.31, 1, 0.0)], look_ahead=False)
     assert not result.effects
     assert "periodic_disturbance" in {f.name for f in result.refused}
+
+
+def test_a_torque_is_named_beside_one_at_another_joint_that_is_refused() -> None:
+    """The elbow's torque acts in the training records alone, the shoulder's in all."""
+    arm = replace(electric_plant.draw_arm(np.random.default_rng(5)), dry=(1e-9, 1e-9))
+
+    def hummed(seed: int, elbow: float) -> Run:
+        rng, rig = np.random.default_rng(seed), load_rig("electric-2dof")
+        records = []
+        for one in electric_plant.records(rig, arm, rng, repeats=2).records:
+            channels = dict(one.channels)
+            for joint, amplitude, frequency in ((0, 2.0, 5.3), (1, elbow, 11.1)):
+                wave = np.sin(2 * np.pi * (frequency * np.asarray(one.time) + rng.uniform()))
+                channels[f"drive_{joint + 1}"] += amplitude / rig.drive_gains[joint] * wave
+            records.append(replace(one, channels=channels))
+        return Run(rig, tuple(records))
+
+    result = trace([hummed(1, 1.0)], [hummed(2, 0.0)], look_ahead=False)
+    (effect,) = result.effects
+    assert (effect.name, effect.where) == ("periodic_disturbance", "joint 1")
+    assert effect.parameters["T_amplitude_1"].value == pytest.approx(2.0, rel=0.05)
+    refused = {(f.name, f.where) for f in result.refused}
+    assert ("periodic_disturbance", "joint 2") in refused
+    assert result.after["torque_1"] < 0.5 * result.before["torque_1"]
 
 
 @pytest.mark.slow
