@@ -147,8 +147,8 @@ class Friction(Effect):
         contact = shape[self.shapes_before :]
         rate = contact[1] if self.stiffens and len(contact) > 1 else 0.0
         index = self._speed_index()
-        speed = shape[index] if len(shape) > index else TRANSITION
-        return (contact[0] if len(contact) else 0.0), rate, speed
+        speed = shape[index] if len(shape) > index else 0.0
+        return (contact[0] if len(contact) else 0.0), rate, speed or TRANSITION
 
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:
         """Return the path s_w (n,) [m] of the contact (`stiffened_path`)."""

@@ -11,6 +11,7 @@ from scipy.stats import cauchy, norm
 from analysis.effects.contact import (
     CAUCHY,
     GRID_RATIO,
+    TRANSITION,
     contact_range,
     contact_state,
     contact_under_load,
@@ -76,6 +77,13 @@ def test_without_memory_a_contact_is_the_mean_sign_of_a_velocity_that_is_spread(
     assert memoryless(v, w) == pytest.approx(spread.sf(0.0) - spread.cdf(0.0))
     heavier = cauchy(v, w)
     assert memoryless(v, w, CAUCHY) == pytest.approx(heavier.sf(0.0) - heavier.cdf(0.0))
+
+
+def test_a_transition_speed_that_is_not_given_is_the_narrowest() -> None:
+    """An exponent of the fall stands behind it in the shape."""
+    effect = StribeckFriction("joint 2")
+    for shape in ((0.03, 0.0), (0.03, 0.0, 0.0, 1.0)):
+        assert effect.contact_of(shape) == (0.0, 0.0, TRANSITION)
 
 
 def test_a_level_without_memory_has_either_tail_and_returns_to_the_other(rig: Rig) -> None:
