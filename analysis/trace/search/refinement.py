@@ -387,9 +387,10 @@ def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
 
 
 def shapes_in(rig: Rig, terms: Sequence[Used]) -> dict[str, Estimate]:
-    """Return the value of every shape that a model has, by its name, with no error (NaN)."""
+    """Return the shapes that a model's forms have, by name, with no error (NaN)."""
     return {
         s.parameter: Estimate(value, s.unit, math.nan, (math.nan, math.nan))
         for u in terms
         for value, s in zip(u.shape, shapes_of(rig, u), strict=True)
+        if s.given(value)
     }
