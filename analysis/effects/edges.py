@@ -19,7 +19,8 @@ from numba import njit
 from analysis.effects.base import Array, Shape
 
 CORNER: Final = 1.0  # where a search begins
-CORNER_BOUNDS: Final = (0.0, 10.0)  # above, the curve is indistinguishable from straight lines
+# Below, the curve is nearly that of a 0, where a form has no corner; above, it is straight lines.
+CORNER_BOUNDS: Final = (0.5, 10.0)
 
 
 def rounding(name: str, stroke: float) -> Shape:

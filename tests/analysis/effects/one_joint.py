@@ -27,14 +27,14 @@ P0 = 101_325.0
 NAMES = (
     "Fc", "Fs", "v_stribeck", "fall", "F_ext", "F_ret", "k_friction", "k_seal", "presliding",
     "stiffening", "inclination", "k_spring", "rest", "T_offset",
-    "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool",
+    "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool", "w_tank",
     "c_internal", "c_cap", "c_rod", "dp_supply", "p_tank", "p_back",
     "alpha_air", "V_cap", "V_rod", "m_payload", "hose",
 )  # fmt: skip
 (
     FC, FS, VS, FALL, FE, FR, KF, KD, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD,
-    ASTERN, NULL, UNDERLAP, TAU, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD, LOAD,
-    HOSE,
+    ASTERN, NULL, UNDERLAP, TAU, TO_TANK, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD,
+    LOAD, HOSE,
 ) = range(len(NAMES))  # fmt: skip
 SHAPES = {"presliding": 40e-6, "v_stribeck": 0.03, "fall": 2.0, "rest": -1.35}
 NAMES_1 = ("M2", "Fv2", "W2", "b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2")
@@ -137,8 +137,11 @@ def _rates(y, t, packed):
     ahead, astern = _edges(y[5] if e[TAU] > 0.0 else u, e)
     p_s, p_t = _ports(cap, rod, ahead, astern, par, e)
     leak = e[C_INT] * (cap - rod)
-    into_cap = _through(par[4], ahead, p_s - cap) - _through(par[5], astern, cap - p_t)
-    into_rod = _through(par[7], astern, p_s - rod) - _through(par[6], ahead, rod - p_t)
+    later, earlier = max(e[TO_TANK], 0.0), max(-e[TO_TANK], 0.0)
+    from_supply = max(ahead - earlier, 0.0), max(astern - earlier, 0.0)
+    to_tank = max(ahead - later, 0.0), max(astern - later, 0.0)
+    into_cap = _through(par[4], from_supply[0], p_s - cap) - _through(par[5], to_tank[1], cap - p_t)
+    into_rod = _through(par[7], from_supply[1], p_s - rod) - _through(par[6], to_tank[0], rod - p_t)
     into_cap -= leak + e[C_CAP] * (cap - p_t)
     into_rod += leak - e[C_ROD] * (rod - p_t)
     soft_cap = 1 / par[3] + e[AIR] * P0 / (cap + P0) ** 2

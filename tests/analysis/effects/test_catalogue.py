@@ -47,8 +47,8 @@ CONTRACT = {
 # Forms of edge, line and seal, no sizes.
 COMPARED = range(40, 400, 45)  # samples of `state` at which kernels and rows are compared
 DETAILS = (
-    "return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition", "tail",
-    "exponent", "spread", "steepness", "sharpness",
+    "return_laminar", "rounding", "corner", "w_tank", "V_supply", "stiffening", "transition",
+    "tail", "exponent", "spread", "steepness", "sharpness",
 )  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def _own(rig: Rig, one: Hypothesis) -> str:
     found: list[tuple[str, float]] = []
     for used in one.effects:
         found += [(c.parameter, one.fit.beta[c.parameter]) for c in used.term.coefficients(rig)]
-        found += shape_values(rig, used).items()
+        found += ((n, v) for n, v in shape_values(rig, used).items() if v)  # 0: not in the form
     return ", ".join(f"{name} {value:.3g}" for name, value in found)
 
 
