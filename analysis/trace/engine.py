@@ -236,7 +236,7 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
     lines = spectral_lines(train_data, finding.winner.fit.residual)
     moves, formulas = (
         ((), ())
-        if finding.verdict in (CLEAN, EXPLAINED) or finding.held_out_only
+        if finding.verdict in (CLEAN, EXPLAINED) or finding.trained_on_noise
         else clues_to(train_data, rows.choosing, finding.winner, lines)
     )
     further = (
@@ -287,8 +287,8 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
         *detection_limit_notes(hidden),
     ]
     runs_before, runs_after = free_runs
-    left = 0.0  # of training rows that hold noise alone
-    if verdict != CLEAN and not finding.held_out_only:
+    left = 0.0
+    if verdict != CLEAN and not finding.trained_on_noise:
         left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
     result = Trace(
         verdict, fitted.effects, error.noise, error.before, error.after,

@@ -13,7 +13,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.judge import gates
 from analysis.trace.result import UNEXPLAINED, Gate, JudgedEffect
-from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis import Hypothesis, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
 from rig.model.units import plain
@@ -76,8 +76,7 @@ class Finding:
 
     `effects` are all effects that were judged, refused ones included; `winner` is the set of those
     that passed; `remainders` are the equations in which it leaves too much; `hypotheses` are all
-    sets that were fitted. `held_out_only`: the training rows hold nothing above the noise, in
-    contrast to held-out rows.
+    sets that were fitted.
     """
 
     rows: TraceRows
@@ -87,7 +86,11 @@ class Finding:
     effects: tuple[JudgedEffect, ...] = ()
     remainders: tuple[Remainder, ...] = ()
     notes: tuple[str, ...] = ()
-    held_out_only: bool = False
+
+    @property
+    def trained_on_noise(self) -> bool:
+        """Whether the training rows hold no more than noise without any effect."""
+        return within_band(self.hypotheses.empty.excess_energy, self.hypotheses.noise_band)
 
     @property
     def named(self) -> tuple[JudgedEffect, ...]:

@@ -20,7 +20,7 @@ from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
 from analysis.trace.judge.gates import judged_beside_unknown_cause
-from analysis.trace.judge.rivals import best_tied_set
+from analysis.trace.judge.rivals import best_tied_set, cost
 from analysis.trace.judge.unrepeated import unrepeated_floors
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_trials import improved_by_exact_trials
@@ -59,6 +59,8 @@ def search_and_judge(
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
     winner = improved_by_exact_trials(hypotheses, hypotheses.run(done))
+    if in_noise:
+        winner = _shown_by_held_out_rows(hypotheses, winner, choosing)
     rng = np.random.default_rng(candidates.seed)
     found = Judge(rows, hypotheses, candidates.free, rng).best_finding(winner)
     named = any(map(gates.passes_gates, found.effects))
@@ -68,7 +70,25 @@ def search_and_judge(
     notes = (*_held_out_only_notes(rows.train, found.remainders), *notes)
     if found.winner.effects:
         return replace(found, notes=notes)
-    return replace(found, effects=(), notes=notes, held_out_only=True)  # refused: fitted to noise
+    return replace(found, effects=(), notes=notes)  # refused: fitted to noise
+
+
+def _shown_by_held_out_rows(
+    hypotheses: HypothesisSet, winner: Hypothesis, choosing: RegressionData
+) -> Hypothesis:
+    """Return the best fitted set with which the choosing rows hold no more than noise, or `winner`.
+
+    The training rows hold no more without effects either, but the set must remove from them what
+    its effects and free numbers cost.
+    """
+    before = hypotheses.empty.fit.energy
+    possible = [
+        o for o in hypotheses.fitted.values()
+        if before - o.fit.energy > SEARCH.number_price * sum(o.size)
+        and not hypotheses.physical_problem(o)
+        and not gates.equations_above_band(hypotheses, o, choosing)
+    ]  # fmt: skip
+    return min(possible, key=lambda o: cost(o, choosing), default=winner)
 
 
 def with_free_form(finding: Finding, candidates: Candidates) -> Finding:

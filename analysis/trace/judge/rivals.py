@@ -91,7 +91,7 @@ def rivals_of(
     for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
         moved = moved_parameter(train_data, winner, composite)
         # One effect is the simpler explanation, unless the records prefer two.
-        if moved and _cost(composite, holdout_data) < _cost(winner, holdout_data):
+        if moved and cost(composite, holdout_data) < cost(winner, holdout_data):
             ratios = ratio, training_test.ratio(composite.fit.residual)
             one, two = (_rival(effect_in(u), *ratios, True) for u in composite.effects[-2:])
             out.append(replace(one, moved=moved, beside=two))
@@ -181,12 +181,12 @@ def best_tied_set(
         return any(is_special_case(effect, other) for effect in named for other in others)
 
     tied = [o for o in tied_sets(hypotheses, winner, effects) if not is_richer(o)]
-    best = min(tied, key=lambda o: _cost(o, holdout_data), default=winner)
-    least = _cost(winner, holdout_data) - SEARCH.number_price
-    return best if _cost(best, holdout_data) < least else winner
+    best = min(tied, key=lambda o: cost(o, holdout_data), default=winner)
+    least = cost(winner, holdout_data) - SEARCH.number_price
+    return best if cost(best, holdout_data) < least else winner
 
 
-def _cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
+def cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
     """Return the energy in training and held-out rows with the price of effects and numbers."""
     residual = held_out_residual(holdout_data, hypothesis.fit)
     energy = hypothesis.fit.energy + float(residual @ residual)

@@ -234,6 +234,20 @@ def a_quiet_friction_is_named_beside_a_loud_leak(b: Benches) -> None:
     assert s.named() == {"internal_leakage", "coulomb_friction"}
 
 
+def a_gain_that_training_hardly_shows_is_named_by_the_held_out_records(b: Benches) -> None:
+    """The held-out motion is three times as large; in training an offset removes about as much."""
+    wrong = {"gain_piston": 1.01}
+    train = experiment(b.rig, rms=0.012, repeats=6, **wrong)
+    held_out = experiment(b.rig, repeats=2, seed=2, rms=0.035, **wrong)
+    result = b.traced((train, held_out), "sensor_gain", "sensor_offset")
+    assert result.verdict == "explained"
+    assert [effect.at for effect in result.effects] == ["joint 2 piston"]
+    low, high = result.effects[0].parameters["gain_piston_2"].ci95
+    assert low < wrong["gain_piston"] < high
+    assert result.after["torque_2"] < 1.2 * result.noise_floor["torque_2"]
+    assert result.before["torque_2"] > 1.5 * result.noise_floor["torque_2"]
+
+
 def twice_the_noise_on_the_held_out_day_is_not_clean(b: Benches) -> None:
     """Small moves show no drop of the supply, large ones do: 1.75 times the noise floor."""
     runs = b.kept("sagging", lambda: (
@@ -620,6 +634,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (a_cubic_spring_is_not_explained_by_a_linear_one, ("nothing is left",)),
     (seals_that_rub_speak_against_no_leak, ()),
     (a_quiet_friction_is_named_beside_a_loud_leak, ("further search",)),
+    (a_gain_that_training_hardly_shows_is_named_by_the_held_out_records, ("held-out rows choose",)),
     (twice_the_noise_on_the_held_out_day_is_not_clean, ("held-out band", "held-out floor x 2")),
     (what_the_judging_rows_alone_show_is_not_explained, ("judging rows unread",)),
     (wrong_numbers_of_a_rig_file_within_their_tolerances_are_no_effect, ("tolerances",)),

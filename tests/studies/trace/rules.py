@@ -199,6 +199,8 @@ RULES: Final = (
          ((SpoolOffset, "inseparable", lambda *_: ()),
           (SensorOffset, "inseparable", lambda *_: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
+    Rule("held-out rows choose", "where training rows hold noise alone, they choose alone",
+         ((judging, "_shown_by_held_out_rows", lambda _sets, winner, _rows: winner),)),
     Rule("further search", "no further effect is searched for in single equations",
          ((HypothesisSet, "extended_in", lambda *_: None),)),
     Rule("price of parameters", "a further parameter costs nothing",
