@@ -156,8 +156,12 @@ class Sensor(SignalEffect):
             out = channel.correct(rig, out, rate, self.shape_of(rig, shape))
         if self.channel in out:
             value = self.shape_of(rig, shape)[0]
-            out[self.channel] = self.undone(out[self.channel], 0, rate, value)
+            out[self.channel] = self.true_channel(out[self.channel], rate, value)
         return out
+
+    def true_channel(self, reading: Array, rate: float, value: float) -> Array:
+        """Return what the channel's samples (n,) would be without the error."""
+        return self.undone(reading, 0, rate, value)
 
     def plotted(self) -> str:
         """Name the channel's quantity, of a position its velocity."""

@@ -19,7 +19,7 @@ import numpy as np
 from analysis.effects.base import Array, Shape, between_samples, longest_lag
 from analysis.effects.measurement import ELECTRIC, Sensor
 from analysis.signals.conditioning import Signals
-from analysis.signals.filters import align
+from analysis.signals.filters import align, channel_filter
 from rig.model.rig import Rig
 
 MARGIN: Final = 16  # [samples] reach of the interpolation of a shift
@@ -100,6 +100,13 @@ class SensorLag(TimingError):
     def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
         """Return x + tau dx/dt."""
         return np.asarray(x + value * rate * np.gradient(x))
+
+    def true_channel(self, reading: Array, rate: float, value: float) -> Array:
+        """Return x + tau dx/dt, the rate that of the low-passed samples.
+
+        Differences of raw samples would multiply their noise by about tau times the sample rate.
+        """
+        return np.asarray(reading + value * channel_filter(rate).apply(reading, 1))
 
 
 TERMS = (ChannelDelay, SensorLag)

@@ -6,7 +6,9 @@ import re
 
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
+from analysis.effects.measurement import Sensor
 from analysis.terms import make
 from rig.model.rig import Rig
 from tests.analysis.test_terms import signals_of
@@ -51,3 +53,19 @@ def test_an_area_that_would_do_the_same_is_stated(
     right = cylinder.model_copy(update=area)
     other = right.cap_area * readings.p_cap[:, 1] - right.rod_area * readings.p_rod[:, 1]
     assert other == pytest.approx(force, abs=0.01 * float(np.std(force)))
+
+
+def test_a_lag_is_undone_without_multiplying_the_noise_of_the_samples(rig: Rig) -> None:
+    """16 ms at 1 kHz: differences of samples would give 11 times the noise."""
+    rate, tau, noise = 1000.0, 16e-3, 1.6e4
+    time = np.arange(4000) / rate
+    true = 5e6 + 1e6 * np.sin(2 * np.pi * 3.0 * time) + 3e5 * np.sin(2 * np.pi * 11.0 * time)
+    _, lagged, _ = lsim(([1.0], [tau, 1.0]), true - true[0], time)
+    reading = true[0] + lagged + noise * np.random.default_rng(3).standard_normal(len(time))
+    error = make("sensor_lag", "joint 1 cap")
+    assert isinstance(error, Sensor)
+    corrected = error.correct(rig, {"cap_pressure_1": reading}, rate, (tau,))["cap_pressure_1"]
+    inner = slice(200, -200)
+    rms = float(np.sqrt(np.mean((corrected - true)[inner] ** 2)))
+    assert rms < 3.0 * noise
+    assert rms < 0.2 * float(np.sqrt(np.mean((reading - true)[inner] ** 2)))
