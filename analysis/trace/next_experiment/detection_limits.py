@@ -226,11 +226,18 @@ def is_possible(rig: Rig, model: Model, explanation: Explanation, times: float) 
 
 
 def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:
-    """Return a sentence for each of the largest limits."""
+    """Return a sentence for the largest limit of each parameter, then for other large ones.
+
+    `limits` begin with the largest. `TRACE.most_detection_limits` are stated.
+    """
+    by_parameter: dict[str, DetectionLimit] = {}
+    for limit in limits:
+        by_parameter.setdefault(limit.parameter, limit)
+    stated = list(dict.fromkeys((*by_parameter.values(), *limits)))
     return [
         f"not excluded by these records: {d.name} at {place_in_words(d.at)} {_up_to(d)} "
         "without a residual above the noise"
-        for d in limits[: TRACE.most_detection_limits]
+        for d in stated[: TRACE.most_detection_limits]
     ]
 
 

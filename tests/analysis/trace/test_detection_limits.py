@@ -65,12 +65,16 @@ def test_an_effect_at_its_limit_stays_hidden_and_changes_the_parameter_as_stated
     assert abs(change) == pytest.approx(found.shift, rel=0.1)
 
 
-def test_the_largest_changes_are_noted_and_all_are_in_the_result(small: Trace) -> None:
+def test_the_largest_change_of_each_parameter_is_noted_and_all_are_in_the_result(
+    small: Trace,
+) -> None:
     noted = [note for note in small.notes if note.startswith("not excluded by these records")]
     assert len(noted) == 3
+    largest = {d.parameter: d for d in reversed(small.detection_limits)}
+    stated = sorted(largest.values(), key=lambda d: -d.shift)
+    assert len(stated) >= 3
     assert all(
-        d.name in note and d.parameter in note
-        for d, note in zip(small.detection_limits, noted, strict=False)
+        d.name in note and d.parameter in note for d, note in zip(stated, noted, strict=False)
     )
     shifts = [d["shift"] for d in to_json(small)["detection_limits"]]
     assert shifts == sorted(shifts, reverse=True)
@@ -123,6 +127,18 @@ def test_a_limit_is_stated_as_the_number_that_a_reader_knows(rig: Rig) -> None:
         f"change W1 by 3 %{end}",
         f"{begin}torque_offset at joint 1 of any possible size, which would change W1{end}",
     ]
+
+
+def test_the_largest_limit_of_every_parameter_is_stated_first() -> None:
+    def of(name: str, parameter: str, shift: float) -> DetectionLimit:
+        return DetectionLimit(
+            name, "bench", "bench", "size", 1.0, "Pa", 0.0, parameter, shift, True
+        )
+
+    weight = ("sensor_gain", 0.9), ("sensor_offset", 0.8), ("torque_offset", 0.7)
+    limits = [*(of(name, "W1", shift) for name, shift in weight), of("entrained_air", "b", 0.02)]
+    notes = detection_limit_notes(limits)
+    assert [note.split()[5] for note in notes] == ["sensor_gain", "entrained_air", "sensor_offset"]
 
 
 def test_no_limit_above_the_sizes_that_are_physical_is_called_possible(small: Trace) -> None:
