@@ -284,11 +284,11 @@ class TankPressure(PortEffect):
     kernel = _tank
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return both [Pa]; `p_back` is that at the pump's whole flow."""
+        """Return both [Pa]; `p_back`, at the whole flow of the pump, may be an extrapolation."""
         p = rig.supply.pressure
         return (
             Shape("p_tank", "Pa", 0.0, 0.4 * p, (0.02 * p, 0.1 * p), 0.0),
-            Shape("p_back", "Pa", 0.0, 0.5 * p, (0.0, 0.05 * p), 0.0),
+            Shape("p_back", "Pa", 0.0, 2.0 * p, (0.0, 0.05 * p), 0.0),
         )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from analysis.effects.base import Evidence, ordered
 from analysis.effects.compliance import DeadVolume
-from analysis.effects.supply import PortEffect, ReturnLine, SupplySag
+from analysis.effects.supply import PortEffect, ReturnLine, SupplySag, TankPressure, port_flow
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
 from rig.model.rig import Rig
@@ -153,6 +153,18 @@ def test_a_drop_that_no_record_reaches_may_be_that_of_any_line_beyond(
         assert high >= (1.0 - 1e-3) * shape[0]
     (line,) = ReturnLine("bench").extrapolated(rated, [lifting], (DROP,)).values()
     assert line[0] < DROP == pytest.approx(line[1])
+
+
+def test_a_drop_of_the_return_line_that_no_record_reaches_may_be_large(
+    rig: Rig, lifting: Signals
+) -> None:
+    """A tenth of the supply pressure at a third of the pump's flow is 0.9 of it at the whole."""
+    p, flow = rig.supply.pressure, float(port_flow(rig, lifting, drawn=False).max())
+    rated = rig.model_copy(update={"supply": rig.supply.model_copy(update={"flow": 3.0 * flow})})
+    shape = (0.1 * p, 0.9 * p)
+    raised = TankPressure("bench").prepare(rated, lifting, shape).p_tank - lifting.p_tank
+    assert raised.max() == pytest.approx(0.2 * p, rel=1e-3)
+    assert TankPressure("bench").problem(rated, {}, shape) == ""
 
 
 def test_an_accumulator_may_be_as_slow_at_a_small_pump_of_low_pressure(
