@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Check:
-    """One statement: its name, whether it is ok, and the figures."""
+    """A statement for the user: its name, whether all is well, and the figures."""
 
     name: str
     ok: bool
@@ -98,13 +98,13 @@ def refuse_constant_channels(
                     f"record {record.name!r}, channel {name!r}: every sample is {low:g}; is the "
                     "sensor connected?"
                 )
-        place = ch.channel(rig.position_kind, i)
-        low, high = spans.get(place, (-np.inf, np.inf))
+        position = ch.channel(rig.position_kind, i)
+        low, high = spans.get(position, (-np.inf, np.inf))
         travel, noise = high - low, rig.sensors.of(rig.position_kind).noise
         if travel < IDENTIFY.least_travel * noise:
-            unit = "m" + rig.unit_of(place)
+            unit = "m" + rig.unit_of(position)
             raise InputError(
-                f"record {record.name!r}, channel {place!r}: joint {i} is not locked but moved "
+                f"record {record.name!r}, channel {position!r}: joint {i} is not locked but moved "
                 f"only {travel * 1e3:.3g} {unit} (sensor noise {noise * 1e3:.3g} {unit}); it was "
                 "not excited, or belongs under 'locked'"
             )
@@ -154,7 +154,7 @@ def clipping(
 
 
 def lost_samples(counted: Iterable[tuple[Record | RecordHead, int]]) -> Check:
-    """State how many samples never arrived; `counted` holds (record, its lost samples)."""
+    """State how many samples never arrived; `counted` holds (record, number of lost samples)."""
     pairs = [(lost, head) for head, lost in counted]
     total = sum(lost for lost, _ in pairs)
     if not total:
@@ -182,12 +182,12 @@ def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
 
 
 def is_hold(rig: Rig, head: Record | RecordHead) -> bool:
-    """Return whether a record was taken with every valve closed, without equations of motion."""
+    """Return whether every joint of a record is locked, so that it has no equations of motion."""
     return set(range(1, len(rig.joints) + 1)) <= set(head.locked)
 
 
 def leak_down(rig: Rig, records: Sequence[Record | RecordHead]) -> list[Check]:
-    """State how far pistons crept while every valve was closed (the records of a hold)."""
+    """State the fastest creep [m/s] of a piston while every valve was closed (holds)."""
     creeps = [
         (abs(float(creep)) * head.sample_rate / head.samples, abs(float(creep)), i, head)
         for head in records
@@ -227,7 +227,7 @@ def joints_excited(rig: Rig, records: Sequence[Record | RecordHead]) -> Check:
 
 
 def supply_measured(rig: Rig) -> list[Check]:
-    """State that no sensor shows the supply pressure, on which the gains of two edges depend."""
+    """State, if no sensor measures it, that the supply pressure is assumed (C_pp, C_mm need it)."""
     if rig.electric or rig.sensors.supply_pressure is not None:
         return []
     return [
@@ -241,12 +241,12 @@ def supply_measured(rig: Rig) -> list[Check]:
 
 
 def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
-    """State what could not be identified and how well conditioned the rest is."""
+    """State each family's unidentified parameters, with reasons, and its condition number."""
     out = []
     for family, solution in solutions.items():
-        lost = "; ".join(f"{name}: {why}" for name, why in solution.unidentifiable.items())
+        reasons = "; ".join(f"{name}: {why}" for name, why in solution.unidentifiable.items())
         out.append(
-            Check(f"identifiable {family}", not lost, lost or "every parameter is determined")
+            Check(f"identifiable {family}", not reasons, reasons or "every parameter is determined")
         )
         out.append(
             Check(
@@ -260,7 +260,7 @@ def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
 
 
 def noise_bias(solutions: Mapping[str, Solution], unbiased: bool) -> Check:
-    """State the worst relative bias that sensor noise in the columns is predicted to cause.
+    """State the largest relative bias predicted from the stated sensor noise in the columns.
 
     The prediction is for least squares; `unbiased` says that the estimator used is not affected.
     """
@@ -297,17 +297,17 @@ def masked(rows: int, dropped: int) -> Check:
 
 
 def consistency(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
-    """State signs, positive inertia over the workspace, R12/W2 against l1, b, nominal values."""
-    parts = [_signs(rig, estimates), *_inertia(rig, estimates), *_bulk(estimates)]
+    """Check signs, inertia over the workspace, R12/W2 against l1, b's range, nominal values."""
+    parts = [_signs(rig, estimates), *_inertia(rig, estimates), *_bulk_modulus(estimates)]
     return parts + _nominal(rig, estimates)
 
 
 def _nominal(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
     if not rig.nominal:
         return []
-    far = far_from_nominal(rig, {name: e.value for name, e in estimates.items()})
+    deviating = far_from_nominal(rig, {name: e.value for name, e in estimates.items()})
     within = f"within a factor of {SIMULATION.far_from_nominal:g} of the rig file's"
-    return [Check("nominal values", not far, far or within)]
+    return [Check("nominal values", not deviating, deviating or within)]
 
 
 def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
@@ -353,19 +353,19 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
                 length, ratio = rig.joints[i].link_length, R[i, j] / W
                 if not length:
                     continue
-                off = ratio / length - 1
+                deviation = ratio / length - 1
                 out.append(
                     Check(
                         "link length",
-                        bool(abs(off) < IDENTIFY.length_tolerance),
+                        bool(abs(deviation) < IDENTIFY.length_tolerance),
                         f"R{i + 1}{j + 1}/W{j + 1} = {ratio:.4g} m against link {i + 1} of "
-                        f"{length:g} m ({100 * off:+.1f} %); rigid bodies give equality",
+                        f"{length:g} m ({100 * deviation:+.1f} %); rigid bodies give equality",
                     )
                 )
     return out
 
 
-def _bulk(estimates: Mapping[str, Estimate]) -> list[Check]:
+def _bulk_modulus(estimates: Mapping[str, Estimate]) -> list[Check]:
     b = estimates["b"].value if "b" in estimates else np.nan
     if not np.isfinite(b):
         return []
@@ -374,11 +374,11 @@ def _bulk(estimates: Mapping[str, Estimate]) -> list[Check]:
     return [Check("bulk modulus", low < b < high, detail)]
 
 
-_GRID = 9  # points of the stroke, a joint
+_GRID = 9  # points over the stroke of each joint
 
 
 def workspace(rig: Rig) -> list[Array]:
-    """Return joint angles (N,) spread over the stroke: a grid, or a fixed lattice."""
+    """Return joint positions (N,) [rad or m] spread over the stroke: a grid, or a fixed lattice."""
     N = len(rig.joints)
     if _GRID**N <= 4096:
         axes = np.meshgrid(*([np.linspace(0, 1, _GRID)] * N), indexing="ij")

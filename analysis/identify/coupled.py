@@ -58,7 +58,7 @@ def coupled(
     InputError for runs of different rigs and for records that cannot be used.
     """
     rig = ck.common_rig(runs)
-    estimator = _fitting_estimator(rig, used, estimator, bootstrap)
+    estimator = _applicable_estimator(rig, used, estimator, bootstrap)
     built = build_rows(rig, runs, used, filtering, progress)
     job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
     result = conclude(
@@ -76,28 +76,28 @@ def coupled(
 def with_identified_bulk_modulus(
     runs: Sequence[Run], terms: Sequence[Used], *more: Sequence[Run]
 ) -> tuple[tuple[Run, ...], ...]:
-    """Return `runs` and `more` with the b [Pa] identified from `runs` as their rigs' nominal one.
+    """Return `runs` and `more` with the b [Pa] identified from `runs` as their rigs' nominal value.
 
     Effects on the pressure at the valves' ports need the flow through them, A s' + V p' / b, in the
     rows from which b is identified; a nominal b may be wrong by a factor of 2. So b is identified
-    first under those of `terms` that do not need the flow. All are returned unchanged where b is no
-    parameter or not determined. Raises InputError as `coupled` does.
+    first without these effects. The runs are unchanged where b is no parameter or not identified.
+    Raises InputError as `coupled` does.
     """
-    every = (tuple(runs), *map(tuple, more))
+    groups = (tuple(runs), *map(tuple, more))
     rig = runs[0].rig
-    own = tuple(used for used in terms if not isinstance(used.term, PortEffect))
-    if not any(c.parameter == BULK for used in own for c in used.term.parameters(rig)):
-        return every
-    b = coupled(runs, own, estimator="ls").estimates.get(BULK)
+    pressure_terms = tuple(used for used in terms if not isinstance(used.term, PortEffect))
+    if not any(c.parameter == BULK for used in pressure_terms for c in used.term.parameters(rig)):
+        return groups
+    b = coupled(runs, pressure_terms, estimator="ls").estimates.get(BULK)
     if b is None or not b.identified or b.value <= 0.0:
-        return every
+        return groups
     value = b.value
 
     def with_nominal(run: Run) -> Run:
         nominal = {**run.rig.nominal, BULK: value}
         return replace(run, rig=run.rig.model_copy(update={"nominal": nominal}))
 
-    return tuple(tuple(map(with_nominal, part)) for part in every)
+    return tuple(tuple(map(with_nominal, part)) for part in groups)
 
 
 def conclude(
@@ -111,7 +111,8 @@ def conclude(
 ) -> Identification:
     """Solve the reductions of all records of the runs `sources`, and check the result.
 
-    `geometry` widens the intervals by the uncertainty of the rig's geometry.
+    `refined` applies an estimator to the solutions of plain least squares; `geometry` widens the
+    intervals by the uncertainty of the rig's geometry.
     """
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
@@ -123,7 +124,7 @@ def conclude(
     estimates, covariance = estimates_of(rig, used, solutions)
     if refinement.bootstrap:
         estimates = with_ends(estimates, refinement.bootstrap)
-    known = (geometry_check(estimates, geometry),) if "fluid" in rig.families else ()
+    geometry_checks = (geometry_check(estimates, geometry),) if "fluid" in rig.families else ()
     if geometry is not None:
         estimates, covariance = geometry.widened(estimates, covariance)
     rows = {family: solution.rows for family, solution in solutions.items()}
@@ -135,7 +136,7 @@ def conclude(
         ck.noise_bias(solutions, refinement.estimator in UNBIASED),
         *consistency(rig, estimates),
         *refinement.checks,
-        *known,
+        *geometry_checks,
     )
     provenance = {
         "method": "coupled",
@@ -146,22 +147,22 @@ def conclude(
     }
     model = Model(rig, used, estimates, covariance, provenance)
     log.info("identified %d parameters from %d records", len(estimates), len(reductions))
-    found = Identification(model, solutions, masked, seconds, geometry=geometry)
-    return found.with_checks(statements)
+    result = Identification(model, solutions, masked, seconds, geometry=geometry)
+    return result.with_checks(statements)
 
 
-def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
-    """Return the estimator for a model, or raise InputError where it does not apply.
+def _applicable_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
+    """Return the estimator for a model; raises InputError where it does not apply.
 
-    Parameters that are not linear in the rows (`Term.reduction`) have plain least squares only.
+    Parameters that are not linear in the rows (`Term.reduction`) allow plain least squares only.
     """
     reducing = [use.term.name for use in used if use.term.reduction(rig) is not None]
     if estimator == PLAIN or not reducing:
         return estimator
     if estimator not in ("ls", "auto") or bootstrap:
-        asked = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
+        option = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
         raise InputError(
-            f"{asked} does not go with {' '.join(reducing)}, not linear in the rows: take ls "
+            f"{option} does not go with {' '.join(reducing)}, not linear in the rows: take ls "
             "without a bootstrap"
         )
     return PLAIN

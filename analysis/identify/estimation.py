@@ -18,9 +18,9 @@ from analysis.identify.estimators.equations import (
     FamilyBlocks,
     RepeatBlock,
     blocks_of,
-    common,
     least_squares,
     pieces,
+    with_common_rows,
 )
 from analysis.identify.estimators.instruments import (
     Hausman,
@@ -80,7 +80,7 @@ class EstimationJob:
 
 @dataclass(frozen=True)
 class Refinement:
-    """An estimator's solutions by family, and its checks."""
+    """An estimator's solutions by family, its checks, and bootstrap intervals by coefficient."""
 
     solutions: dict[str, Solution]
     checks: tuple[Check, ...]
@@ -95,36 +95,36 @@ def refuse_unknown(estimator: str) -> None:
 
 
 def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
-    """Solve again by the job's estimator, with the nuisance columns and with intervals.
+    """Solve again by the job's estimator, with nuisance columns and 95 % intervals.
 
-    `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
-    InputError for an estimator that needs repeats where a step has only one.
+    `solutions` are those of plain least squares; a parameter not identified by them stays so.
+    Raises InputError for an estimator that needs repeats where a step has only one.
     """
     if job.rig.electric and job.estimator == OUTPUT_ERROR:
         from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
 
         fitted, check = free_run_fit(job.rig, job.runs, job.terms, solutions)
         return Refinement(fitted, (check,), job.estimator)
-    counted = repeats_in_motion(
+    repeat_counts = repeats_in_motion(
         job.rig, ((rows.conditioned.run, rows.record) for rows in job.built)
     )
     prepared, checks = _prepare(job, solutions)
-    single = sorted(
-        {step for (_, step), n in counted.items() if n < 2}.union(
+    single_repeat = sorted(
+        {step for (_, step), n in repeat_counts.items() if n < 2}.union(
             *(steps_without_instruments(p.blocks) for p in prepared)
         )
     )
-    if single and job.estimator in NEED_REPEATS:
+    if single_repeat and job.estimator in NEED_REPEATS:
         raise InputError(
             f"--estimator {job.estimator} needs two or more repeats of every step, with the same "
             "excitation started at the same sample; these steps have one, or none that share a "
-            f"row: {' '.join(single)}. Record more repeats (bramah run --repeats 4), or use "
+            f"row: {' '.join(single_repeat)}. Record more repeats (bramah run --repeats 4), or use "
             "--estimator output-error"
         )
     estimator = "ls" if job.estimator == "auto" else job.estimator
     plain = {p.family: _solve(p, "ls") for p in prepared}
-    tests = {} if single else {p.family: _hausman(p) for p in prepared}
-    if not single:
+    tests = {} if single_repeat else {p.family: _hausman(p) for p in prepared}
+    if not single_repeat:
         errors = {family: error for family, (_, error, _) in plain.items()}
         statement = noise_statement(shifts_of(prepared, tests, errors))
         if job.estimator == "auto" and not statement.ok:
@@ -143,11 +143,11 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         }
         done = output_error(job.rig, job.runs, job.terms, values)
         checks.append(done.check)
-        new = {f: merged(s, done.names, done.value, done.spread) for f, s in solutions.items()}
-        return Refinement(new, tuple(checks), estimator)
+        updated = {f: merged(s, done.names, done.value, done.spread) for f, s in solutions.items()}
+        return Refinement(updated, tuple(checks), estimator)
     fits = plain if estimator == "ls" else {p.family: _solve(p, estimator) for p in prepared}
-    new = dict(solutions)
-    ends: dict[str, tuple[float, float]] = {}
+    updated = dict(solutions)
+    intervals: dict[str, tuple[float, float]] = {}
     for p in prepared:
         beta, total, fit = fits[p.family]
         shifts = list(p.omitted)
@@ -156,30 +156,30 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
         elif estimator == "ls":
             shifts.append(predicted_shift(solutions[p.family], p))
         total = functools.reduce(including, shifts, total)
-        new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
+        updated[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
             checks.append(outlier_statement(p.family, fit))
         if job.bootstrap:
-            ends |= _bootstrap_ends(job, p, estimator, sum(shifts, np.zeros(p.parameters)))
-    return Refinement(new, tuple(checks), estimator, ends)
+            intervals |= _intervals(job, p, estimator, sum(shifts, np.zeros(p.parameters)))
+    return Refinement(updated, tuple(checks), estimator, intervals)
 
 
-def _bootstrap_ends(
+def _intervals(
     job: EstimationJob, p: FamilyBlocks, estimator: str, shift: Array
 ) -> dict[str, tuple[float, float]]:
-    """Return the bootstrap's intervals by name, extended by a shift (k,) of the value.
+    """Return the bootstrap's 95 % intervals by coefficient, extended by a shift (k,) of the value.
 
-    No resampling shows this shift, because it is the same in every repeat.
+    The shift is the same in every repeat, so that resampling repeats does not show it.
     """
     rng = job.rng or np.random.default_rng(0)
-    kind = _FITS[estimator]
-    rows = _prior_rows(p, kind(p.blocks), estimator)
+    fit_blocks = _FITS[estimator]
+    rows = _prior_rows(p, fit_blocks(p.blocks), estimator)
 
     def estimate(blocks: Sequence[RepeatBlock]) -> Array:
-        return nu.with_prior_rows(kind(blocks), rows).beta[: p.parameters]
+        return nu.with_prior_rows(fit_blocks(blocks), rows).beta[: p.parameters]
 
     low, high = bootstrap(p.blocks, estimate, job.bootstrap, rng)
-    # Towards the estimate by instruments, or with the nuisances that are left out.
+    # Extended towards the value without this shift (by instruments, or with all nuisances).
     low, high = low - np.maximum(shift, 0.0), high - np.minimum(shift, 0.0)
     ends = zip(p.names, low, high, strict=False)
     return {name: (float(a), float(b)) for name, a, b in ends}
@@ -188,7 +188,7 @@ def _bootstrap_ends(
 def _prepare(
     job: EstimationJob, solutions: Mapping[str, Solution]
 ) -> tuple[list[FamilyBlocks], list[Check]]:
-    """Build rows with the nuisance columns, without one that the data contradict (reported)."""
+    """Return each family's rows with its plausible nuisance columns, and a check for each."""
     coefficients = {
         name: float(v) for s in solutions.values() for name, v in zip(s.names, s.value, strict=True)
     }
@@ -203,44 +203,44 @@ def _prepare(
         if not determined:
             continue
         nuisances = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
-        # Without their columns, other parameters of the same motion would take their part.
+        # Without their columns, parameters excited by the same motion would absorb their share.
         noisy = [n for n, why in solution.unidentifiable.items() if why == MOSTLY_NOISE]
         nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
         names = (*determined, *nuisances)
-        kept = [columns.index(name) for name in names]
-        blocks = tuple(blocks_of(built, family, kept))
+        selected = [columns.index(name) for name in names]
+        blocks = tuple(blocks_of(built, family, selected))
         prepared = FamilyBlocks(family, names, len(determined), blocks)
         if nuisances:
-            prepared, stated = _plausible(prepared)
+            prepared, stated = _without_implausible(prepared)
             checks += stated
         out.append(prepared)
     return out, checks
 
 
-def _plausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:
+def _without_implausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:
     """Return a family without the nuisances that its data contradict, with a check for each."""
     checks = []
     fit = least_squares(p.blocks)
     error = spread([pieces(fit)], fit.inverse)
     for name in p.names[p.parameters :]:
-        # Found anew each time: leaving out a nuisance shifts the columns.
+        # Recomputed for each name: leaving out a nuisance shifts the indices of the columns.
         prior = next((b for b in nu.priors(p.names, fit.beta) if b.name == name), None)
         if prior is None:
             continue
         if not nu.implausible(prior, fit.beta, error.covariance):
             checks.append(nuisance_statement(prior, p.names, fit.beta, error, None))
             continue
-        less = _without(p, name)
-        left = least_squares(less.blocks)
-        shift = shift_without(fit.beta, left.beta, error, p.parameters)
+        reduced = _without_column(p, name)
+        refitted = least_squares(reduced.blocks)
+        shift = shift_without(fit.beta, refitted.beta, error, p.parameters)
         moved = largest_shift(p.names[: p.parameters], fit.beta[: p.parameters], shift)
         checks.append(nuisance_statement(prior, p.names, fit.beta, error, moved))
-        p = replace(less, omitted=(*p.omitted, shift))
-        fit, error = left, spread([pieces(left)], left.inverse)
+        p = replace(reduced, omitted=(*p.omitted, shift))
+        fit, error = refitted, spread([pieces(refitted)], refitted.inverse)
     return p, checks
 
 
-def _without(p: FamilyBlocks, name: str) -> FamilyBlocks:
+def _without_column(p: FamilyBlocks, name: str) -> FamilyBlocks:
     """Return a family's blocks without the column `name`."""
     at = p.names.index(name)
     blocks = tuple(replace(b, X=np.delete(b.X, at, axis=1)) for b in p.blocks)
@@ -257,20 +257,20 @@ def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, Equ
 
 
 def _prior_rows(p: FamilyBlocks, fit: EquationFit, estimator: str) -> tuple[nu.PriorRow, ...]:
-    """Return the rows of prior knowledge beside those of a fit that is not joined with them."""
+    """Return the prior rows of the nuisances, weighted for a fit without prior rows."""
     plain = least_squares(fit.blocks) if estimator == "iv" else fit
     return nu.prior_rows(plain, nu.priors(p.names, plain.beta))
 
 
 def _hausman(p: FamilyBlocks) -> Hausman:
-    plain = least_squares(common(p.blocks))
+    plain = least_squares(with_common_rows(p.blocks))
     return hausman(plain, _prior_rows(p, plain, "ls"))
 
 
 def merged(
     solution: Solution, names: Sequence[str], beta: Array, error: CovarianceParts
 ) -> Solution:
-    """Return the solution with new values, covariance and dof for those of `names` that it has."""
+    """Return the solution with value, covariance and dof replaced for those of `names` it has."""
     known = [k for k, name in enumerate(names) if name in solution.names]
     place = [solution.names.index(names[k]) for k in known]
     value, dof = solution.value.copy(), solution.dof.copy()

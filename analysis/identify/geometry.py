@@ -103,8 +103,8 @@ def shifts_of_rows(
     """Return the shifts from the rows of records in memory; None for a rig without tolerances."""
     if not rig.uncertain_numbers:
         return None
-    others = map(rig.with_moved, rig.uncertain_numbers)
-    moved = [folded(other, terms, _rows_again(rig, terms, built, other))[0] for other in others]
+    variants = map(rig.with_moved, rig.uncertain_numbers)
+    moved = [folded(other, terms, _rebuilt_rows(rig, terms, built, other))[0] for other in variants]
     return _shifts(rig, terms, folded(rig, terms, (item.rows for item in built))[0], moved)
 
 
@@ -114,14 +114,17 @@ def shifts_of_reductions(
     reductions: Sequence[RecordReduction],
     moved: Sequence[Sequence[RecordReduction]],
 ) -> GeometryShifts | None:
-    """Return the shifts from the reductions of all records and, in `moved`, of each number."""
+    """Return the shifts from reductions of all records; `moved` has those of each changed number.
+
+    None for a rig without tolerances.
+    """
     if not rig.uncertain_numbers:
         return None
-    return _shifts(rig, terms, _collected(reductions), [_collected(each) for each in moved])
+    return _shifts(rig, terms, _parts_of(reductions), list(map(_parts_of, moved)))
 
 
 def wider(estimate: Estimate, std: float) -> Estimate:
-    """Return an estimate with a standard deviation `std` added in quadrature to either side."""
+    """Return an estimate whose interval includes a further standard deviation, in quadrature."""
     value, (low, high) = estimate.value, estimate.ci95
     half = IDENTIFY.normal_quantile * std
     ends = (value - math.hypot(value - low, half), value + math.hypot(high - value, half))
@@ -131,8 +134,8 @@ def wider(estimate: Estimate, std: float) -> Estimate:
 def geometry_check(estimates: Mapping[str, Estimate], geometry: GeometryShifts | None) -> Check:
     """State, for every kind of tolerance, the number and parameter with the largest shift.
 
-    Without tolerances (`geometry` None), state that the rig file's numbers are taken as exact:
-    records show no area and no pin distance that is wrong.
+    Without tolerances (`geometry` None), state that the rig file's numbers are taken as exact: a
+    wrong area or pin distance may leave no residual.
     """
     if geometry is None:
         return Check(
@@ -150,9 +153,9 @@ def geometry_check(estimates: Mapping[str, Estimate], geometry: GeometryShifts |
         of_kind = [j for j, number in enumerate(geometry.numbers) if number.kind == kind]
         k, j = np.unravel_index(np.argmax(np.abs(relative[:, of_kind])), (len(value), len(of_kind)))
         number = geometry.numbers[of_kind[int(j)]]
-        moves = 100 * relative[k, of_kind[int(j)]]
+        percent = 100 * relative[k, of_kind[int(j)]]
         clauses.append(
-            f"{number.name} ({number.stated}) moves {list(estimates)[int(k)]} by {moves:+.2g} %"
+            f"{number.name} ({number.stated}) moves {list(estimates)[int(k)]} by {percent:+.2g} %"
         )
     return Check(
         NAME,
@@ -172,7 +175,7 @@ def tolerances_ignored(rig: Rig, method: str) -> Check:
     )
 
 
-def _rows_again(
+def _rebuilt_rows(
     rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows], other: Rig
 ) -> Iterable[Mapping[str, Rows]]:
     """Yield the rows of every record, rebuilt with the rig `other`."""
@@ -181,20 +184,20 @@ def _rows_again(
         yield record_rows(other, terms, signals, item.conditioned.filtering)
 
 
-def _collected(reductions: Sequence[RecordReduction]) -> Parts:
+def _parts_of(reductions: Sequence[RecordReduction]) -> Parts:
     return {
         family: [part for reduction in reductions for part in reduction.parts[family]]
         for family in FAMILIES
     }
 
 
-def _shifts(rig: Rig, terms: Sequence[Used], own: Parts, moved: Sequence[Parts]) -> GeometryShifts:
-    """Return the shifts from the triangles of the rig itself and with each number increased."""
+def _shifts(rig: Rig, terms: Sequence[Used], base: Parts, moved: Sequence[Parts]) -> GeometryShifts:
+    """Return the shifts from the triangles of the nominal rig and of each changed one."""
     names = {f: names for f in FAMILIES if (names := parameters_of(rig, terms, f))}
     shifts = {
         family: np.column_stack(
             [_solved(columns, parts[family]) for parts in moved]
-        ) - _solved(columns, own[family])[:, None]
+        ) - _solved(columns, base[family])[:, None]
         for family, columns in names.items()
     }  # fmt: skip
     reciprocal = {c.parameter for u in terms for c in u.term.coefficients(rig) if c.reciprocal}

@@ -1,4 +1,4 @@
-"""Identification: runs in, parameters with intervals, checks and a model out."""
+"""Identify parameters with intervals, checks and a model from runs, by any method."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def identify(
     `terms` defaults to the paper's model. `reject_noise` False also returns parameters that are
     determined mostly by sensor noise, for studies. Other methods than "coupled" are in
     `analysis.identify.methods`; `search` is for pso and ga. `estimator` is one of
-    `analysis.identify.estimation.ESTIMATORS` ("auto": least squares, or instruments where noise in
-    the regressors biases it and that matters), "plain" the bare solution without nuisances;
-    `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
-    seed 0); `progress` receives the share of the runs that the coupled method has worked through.
+    `analysis.identify.estimation.ESTIMATORS` ("auto": least squares, or instrumental variables
+    where noise in the regressors biases it by more than matters) or "plain", without nuisances;
+    `bootstrap` > 0 takes the intervals from so many draws of whole repeats; `rng` (default: seed 0)
+    draws them; `progress` receives the share of the runs that the coupled method has processed.
     Raises InputError for another method or estimator, for runs of different rigs and for records
     that cannot be used, naming record and channel.
     """
@@ -72,8 +72,7 @@ def identify(
             rng, options = rng or np.random.default_rng(0), search or SearchOptions()
             result = search_parameters(method, runs, used, filtering, rng, options)
         if result.geometry is None and rig.uncertain_numbers:
-            ignored = tolerances_ignored(rig, method)
-            result = result.with_checks((*result.checks, ignored))
+            result = result.with_checks((*result.checks, tolerances_ignored(rig, method)))
         return result
     if any(isinstance(u.term, PortEffect) for u in used):
         (runs,) = with_identified_bulk_modulus(runs, used)

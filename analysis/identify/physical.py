@@ -48,8 +48,8 @@ LEVELS = ("signs", "rigid bodies")
 class Cost:
     """The cost of a level for one family; `residual` is the relative growth of the residual's rms.
 
-    `active` names the constraints that hold, `gap` states by how much the data alone violate each;
-    `p` is the p value of that, NaN where it cannot be judged.
+    `active` names the active constraints, `gap` states by how much the unconstrained estimate
+    violates each; `p` is the p value of all violations, NaN where it cannot be judged.
     """
 
     residual: float
@@ -71,7 +71,7 @@ class Level:
     estimates: Mapping[str, Estimate]
     covariance: Array
     costs: Mapping[str, Cost]
-    geometry: GeometryShifts | None = None  # with the directions that are held taken out
+    geometry: GeometryShifts | None = None  # without the directions of active constraints
 
     @property
     def rejected(self) -> bool:
@@ -116,12 +116,11 @@ def feasible(rig: Rig, names: tuple[str, ...], rigid: bool) -> Feasible:
 
 
 def _rigid(rig: Rig, index: Mapping[str, int], weights: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return R_ij - l_i W_j = 0 for i < j wherever length and weight are known."""
+    """Return the rows of R_ij - l_i W_j = 0, i < j, with labels, where l_i and W_j exist."""
     N = len(rig.joints)
     inertia, rows, labels = inertia_names(N), [], []
     for i in range(N):
-        # An electric rig may omit its link lengths.
-        length = getattr(rig.joints[i], "link_length", None)
+        length = rig.joints[i].link_length  # an electric rig may omit it
         for j in range(i + 1, N):
             if length is None or f"W{j + 1}" not in index:
                 continue
@@ -135,14 +134,14 @@ def _rigid(rig: Rig, index: Mapping[str, int], weights: Array) -> tuple[Array, t
 
 
 def physical(result: Identification) -> Physical:
-    """Return physically consistent parameters and their cost.
+    """Return the parameters of both levels and their cost in the residual.
 
     Raises InputError where a parameter is not identified, because nothing can be constrained then.
     """
-    lost = [n for n, e in result.estimates.items() if not e.identified]
-    if lost:
+    unidentified = [n for n, e in result.estimates.items() if not e.identified]
+    if unidentified:
         raise InputError(
-            f"--physical needs every parameter identified, and {' '.join(lost)} is not; "
+            f"--physical needs every parameter identified, and {' '.join(unidentified)} is not; "
             "record the step that excites it"
         )
     levels = tuple(_level(result, name, rigid=bool(k)) for k, name in enumerate(LEVELS))
@@ -155,8 +154,8 @@ def with_physics(result: Identification, physical: Physical) -> Identification:
     """Return the identification with the consistent parameters in place of the free ones."""
     level = physical.levels[physical.returned]
     model = replace(result.model, parameters=level.estimates, covariance=level.covariance)
-    held = replace(result, model=model, geometry=level.geometry)
-    return held.with_checks((*result.checks, *physical.checks), physical=level.name)
+    constrained = replace(result, model=model, geometry=level.geometry)
+    return constrained.with_checks((*result.checks, *physical.checks), physical=level.name)
 
 
 def _level(result: Identification, name: str, rigid: bool) -> Level:
@@ -169,7 +168,7 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
         minimum = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
         P = _projection(X, minimum)
         solutions[family] = free = solution
-        if len(minimum.active):  # no variance is left along the directions held
+        if len(minimum.active):  # no variance across active constraints
             covariance = P @ solution.covariance @ P.T
             solutions[family] = replace(solution, value=minimum.beta, covariance=covariance)
         if geometry is not None:
@@ -184,15 +183,15 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
 
 
 def _projection(X: Array, minimum: Minimum) -> Array:
-    """Return P (k, k), which removes from a small change what the active constraints hold."""
+    """Return P (k, k), which projects a small change onto the null space of active constraints."""
     k, C = len(minimum.beta), minimum.active
     if not len(C):
         return np.eye(k)
     scale = 1.0 / np.linalg.norm(X, axis=0)
     A = (X * scale).T @ (X * scale)
-    held = C * scale
-    lever = np.linalg.solve(A, held.T)
-    P = np.eye(k) - lever @ np.linalg.pinv(held @ lever) @ held
+    constraints = C * scale
+    lever = np.linalg.solve(A, constraints.T)
+    P = np.eye(k) - lever @ np.linalg.pinv(constraints @ lever) @ constraints
     return np.asarray(P * np.outer(scale, 1.0 / scale))
 
 
@@ -204,20 +203,20 @@ def _cost(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) ->
     before = float(np.sum((y - X @ solution.value) ** 2)) + rest
     after = float(np.sum((y - X @ minimum.beta) ** 2)) + rest
     growth = float(np.sqrt(after / before) - 1.0) if before > 0 else 0.0
-    apart = C @ solution.value
+    violation = C @ solution.value
     gap = tuple(
         _constraint_text(label, rig, solution, row, value)
-        for label, row, value in zip(minimum.labels, C, apart, strict=True)
+        for label, row, value in zip(minimum.labels, C, violation, strict=True)
     )
-    return Cost(growth, minimum.labels, gap, _probability(solution, C, apart))
+    return Cost(growth, minimum.labels, gap, _probability(solution, C, violation))
 
 
-def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -> str:
-    """State how far the data alone are from one active constraint."""
+def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, violation: float) -> str:
+    """State by how much the unconstrained estimate violates one active constraint."""
     std = float(np.sqrt(row @ solution.covariance @ row))
-    far = f", {abs(apart) / std:.3g} standard errors" if std > 0 else ""
+    far = f", {abs(violation) / std:.3g} standard errors" if std > 0 else ""
     if "=" not in label or ">=" in label:
-        return f"{label}: the data alone give {apart:.3g}{far}"
+        return f"{label}: the data alone give {violation:.3g}{far}"
     i, j = (int(d) for d in label[1:3])
     values = dict(zip(solution.names, solution.value, strict=True))
     R = chain_matrix(values, len(rig.joints))[i - 1, j - 1]
@@ -227,18 +226,18 @@ def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, apart
     )
 
 
-def _probability(solution: Solution, C: Array, apart: Array) -> float:
+def _probability(solution: Solution, C: Array, violation: Array) -> float:
     """Return p of T^2 = d' (C V C')^-1 d (Hotelling), with the least dof of the parameters in C."""
     V = C @ solution.covariance @ C.T
     dof = float(np.min(solution.dof[np.abs(C).sum(axis=0) > 0]))
     q = len(C)
     if not np.isfinite(V).all() or np.linalg.matrix_rank(V, hermitian=True) < q:
         return float("nan")
-    free = dof - q + 1.0
-    if not free > 0:
+    denominator_dof = dof - q + 1.0
+    if not denominator_dof > 0:
         return float("nan")
-    t2 = float(apart @ np.linalg.solve(V, apart))
-    return float(fdtrc(q, free, t2 * free / (dof * q)))
+    t2 = float(violation @ np.linalg.solve(V, violation))
+    return float(fdtrc(q, denominator_dof, t2 * denominator_dof / (dof * q)))
 
 
 def _statement(level: Level) -> Check:

@@ -1,4 +1,4 @@
-"""One record reduced to the quantities that an identification needs: triangles, counts, noise.
+"""Reduce one record to the quantities that an identification needs: triangles, counts, noise.
 
 A reduction has a few kilobytes for any length of the record; `analysis.identify.coupled` joins
 those of all records. Every record is kept in `record_segments` parts of its duration: a step of one
@@ -52,12 +52,12 @@ def reduce_rows(
     rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows]
 ) -> list[RecordReduction]:
     """Reduce the rows of all records of runs in memory."""
-    disturbed: set[tuple[int, str]] = set()
+    with_noise: set[tuple[int, str]] = set()
     out = []
     for item in built:
         record, noise = item.record, None
-        if item.group not in disturbed:
-            disturbed.add(item.group)
+        if item.group not in with_noise:
+            with_noise.add(item.group)
             noise = record_moments(rig, terms, item.conditioned, item.rows)
         duration = record.samples / record.sample_rate
         parts, masked = folded(rig, terms, [item.rows], duration, IDENTIFY.record_segments)
@@ -75,9 +75,9 @@ def folded(
     duration: float = 0.0,
     segments: int = 1,
 ) -> tuple[dict[str, tuple[Part, ...]], int]:
-    """Return, by family, a triangle for each of the equal `segments` of a duration [s].
+    """Return, by family, a triangle for each of `segments` equal parts of a duration [s].
 
-    Also the number of masked rows.
+    Also the number of masked rows. `chunks` are rows by equation, in order of time.
     """
     columns = {family: len(parameters_of(rig, terms, family)) for family in FAMILIES}
     sums = {f: [Accumulator(count) for _ in range(segments)] for f, count in columns.items()}
@@ -110,7 +110,7 @@ def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowC
 
 
 def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None:
-    """Return the summed noise moments (k+1, k+1) of all records; one represents each step."""
+    """Return the noise moments (k+1, k+1) of all records, each step's from one of its records."""
     counts = Counter((reduction.run, reduction.head.step) for reduction in reductions)
     weighted = [
         counts[reduction.run, reduction.head.step] * reduction.noise[family]

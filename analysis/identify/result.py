@@ -42,7 +42,7 @@ class Identification:
 
     @property
     def method(self) -> str:
-        """The method by which it was found."""
+        """The name of the method."""
         return str(self.model.provenance["method"])
 
     @property
@@ -56,14 +56,14 @@ class Identification:
         return self.model.parameters
 
     def with_checks(self, checks: tuple[Check, ...], **provenance: str) -> Identification:
-        """Return the result with other checks, and `provenance` added to its model's."""
+        """Return the result with these `checks` alone, and `provenance` added to its model's."""
         failed = [c.name for c in checks if not c.ok]
-        known = {**self.model.provenance, **provenance, "checks_failed": failed}
-        return replace(self, checks=checks, model=replace(self.model, provenance=known))
+        all_provenance = {**self.model.provenance, **provenance, "checks_failed": failed}
+        return replace(self, checks=checks, model=replace(self.model, provenance=all_provenance))
 
 
 def to_json(result: Identification) -> dict[str, Any]:
-    """Return the identification as JSON data; null where a number does not exist."""
+    """Return the identification as JSON data, null for a number that is not finite."""
     geometry = {}
     if result.geometry is not None:
         geometry = {"geometry": result.geometry.to_json(result.estimates)}
@@ -93,7 +93,7 @@ def estimates_of(
     count = sum(len(solution.names) for solution in solutions.values())
     covariance = np.zeros((count, count))
     for solution in solutions.values():
-        own = slice(len(estimates), len(estimates) + len(solution.names))
+        block = slice(len(estimates), len(estimates) + len(solution.names))
         std = np.sqrt(np.diag(solution.covariance))
         half = half_width(std, solution.dof)
         slopes = np.ones(len(std))
@@ -101,7 +101,7 @@ def estimates_of(
             c = coefficients[name]
             note = solution.unidentifiable.get(name, "")
             estimates[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
-        covariance[own, own] = solution.covariance * np.outer(slopes, slopes)
+        covariance[block, block] = solution.covariance * np.outer(slopes, slopes)
     return estimates, covariance
 
 
@@ -113,7 +113,7 @@ def _estimate(
     if not c.reciprocal:
         return Estimate(float(value), c.unit, float(std), (float(low), float(high)), note), 1.0
     if value == 0:
-        return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
+        return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "1/b is estimated as 0"), np.nan
     slope = -1.0 / value**2
     ends = reciprocal_interval(value, low, high) if value > 0 else (np.nan, np.nan)
     estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)

@@ -1,7 +1,7 @@
 """The regression rows of all records of a set of runs, built once and shared.
 
-The solution, the estimators that refine it and the report all read the same `RecordRows`; columns
-that an estimator fits beside the model's are appended to them (`with_columns`).
+The solution, the estimators that refine it and the report all read the same `RecordRows`;
+`with_columns` appends the columns that an estimator adds to the model's.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def build_rows(
     filtering: Callable[[Record], Filtering] = default_filtering,
     progress: Callable[[float], None] | None = None,
 ) -> list[RecordRows]:
-    """Return the filtered, decimated rows of every record; raises InputError for a bad one.
+    """Return the filtered, decimated rows of every record; raises InputError for an unusable one.
 
     `progress` receives the share of the runs that is done.
     """
@@ -94,10 +94,10 @@ def with_columns(
             parts = [term_part(rig, used, signals, filtering, family, signals) for used in extra]
             for r in record.family(family):
                 at = places_of(r, signals, filtering)
-                more = columns_at(names[family], parts, r.equation, at)
-                more = without_sines(more, sines_at(r, signals, filtering))
+                appended = columns_at(names[family], parts, r.equation, at)
+                appended = without_sines(appended, sines_at(r, signals, filtering))
                 rows[r.equation] = replace(
-                    r, names=(*r.names, *names[family]), matrix=np.hstack((r.matrix, more))
+                    r, names=(*r.names, *names[family]), matrix=np.hstack((r.matrix, appended))
                 )
         out.append(replace(record, rows=rows))
     return out
@@ -105,10 +105,10 @@ def with_columns(
 
 def repeats_of(records: Iterable[tuple[int, Record | RecordHead]]) -> dict[tuple[int, str], int]:
     """Count the repeats of every (run, step) among the records, each with its run's number."""
-    seen: dict[tuple[int, str], set[int]] = {}
+    repeats: dict[tuple[int, str], set[int]] = {}
     for run, record in records:
-        seen.setdefault((run, record.step), set()).add(record.repeat)
-    return {key: len(repeats) for key, repeats in seen.items()}
+        repeats.setdefault((run, record.step), set()).add(record.repeat)
+    return {key: len(numbers) for key, numbers in repeats.items()}
 
 
 def repeats_in_motion(

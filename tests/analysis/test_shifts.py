@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from analysis.identify.estimation import EstimationJob, _bootstrap_ends
+from analysis.identify.estimation import EstimationJob, _intervals
 from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman, instrumental_variables
@@ -139,7 +139,7 @@ def test_draws_of_repeats_keep_the_weight_of_what_is_known_beforehand(rig: Rig) 
     joined = with_prior_rows(fit, rows)
     between_repeats = spread([pieces(joined)], joined.inverse).covariance[0, 0]
     job = EstimationJob(rig, (), (), (), "ls", 200, rng)
-    low, high = _bootstrap_ends(job, p, "ls", np.zeros(1))["C_pp_1"]
+    low, high = _intervals(job, p, "ls", np.zeros(1))["C_pp_1"]
     assert (high - low) / 3.92 == pytest.approx(np.sqrt(between_repeats), rel=0.3)
 
 
@@ -242,4 +242,4 @@ def test_a_temperature_that_did_not_vary_hides_no_noise_in_the_regressors() -> N
     instruments = with_prior_rows(instrumental_variables(blocks), rows)
     assert fit.beta[0] == pytest.approx(0.9, abs=0.02)
     assert instruments.beta == pytest.approx([1.0, -0.003], abs=0.02)
-    assert hausman(fit, rows).certain[0]
+    assert hausman(fit, rows).significant[0]

@@ -45,12 +45,12 @@ def _units(blocks: Sequence[RepeatBlock]) -> Units:
     """Return the units to draw in each stratum: (repeat, -1), or (only repeat, part)."""
     out: Units = {}
     for stratum in dict.fromkeys(b.stratum for b in blocks):
-        own = [b for b in blocks if b.stratum == stratum]
-        repeats = sorted({b.repeat for b in own})
+        members = [b for b in blocks if b.stratum == stratum]
+        repeats = sorted({b.repeat for b in members})
         if len(repeats) > 1:
             out[stratum] = [(repeat, -1) for repeat in repeats]
         else:
-            parts = np.unique(np.concatenate([b.segment for b in own]))
+            parts = np.unique(np.concatenate([b.segment for b in members]))
             out[stratum] = [(repeats[0], part) for part in parts.tolist()]
     return out
 

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CovarianceParts:
-    """A covariance (k, k), the degrees of freedom (k,), and the systematic share of variance."""
+    """A covariance (k, k), degrees of freedom (k,), the systematic share of each variance (k,)."""
 
     covariance: Array
     dof: Array
@@ -73,7 +73,7 @@ def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
-    """Return V_groups - V_noise (k, k), positive; zero for parameters without significance."""
+    """Return max(V_groups - V_noise, 0) (k, k); zero for parameters without significance."""
     _, score = pieces.grouped(pieces.part, pieces.score)
     u = score @ inverse.T
     noise = stratified(pieces.score @ inverse.T, pieces.stratum, pieces.part)
@@ -91,11 +91,11 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
 
 
 def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
-    """Return the jackknife covariance (k, k) over the parts of the period, all repeats together.
+    """Return the jackknife covariance (k, k) over parts of the period, summed over repeats.
 
     A direction that the rows do not determine, zero in `inverse` (k, k), gets no variance.
     """
-    assert pieces.information is not None, "a step with one repeat has it"
+    assert pieces.information is not None, "`pieces` has it where a step has one repeat"
     stratum, score = pieces.grouped(pieces.part, pieces.score)
     _, information = pieces.grouped(pieces.part, pieces.information)
     A = scaled_inverse(inverse)

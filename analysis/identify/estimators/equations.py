@@ -63,8 +63,8 @@ class RepeatBlock:
 class FamilyBlocks:
     """A family's blocks, nuisance columns last, with the names of all columns.
 
-    `omitted` holds, for each nuisance that was left out since the data contradict it, how much its
-    absence shifts the `parameters` first columns' coefficients (k,).
+    The first `parameters` columns are the model's. `omitted` holds, for each nuisance that the data
+    contradict, how much leaving it out shifts their coefficients (k,).
     """
 
     family: str
@@ -92,10 +92,9 @@ class EquationFit:
 def segments(time: Array, period: float, shared: tuple[float, float] | None = None) -> Indices:
     """Return the part of the excitation's period that each row (m,) lies in.
 
-    Without a period [s] (0) the time from the first to the last row is divided, or that which the
-    repeats have in common, `shared` [s]: rows outside belong to its first and last part. Rows of
-    the same part of later periods belong together, because an error of the model repeats with the
-    excitation.
+    Without a period [s] (0) the time from the first to the last row is divided, or the interval
+    `shared` [s] of all repeats, whose end parts take the rows outside it. Rows of the same part of
+    later periods belong together, because an error of the model repeats with the excitation.
     """
     begin, span = 0.0, period
     if period <= 0:
@@ -107,27 +106,27 @@ def segments(time: Array, period: float, shared: tuple[float, float] | None = No
     return np.asarray(np.clip(part, 0, count - 1), dtype=np.int64)
 
 
-def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> list[RepeatBlock]:
-    """Return the blocks of one family with the columns `kept`, sorted into segments and levels."""
-    every = [(record_rows, rows) for record_rows in built for rows in record_rows.family(family)]
+def blocks_of(built: Sequence[RecordRows], family: str, chosen: Sequence[int]) -> list[RepeatBlock]:
+    """Return one family's blocks of the columns `chosen`, sorted into segments and levels."""
+    pairs = [(record_rows, rows) for record_rows in built for rows in record_rows.family(family)]
     shared: dict[tuple[int, str, str], tuple[float, float]] = {}
-    for record_rows, rows in every:
+    for record_rows, rows in pairs:
         key, (begin, end) = (*record_rows.group, rows.equation), (rows.time[0], rows.time[-1])
-        known = shared.get(key, (begin, end))
-        shared[key] = max(begin, known[0]), max(min(end, known[1]), begin)
+        span = shared.get(key, (begin, end))
+        shared[key] = max(begin, span[0]), max(min(end, span[1]), begin)
     blocks = []
-    for record_rows, rows in every:
+    for record_rows, rows in pairs:
         record, group = record_rows.record, record_rows.group
         period = record.period / record.sample_rate
         blocks.append(
             RepeatBlock(
                 *group, record.repeat, record.name, rows.equation,
-                rows.matrix[:, list(kept)], rows.rhs, rows.time,
+                rows.matrix[:, list(chosen)], rows.rhs, rows.time,
                 segments(rows.time, period, shared[*group, rows.equation]),
                 np.zeros(len(rows.rhs), dtype=np.int64),
             )
         )  # fmt: skip
-    return _levelled(blocks, {(*r.group, r.record.name): r.record for r in built})
+    return _with_levels(blocks, {(*r.group, r.record.name): r.record for r in built})
 
 
 def solve(blocks: Sequence[RepeatBlock], Z: Sequence[Array], w: Sequence[Array]) -> EquationFit:
@@ -153,7 +152,7 @@ class Pieces:
     """Scores g = Z'w e and information A of every (stratum, repeat, part) that has rows.
 
     Arrays of the length of the pieces: `stratum`, `repeat`, `part` (c,), `score` (c, k),
-    `information` (c, k, k), None where every step has repeats: only a single one needs it.
+    `information` (c, k, k), None where every step has repeats: only a single repeat needs it.
     """
 
     stratum: Indices
@@ -180,7 +179,7 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
         inside = (labels == parts[:, None]).astype(np.float64)
         score.append(inside @ (z * (weight * e)[:, None]))
         if single:
-            information += [(z * (weight * here)[:, None]).T @ b.X for here in inside]
+            information += [(z * (weight * selected)[:, None]).T @ b.X for selected in inside]
         keys += [(strata[b.stratum], b.repeat, place) for place in parts.tolist()]
     stratum, repeat, part = np.array(keys, dtype=np.int64).T
     first, number = numbered(stratum, repeat, part)
@@ -193,8 +192,8 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
     )
 
 
-def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
-    """Return the blocks reduced to rows that every repeat of their step and equation has."""
+def with_common_rows(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
+    """Return the blocks with only those rows that every repeat of their step and equation has."""
     shared = shared_ticks(blocks)
     out = []
     for b in blocks:
@@ -215,43 +214,43 @@ def shared_ticks(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], Ar
     return shared
 
 
-def alike(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], list[int]]:
-    """Return the places of the blocks by run, step and equation: those of all repeats."""
+def groups(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], list[int]]:
+    """Return the indices of the blocks of all repeats, by run, step and equation."""
     places: dict[tuple[int, str, str], list[int]] = {}
     for k, b in enumerate(blocks):
         places.setdefault(b.shared, []).append(k)
     return places
 
 
-def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
-    """Return a block with only the rows `here` (m,)."""
+def rows_of(b: RepeatBlock, selected: NDArray[np.bool_]) -> RepeatBlock:
+    """Return a block with only the rows `selected` (m,)."""
     return replace(
-        b, X=b.X[here], y=b.y[here], time=b.time[here], segment=b.segment[here],
-        level=b.level[here],
+        b, X=b.X[selected], y=b.y[selected], time=b.time[selected], segment=b.segment[selected],
+        level=b.level[selected],
     )  # fmt: skip
 
 
-def _levelled(
+def _with_levels(
     blocks: Sequence[RepeatBlock], records: Mapping[tuple[int, str, str], Record]
 ) -> list[RepeatBlock]:
     """Return the blocks with `level`, the bin of the state that the equation's law depends on.
 
-    Flow rows are sorted by their chamber's pressure, torque rows by their piston's position, into
-    bins of equally many rows. The mean over the repeats is sorted, so that noise does not affect
-    the order. A law that is wrong at some states has its residual in few of the bins.
+    Flow rows are sorted by their chamber's pressure, torque rows by their joint's position, into
+    bins of equally many rows. The mean over the repeats is sorted, so that noise hardly affects the
+    order. A law that is wrong at some states has its residual in few of the bins.
     """
     out = list(blocks)
-    for number, (_, mine) in enumerate(sorted(alike(blocks).items())):
-        own = [blocks[k] for k in mine]
-        ticks = np.concatenate([b.ticks for b in own])
-        state = np.concatenate([_state(b, records[*b.stratum, b.record]) for b in own])
+    for number, (_, indices) in enumerate(sorted(groups(blocks).items())):
+        group = [blocks[k] for k in indices]
+        ticks = np.concatenate([b.ticks for b in group])
+        state = np.concatenate([_state(b, records[*b.stratum, b.record]) for b in group])
         times, place = np.unique(ticks, return_inverse=True)
         mean = np.bincount(place, state) / np.bincount(place)
         rank = np.empty(len(times), dtype=np.int64)
         rank[np.argsort(mean, kind="stable")] = np.arange(len(times))
         label = number * IDENTIFY.state_levels + rank * IDENTIFY.state_levels // len(times)
-        ends = np.cumsum([len(b.time) for b in own])[:-1]
-        for k, level in zip(mine, np.split(label[place], ends), strict=True):
+        ends = np.cumsum([len(b.time) for b in group])[:-1]
+        for k, level in zip(indices, np.split(label[place], ends), strict=True):
             out[k] = replace(blocks[k], level=level)
     return out
 
@@ -267,7 +266,7 @@ def _state(b: RepeatBlock, record: Record) -> Array:
 
 
 def over_repeats(blocks: Sequence[RepeatBlock], arrays: Sequence[Array]) -> list[tuple[Array, int]]:
-    """Return, for each block, the sum of its repeats' arrays and the number of repeats.
+    """Return, for each block, the sum of `arrays` over all its repeats and the number of repeats.
 
     `arrays` holds one array for each block, of equal shape among the repeats of a step's equation.
     """

@@ -21,11 +21,11 @@ from scipy.special import stdtr
 from analysis.identify.estimators.equations import (
     EquationFit,
     RepeatBlock,
-    common,
     over_repeats,
     pieces,
     shared_ticks,
     solve,
+    with_common_rows,
 )
 from analysis.identify.estimators.nuisance import PriorRow, with_prior_rows
 from analysis.identify.settings import IDENTIFY
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Hausman:
-    """Least squares minus instruments (k,), its standard error (k,) and p values (k,)."""
+    """Least squares minus instruments (k,), its standard error, p value and relative size (k,)."""
 
     difference: Array
     error: Array
@@ -44,8 +44,8 @@ class Hausman:
     relative: Array
 
     @property
-    def certain(self) -> NDArray[np.bool_]:
-        """Return where (k,) the difference is significant."""
+    def significant(self) -> NDArray[np.bool_]:
+        """Where (k,) the difference is significant, all parameters tested together."""
         return np.asarray(self.p < IDENTIFY.instrument_level / len(self.p))
 
 
@@ -61,7 +61,7 @@ def steps_without_instruments(blocks: Sequence[RepeatBlock]) -> set[str]:
 
 def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with the other repeats' mean rows as instruments; every step needs two repeats."""
-    blocks = common(blocks)
+    blocks = with_common_rows(blocks)
     sums = over_repeats(blocks, [b.X for b in blocks])
     Z = [(total - b.X) / (n - 1) for b, (total, n) in zip(blocks, sums, strict=True)]
     return solve(blocks, Z, [np.ones(len(b.y)) for b in blocks])

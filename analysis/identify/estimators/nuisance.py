@@ -1,8 +1,8 @@
-"""Small effects that the model leaves out, fitted as additional columns of the rows.
+"""Fit small effects that the model leaves out, as additional (nuisance) columns of the rows.
 
 They shift parameters by more than their scatter, so that intervals without them would be wrong.
-Each is one column of the fluid rows, or of an electric joint's torque rows, estimated with the
-parameters but not reported as one.
+Each is one column of the fluid rows, or of an electric joint's torque rows; its coefficient is
+estimated with the parameters but is not one of them.
 
 Oil temperature. The oil's temperature, and with it the bulk modulus, changes between records; one b
 for all records would be that of their mean temperature, and the gains of the steps would shift.
@@ -157,19 +157,19 @@ def _at_edges(
 
     `openings` are those of the edges that are open for u > 0 and for u < 0.
     """
-    C, (ahead, astern) = dict(gains), openings
+    C, (positive, negative) = dict(gains), openings
     pp, pm, mp, mm = (C.get(gain, 0.0) for gain in gain_names(i + 1))
     p_s, p_t = signals.p_s, signals.p_tank
     cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
-    in_cap = pp * law(p_s - cap) * ahead + pm * law(cap - p_t) * astern
-    in_rod = -mp * law(rod - p_t) * ahead - mm * law(p_s - rod) * astern
+    in_cap = pp * law(p_s - cap) * positive + pm * law(cap - p_t) * negative
+    in_rod = -mp * law(rod - p_t) * positive - mm * law(p_s - rod) * negative
     return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
 
 
 def _transition(drop: Array) -> Array:
-    """Return - dp^(-3/2) / 4 of drops (n,) [Pa]; below `least_drop` it is held."""
-    held = np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop)
-    return np.asarray(-0.25 / (held * np.sqrt(held)))
+    """Return - dp^(-3/2) / 4 of drops (n,) [Pa]; constant below `least_drop`."""
+    limited = np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop)
+    return np.asarray(-0.25 / (limited * np.sqrt(limited)))
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Prior:
 def nuisance_terms(
     terms: Sequence[Used], runs: Sequence[Run], values: Mapping[str, float]
 ) -> tuple[Used, ...]:
-    """Return the nuisances that belong to the terms; `values` are first estimates by name.
+    """Return the nuisances for a model of `terms`; `values` are first estimates by name.
 
     The transition belongs to a model with orifices alone: further flow terms would be correlated
     with it.
@@ -206,9 +206,9 @@ def nuisance_terms(
 
 
 def sample_paths(rig: Rig, joints: Iterable[int], values: Mapping[str, float]) -> tuple[Used, ...]:
-    """Return the path between samples of the drives or spools of `joints` (0-based).
+    """Return the nuisance of the path between samples for each of `joints` (0-based).
 
-    That of a spool needs the gains among `values`, first estimates by name: none without them.
+    A spool's needs the gains among `values`, first estimates by name; without them it has none.
     """
     if rig.electric:
         return tuple(Used(DrivePath(joint=i)) for i in joints)
@@ -233,7 +233,7 @@ def priors(names: Sequence[str], value: Array) -> list[Prior]:
 
 
 def implausible(prior: Prior, beta: Array, covariance: Array) -> bool:
-    """Return whether the data contradict prior knowledge: another effect is in that column."""
+    """Return whether the data contradict prior knowledge, as another effect in the column does."""
     variance = prior.std**2 + float(prior.h @ covariance @ prior.h)
     return bool(abs(prior.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
 
@@ -274,15 +274,15 @@ def with_prior_rows(fit: EquationFit, rows: Sequence[PriorRow]) -> EquationFit:
 
 
 def spread_with_priors(fit: EquationFit, rows: Sequence[PriorRow]) -> CovarianceParts:
-    """Return the spread of a fit joined with prior rows: that of its rows and of the priors.
+    """Return the spread of a fit joined with prior rows: scatter of its rows plus the priors' part.
 
-    Prior knowledge needs no repeats: its part of a variance counts as known.
+    The priors' part of a variance counts as known: it has no part in Student's t.
     """
-    own = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
+    of_rows = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
     influence = [row.weight * row.std * (fit.inverse @ row.h) for row in rows]
-    known = sum((np.outer(u, u) for u in influence), np.zeros_like(own.covariance))
-    scatter = np.diag(own.covariance)
+    known = sum((np.outer(u, u) for u in influence), np.zeros_like(of_rows.covariance))
+    scatter = np.diag(of_rows.covariance)
     with np.errstate(divide="ignore", invalid="ignore"):
         grown = np.where(scatter > 0, np.minimum(1.0 + np.diag(known) / scatter, 1e3), 1.0)
-    systematic = np.minimum(own.systematic, 1.0) / grown
-    return CovarianceParts(own.covariance + known, own.dof * grown**2, systematic)
+    systematic = np.minimum(of_rows.systematic, 1.0) / grown
+    return CovarianceParts(of_rows.covariance + known, of_rows.dof * grown**2, systematic)

@@ -1,4 +1,4 @@
-"""Robust loss: rows far outside the scatter of the rest lose their weight.
+"""Solve with a robust loss: rows far outside the scatter of the rest lose their weight.
 
 Iteratively reweighted least squares with Huber's loss to a start, then Tukey's biweight, scale by
 the median absolute residual of each step's equation. A spike in a channel also makes large entries
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
-from analysis.identify.estimators.equations import EquationFit, RepeatBlock, alike, least_squares
+from analysis.identify.estimators.equations import EquationFit, RepeatBlock, groups, least_squares
 from analysis.identify.settings import IDENTIFY
 
 Array = NDArray[np.float64]
@@ -24,17 +24,17 @@ Array = NDArray[np.float64]
 
 def robust(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with weights that fall for outlying rows."""
-    before = leverage_weights(blocks)
-    fit = least_squares(blocks, before)
+    initial = leverage_weights(blocks)
+    fit = least_squares(blocks, initial)
     for loss in (_huber, _tukey):
         for _ in range(IDENTIFY.robust_rounds):
-            scales = _scales(blocks, fit.residuals(), before)
+            scales = _scales(blocks, fit.residuals(), initial)
             weights = [
                 start * loss(e / s)
-                for start, e, s in zip(before, fit.residuals(), scales, strict=True)
+                for start, e, s in zip(initial, fit.residuals(), scales, strict=True)
             ]
-            last, fit = fit.beta, least_squares(blocks, weights)
-            if np.all(np.abs(fit.beta - last) <= IDENTIFY.robust_settled * np.abs(fit.beta)):
+            previous, fit = fit.beta, least_squares(blocks, weights)
+            if np.all(np.abs(fit.beta - previous) <= IDENTIFY.robust_settled * np.abs(fit.beta)):
                 break
     return fit
 
@@ -68,7 +68,7 @@ def _scales(
     blocks: Sequence[RepeatBlock], residuals: Sequence[Array], weights: Sequence[Array]
 ) -> list[float]:
     scale = {}
-    for key, places in alike(blocks).items():
+    for key, places in groups(blocks).items():
         deviations = [np.abs(residuals[k][weights[k] > 0.5]) for k in places]
         median = float(np.median(np.concatenate(deviations)))
         scale[key] = max(IDENTIFY.mad_to_std * median, 1e-300)
@@ -76,9 +76,9 @@ def _scales(
 
 
 def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
-    """Return weights (m,) of rows by their distance from the repeats' median, 1 for most."""
+    """Return weights (m,) of each block's rows, below 1 far from the median of the repeats."""
     out = [np.ones(len(b.y)) for b in blocks]
-    for members in alike(blocks).values():
+    for members in groups(blocks).values():
         if len(members) < IDENTIFY.least_repeats:
             continue
         times = np.unique(np.concatenate([blocks[i].ticks for i in members]))
@@ -87,12 +87,12 @@ def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
         places = [np.searchsorted(times, blocks[i].ticks) for i in members]
         for n, (i, at) in enumerate(zip(members, places, strict=True)):
             stack[n, at] = np.column_stack((blocks[i].X, blocks[i].y))
-        off = np.abs(stack - np.nanmedian(stack, axis=0))
+        distances = np.abs(stack - np.nanmedian(stack, axis=0))
         # Repeats differ slightly throughout (drift, trim): scale by the record's own median
         # distance.
-        usual = IDENTIFY.mad_to_std * np.nanmedian(off, axis=1, keepdims=True)
+        typical = IDENTIFY.mad_to_std * np.nanmedian(distances, axis=1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = np.nanmax(np.where(usual > 0, off / usual, 0.0), axis=2)
+            distance = np.nanmax(np.where(typical > 0, distances / typical, 0.0), axis=2)
         for n, (i, at) in enumerate(zip(members, places, strict=True)):
             out[i] = (
                 IDENTIFY.leverage_limit / np.maximum(distance[n, at], IDENTIFY.leverage_limit)

@@ -103,7 +103,7 @@ def shifts_of(
                     sign * float(test.relative[i]),
                     size / float(test.error[i]) if test.error[i] > 0 else 0.0,
                     size / float(half[i]) if half[i] > 0 else np.inf,
-                    bool(test.certain[i]),
+                    bool(test.significant[i]),
                 )
             )
     return shifts
@@ -111,7 +111,7 @@ def shifts_of(
 
 def significant_shift(test: Hausman, p: FamilyBlocks) -> Array:
     """Return least squares minus instruments (k,) of the parameters, 0 where insignificant."""
-    return np.where(test.certain, test.difference, 0.0)[: p.parameters]
+    return np.where(test.significant, test.difference, 0.0)[: p.parameters]
 
 
 def predicted_shift(solution: Solution, p: FamilyBlocks) -> Array:
@@ -146,19 +146,19 @@ def nuisance_statement(
     `moved` of an impossible one is the parameter that moves most without it, and how much
     (relative); the check is ok if that is too little to matter.
     """
-    check = _possible(prior, names, beta, error, moved is not None)
+    check = _prior_check(prior, names, beta, error, moved is not None)
     if moved is None or moved[1] > shift_limit(moved[0]):
         return check
     size = f"{100 * moved[1]:.2g} %"
-    least = f"no parameter moves by more than {size} without it, which the intervals include"
+    note = f"no parameter moves by more than {size} without it, which the intervals include"
     if not moved[1]:
         share = IDENTIFY.shift_of_interval
-        least = f"no parameter moves by more than {share:g} of its 95 % interval's half width"
-    return Check(check.name, True, f"{check.detail} ({least})")
+        note = f"no parameter moves by more than {share:g} of its 95 % interval's half width"
+    return Check(check.name, True, f"{check.detail} ({note})")
 
 
-def _possible(
-    prior: nu.Prior, names: Sequence[str], beta: Array, error: CovarianceParts, wrong: bool
+def _prior_check(
+    prior: nu.Prior, names: Sequence[str], beta: Array, error: CovarianceParts, implausible: bool
 ) -> Check:
     i = list(names).index(prior.name)
     value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
@@ -172,28 +172,28 @@ def _possible(
                 f"{100 * IDENTIFY.bulk_slope:.1f} +- {200 * IDENTIFY.bulk_slope_std:.1f} % per "
                 "kelvin"
             )
-        if wrong:
+        if implausible:
             statement += ", which no oil does: b is that of the records' mean temperature"
         else:
             statement += "; b is that of the rig's nominal oil temperature"
-        return Check("oil temperature", not wrong, statement)
+        return Check("oil temperature", not implausible, statement)
     if prior.name.startswith((nu.BETWEEN, nu.DRIVE_BETWEEN)):
         statement = (
             f"{value:+.3f} +- {2 * std:.3f} of a sample's interval from the interpolated one"
         )
-        if wrong:
+        if implausible:
             statement += (
                 ", more than a command held between samples makes (a lag, a delay?): left out"
             )
-        return Check(prior.name, not wrong, statement)
+        return Check(prior.name, not implausible, statement)
     size = np.sqrt(max(value, 0.0) + 2 * std)
     statement = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
-    if wrong:
+    if implausible:
         statement = (
             "the flow depends on the pressure drop in a way no orifice does (a supply, tank or "
             "sensor pressure that is off, a leak?); the gains are those of the plain square root"
         )
-    return Check("laminar transition", not wrong, statement)
+    return Check("laminar transition", not implausible, statement)
 
 
 def noise_statement(shifts: Sequence[Shift]) -> Check:
@@ -203,8 +203,8 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
     """
     if not shifts:
         return Check(NOISE_CHECK, False, "nothing identified to judge")
-    certain = [s for s in shifts if s.significant]
-    biased = [s for s in certain if s.material]
+    significant = [s for s in shifts if s.significant]
+    biased = [s for s in significant if s.material]
     if biased:
         worst = max(biased, key=lambda s: abs(s.relative))
         return Check(
@@ -212,8 +212,8 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
             f"least squares is biased by noise in the regressors, {_figures(worst)}; so are "
             f"{len(biased) - 1} others; --estimator auto or iv is not",
         )  # fmt: skip
-    if certain:
-        worst = max(certain, key=lambda s: s.t)
+    if significant:
+        worst = max(significant, key=lambda s: s.t)
         return Check(
             NOISE_CHECK, True,
             f"noise in the regressors moves least squares, but too little to matter: most "

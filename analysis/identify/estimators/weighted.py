@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from analysis.identify.estimators.equations import (
     EquationFit,
     RepeatBlock,
-    common,
     least_squares,
     over_repeats,
+    with_common_rows,
 )
 from analysis.identify.settings import IDENTIFY
 from rig.model.parse import InputError
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 def weighted_least_squares(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with weights 1 / sigma^2 of each step's equation; blocks need repeats."""
-    blocks = common(blocks)
+    blocks = with_common_rows(blocks)
     fit = least_squares(blocks)
     for _ in range(IDENTIFY.weight_rounds):
         fit = least_squares(_whitened(blocks, fit.beta))

@@ -1,4 +1,4 @@
-"""PSO and GA on STEP1's parameters: the search methods that the paper compares with.
+"""Search STEP1's parameters by PSO or GA, the search methods that the paper compares with.
 
 The algorithms are pymoo's (Blank and Deb, pymoo: Multi-objective optimization in Python, 2020):
 it has both, takes a seed instead of numpy's global generator, and offers ask-and-tell, so that
@@ -43,9 +43,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SearchHistory:
-    """A finished search: the best values, and the number of candidates that failed, by cause.
+    """A finished search: the best values, and the number of candidates lost, by cause.
 
-    By generation: the best error so far, the number of candidates, and of those that were lost.
+    A lost candidate could not be simulated. By generation: the best error so far (`errors`), the
+    number of candidates (`sizes`) and of lost ones.
     """
 
     values: Mapping[str, float]
@@ -74,10 +75,10 @@ def search_parameters(
     rng: np.random.Generator,
     options: SearchOptions,
 ) -> Identification:
-    """Search STEP1's parameters by simulation; every other parameter is null.
+    """Search STEP1's parameters by simulation; every other parameter is NaN.
 
     Raises InputError without a record that excites the last joint alone, without nominal values,
-    or where every candidate lost its state.
+    or where no candidate can be simulated.
     """
     rig = ck.common_rig(runs)
     record = single_joint_record(runs)
@@ -95,7 +96,7 @@ def search_parameters(
 def run_search(
     method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
 ) -> SearchHistory:
-    """Let the algorithm propose generations until the evaluations are spent."""
+    """Simulate the generations that the algorithm proposes, `options.evaluations` candidates."""
     started = time.perf_counter()
     algorithm, evaluator, wrap = _pymoo(method, task, options, rng)
     best, best_error = np.zeros(len(task.names)), np.inf
@@ -173,8 +174,8 @@ def _identification(
     }
     model = Model(rig, used, estimates, covariance, provenance)
     extra = {"search": history_json(task, history, options)}
-    found = Identification(model, solutions, 0, history.seconds, extra=extra)
-    return found.with_checks(_statements(method, runs, task, history))
+    result = Identification(model, solutions, 0, history.seconds, extra=extra)
+    return result.with_checks(_statements(method, runs, task, history))
 
 
 def _as_solution(method: str, task: SearchTask, history: SearchHistory, family: str) -> Solution:
@@ -183,10 +184,10 @@ def _as_solution(method: str, task: SearchTask, history: SearchHistory, family: 
     names = parameters_of(task.model.rig, task.model.terms, family)
     nan = np.full(len(names), np.nan)
     value = np.array([best_values.get(name, np.nan) for name in names])
-    lost = {
+    reasons = {
         n: f"{method} searches STEP1's parameters only" for n in names if n not in history.values
     }
-    return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
+    return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, reasons)
 
 
 def _failures(history: SearchHistory) -> str:
@@ -196,20 +197,20 @@ def _failures(history: SearchHistory) -> str:
 def _statements(
     method: str, runs: Sequence[Run], task: SearchTask, history: SearchHistory
 ) -> tuple[Check, ...]:
-    gone = sum(history.lost.values())
-    share = 100.0 * gone / history.evaluations
+    failed = sum(history.lost.values())
+    share = 100.0 * failed / history.evaluations
     parameters = len(task.model.parameters)
-    stuck = []
+    at_bounds = []
     for name, low, high in zip(task.names, task.low, task.high, strict=True):
-        place, width = np.log10(history.values[name] / low), np.log10(high / low)
-        if min(place, width - place) < IDENTIFY.at_bound * width:
-            stuck.append(name)
+        distance, width = np.log10(history.values[name] / low), np.log10(high / low)
+        if min(distance, width - distance) < IDENTIFY.at_bound * width:
+            at_bounds.append(name)
     records = [record for run in runs for record in run.records]
     return (
         Check(
             "state exists",
-            gone == 0,
-            f"{gone} of {history.evaluations} candidates ({share:.1f} %) lost their state: "
+            failed == 0,
+            f"{failed} of {history.evaluations} candidates ({share:.1f} %) lost their state: "
             f"{_failures(history)}; of the first {history.sizes[0]}, "
             f"{history.lost_by_generation[0]}",
         ),
@@ -221,9 +222,9 @@ def _statements(
         ),
         Check(
             "bounds",
-            not stuck,
-            f"{' '.join(stuck)} ended at a bound of the search"
-            if stuck
+            not at_bounds,
+            f"{' '.join(at_bounds)} ended at a bound of the search"
+            if at_bounds
             else "no parameter ended at a bound of the search",
         ),
         Check(
@@ -238,7 +239,7 @@ def _statements(
 def history_json(
     task: SearchTask, history: SearchHistory, options: SearchOptions
 ) -> dict[str, Any]:
-    """Return the search as plain data."""
+    """Return the search as JSON data."""
     errors = [e if e < IDENTIFY.failed_error else None for e in history.errors]
     return {
         "record": task.record,

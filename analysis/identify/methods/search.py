@@ -69,7 +69,10 @@ class SearchOptions:
                 "is too short: expected at least 4 of each"
             )
         if not self.factor > 1.0 or self.windows < 1 or not self.seconds > 0.0:
-            raise InputError("a search needs a factor above 1 and at least one window of data")
+            raise InputError(
+                f"a search over a factor of {self.factor:g} in {self.windows} windows of "
+                f"{self.seconds:g} s: expected a factor above 1, a window or more, and above 0 s"
+            )
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ class SearchTask:
 
 @dataclass(frozen=True)
 class Score:
-    """A candidate's error, and why its simulation failed ('' if it did not)."""
+    """A candidate's error, and the cause of a failed simulation ('' if it did not fail)."""
 
     error: float
     failure: str
@@ -111,8 +114,8 @@ def searched_names(rig: Rig) -> tuple[str, ...]:
     """Name STEP1's parameters: inertia, friction and gravity of the last joint, b, its gains."""
     N = len(rig.joints)
     inertia = inertia_names(N)
-    last = "M2" if N == 2 else inertia[-1]
-    return (last, f"Fv{N}", f"W{N}", "b", *gain_names(N))
+    inertia_of_last = "M2" if N == 2 else inertia[-1]
+    return (inertia_of_last, f"Fv{N}", f"W{N}", "b", *gain_names(N))
 
 
 def single_joint_record(runs: Sequence[Run]) -> Record:
@@ -133,26 +136,26 @@ def make_task(
 ) -> SearchTask:
     """Prepare the search on one record; raises InputError for a rig without nominal values.
 
-    Also for a record with a gap of lost samples that a model cannot be simulated through.
+    Also for a record too short for a window, or with a gap of lost samples too long to bridge.
     """
     names = searched_names(rig)
     model = _template(rig, terms, names)
     nominal = np.array([rig.nominal[name] for name in names])
     signals = condition(rig, record, filtering.channels)
-    drive = _stilled(drive_of(signals))
+    drive = _with_locked_at_rest(drive_of(signals))
     length, reach = round(options.seconds * record.sample_rate), filtering.channels.reach
-    room = record.samples - 2 * reach - length
-    if room < 0:
+    spare = record.samples - 2 * reach - length
+    if spare < 0:
         raise InputError(
             f"record {record.name!r} of {record.samples / record.sample_rate:g} s is too short "
             f"for a window of {options.seconds:g} s; take a longer one"
         )
     channels = compared(rig, aligned_channels(rig, record), signals)
-    every = arrived(rig, record)
+    arrived_samples = arrived(rig, record)
     windows = []
-    for first in np.unique(np.linspace(reach, reach + room, options.windows).astype(int)):
+    for first in np.unique(np.linspace(reach, reach + spare, options.windows).astype(int)):
         measured = {name: x[first : first + length] for name, x in channels.items()}
-        valid = every[first : first + length]
+        valid = arrived_samples[first : first + length]
         spread = {n: float(valid.sum() * y[valid].var()) for n, y in measured.items()}
         start = state_at(signals, int(first))
         windows.append(SearchWindow(int(first), start, measured, spread, valid))
@@ -163,12 +166,12 @@ def make_task(
 
 
 def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
-    """Return a model with nominal searched parameters; the others have no influence."""
+    """Return a model with the searched parameters at nominal; the others have no influence."""
     missing = [name for name in names if not rig.nominal.get(name, 0.0) > 0.0]
     if missing:
         raise InputError(
-            f"rig {rig.name!r} has no positive nominal {' '.join(missing)}: a search has to know "
-            "where to start; add them under 'nominal' in the rig file"
+            f"rig {rig.name!r} has no positive nominal {' '.join(missing)}: a search starts "
+            "there; add them under 'nominal' in the rig file"
         )
     known = [c.parameter for used in terms for c in used.term.coefficients(rig)]
     if set(names) - set(known):
@@ -178,11 +181,11 @@ def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
     )
 
 
-def _stilled(drive: DrivingInput) -> DrivingInput:
-    """Hold the locked joints at their mean, without velocity: what STEP1's equations assume."""
-    mean = np.where(drive.locked, drive.q.mean(axis=0), drive.q)
-    still = np.where(drive.locked, 0.0, 1.0)
-    return replace(drive, q=mean, qd=drive.qd * still, qdd=drive.qdd * still)
+def _with_locked_at_rest(drive: DrivingInput) -> DrivingInput:
+    """Hold the locked joints at their mean position at rest, as STEP1's equations assume."""
+    held = np.where(drive.locked, drive.q.mean(axis=0), drive.q)
+    moving = np.where(drive.locked, 0.0, 1.0)
+    return replace(drive, q=held, qd=drive.qd * moving, qdd=drive.qdd * moving)
 
 
 def with_values(model: Model, values: Mapping[str, float]) -> Model:
@@ -212,8 +215,8 @@ def score(task: SearchTask, values: Mapping[str, float]) -> Score:
         elif not failure:
             channels = simulated.channels()
             for name, y in window.measured.items():
-                off = (y - channels[name])[window.valid]
-                total += float(np.sum(off**2)) / window.spread[name]
+                residual = (y - channels[name])[window.valid]
+                total += float(np.sum(residual**2)) / window.spread[name]
     if failure:
         return Score(IDENTIFY.failed_error * (1.0 + lost / samples), failure)
     return Score(total / (len(task.windows) * len(task.windows[0].measured)), "")

@@ -1,4 +1,4 @@
-"""The sequential method, step after step, in the two ways the paper names (its section II.B).
+"""Identify step by step, in the two ways that the paper names (its section II.B).
 
  E1  a parameter is identified at one step only and known in every step after it
  E2  every step identifies what it can by itself, and the steps' values are averaged
@@ -79,10 +79,10 @@ class StepRows:
 
 @dataclass(frozen=True)
 class StepwiseFit:
-    """One family solved step by step: every step's own values and condition number, E1, E2.
+    """One family solved step by step: each step's values (`own`) and condition number, E1, E2.
 
-    `rows` counts the rows of all steps, `triangle` (k+1, k+1) represents them; `lost` states why
-    E1 has no value.
+    E1 is `first`, E2 `averaged`. `rows` counts the rows of all steps, `triangle` (k+1, k+1)
+    represents them; `lost` states, by parameter, why E1 has no value.
     """
 
     names: tuple[str, ...]
@@ -95,7 +95,7 @@ class StepwiseFit:
     lost: Mapping[str, str]
 
     def solution(self, values: Mapping[str, StepValue]) -> Solution:
-        """Return some of the values as a solution, with their residual over all rows."""
+        """Return `values` as a solution, with their residual over all rows; the others are NaN."""
         k, R = len(self.names), self.triangle
         value, std, dof = (np.full(k, np.nan) for _ in range(3))
         for i, name in enumerate(self.names):
@@ -104,14 +104,14 @@ class StepwiseFit:
                 value[i], std[i], dof[i] = estimate.value, estimate.std, estimate.dof
         residual = R[:k, k] - R[:k, :k] @ np.nan_to_num(value)
         squares = float(np.sum(residual**2)) + float(R[k, k] ** 2)
-        lost = {
+        reasons = {
             name: self.lost.get(name, "no step determines it")
             for name in self.names
             if name not in values
         }
         return Solution(
             self.names, value, np.diag(std**2), dof, max(self.condition.values()), self.rows,
-            float(np.sqrt(squares / max(self.rows, 1))), np.full(k, np.nan), lost,
+            float(np.sqrt(squares / max(self.rows, 1))), np.full(k, np.nan), reasons,
         )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ def sequential(
     filtering: Callable[[Record], Filtering],
     reject_noise: bool,
 ) -> Identification:
-    """Identify step after step: the estimates are E1's, `extra` holds E2 and every step's values.
+    """Identify step by step: the estimates are E1's, `extra` holds E2 and every step's values.
 
     Raises InputError for runs of different rigs and records that cannot be used.
     """
@@ -138,7 +138,7 @@ def sequential(
     estimates, covariance = estimates_of(rig, terms, solutions)
     rows = {family: outcome.rows for family, outcome in outcomes.items()}
     # Every step's own values, as estimates in the parameter's unit.
-    shown = {
+    by_name = {
         name: {
             value.step: estimates_of(rig, terms, {f: o.solution({name: value})})[0][name]
             for value in values
@@ -147,7 +147,7 @@ def sequential(
         for name, values in o.own.items()
     }
     statements = (
-        _uniqueness(shown),
+        _uniqueness(by_name),
         *record_checks(rig, reductions, rows),
         *consistency(rig, estimates),
     )
@@ -158,14 +158,14 @@ def sequential(
         "rows": rows,
     }
     second = {f: o.solution(o.averaged) for f, o in outcomes.items()}
-    extra = {"sequential": _json(outcomes, shown, estimates, estimates_of(rig, terms, second)[0])}
+    extra = {"sequential": _json(outcomes, by_name, estimates, estimates_of(rig, terms, second)[0])}
     model = Model(rig, tuple(terms), estimates, covariance, provenance)
-    found = Identification(model, solutions, masked, seconds, extra=extra, built=tuple(built))
-    return found.with_checks(statements)
+    result = Identification(model, solutions, masked, seconds, extra=extra, built=tuple(built))
+    return result.with_checks(statements)
 
 
 def _steps(reductions: Sequence[RecordReduction], family: str, columns: int) -> list[StepRows]:
-    """Return the steps that have rows of a family, whose rows have so many columns."""
+    """Return the steps that have rows of a family with `columns` coefficients."""
     out = []
     for step in dict.fromkeys(reduction.head.step for reduction in reductions):
         part = [reduction for reduction in reductions if reduction.head.step == step]
@@ -189,42 +189,42 @@ def disagreement(by_step: Mapping[str, Estimate]) -> float:
     )
 
 
-def _uniqueness(shown: Mapping[str, Mapping[str, Estimate]]) -> Check:
+def _uniqueness(by_name: Mapping[str, Mapping[str, Estimate]]) -> Check:
     """State which parameters have several values, and by how much the worst of them disagree."""
-    apart = {n: disagreement(by_step) for n, by_step in shown.items() if len(by_step) > 1}
-    if not apart:
+    gaps = {n: disagreement(by_step) for n, by_step in by_name.items() if len(by_step) > 1}
+    if not gaps:
         return Check("one value each", True, "no parameter is identified by more than one step")
     texts = []
-    for name in sorted(apart, key=lambda n: -apart[n])[: IDENTIFY.worst_shown]:
-        values = ", ".join(f"{step} {estimate.value:.5g}" for step, estimate in shown[name].items())
-        texts.append(f"{name}: {values} ({apart[name]:.1f} of their 95 % intervals apart)")
+    for name in sorted(gaps, key=lambda n: -gaps[n])[: IDENTIFY.worst_shown]:
+        values = ", ".join(f"{step} {e.value:.5g}" for step, e in by_name[name].items())
+        texts.append(f"{name}: {values} ({gaps[name]:.1f} of their 95 % intervals apart)")
     return Check(
         "one value each", False,
-        f"{len(apart)} parameters have several values, worst: " + "; ".join(texts),
+        f"{len(gaps)} parameters have several values, worst: " + "; ".join(texts),
     )  # fmt: skip
 
 
 def _json(
     outcomes: Mapping[str, StepwiseFit],
-    shown: Mapping[str, Mapping[str, Estimate]],
+    by_name: Mapping[str, Mapping[str, Estimate]],
     first: Mapping[str, Estimate],
     averaged: Mapping[str, Estimate],
 ) -> dict[str, Any]:
-    taken = {n: v.step for o in outcomes.values() for n, v in o.first.items()}
-    means = {n: v.step for o in outcomes.values() for n, v in o.averaged.items()}
+    first_steps = {n: v.step for o in outcomes.values() for n, v in o.first.items()}
+    average_steps = {n: v.step for o in outcomes.values() for n, v in o.averaged.items()}
     return {
         "steps": list(next(iter(outcomes.values())).condition),
         "per_step": {
             name: [{"step": step, **estimate_json(e)} for step, e in by_step.items()]
-            for name, by_step in shown.items()
+            for name, by_step in by_name.items()
         },
         "disagreement": {
             name: finite(disagreement(by_step))
-            for name, by_step in shown.items()
+            for name, by_step in by_name.items()
             if len(by_step) > 1
         },
-        "E1": {n: {"step": taken.get(n), **estimate_json(e)} for n, e in first.items()},
-        "E2": {n: {"steps": means.get(n), **estimate_json(e)} for n, e in averaged.items()},
+        "E1": {n: {"step": first_steps.get(n), **estimate_json(e)} for n, e in first.items()},
+        "E2": {n: {"steps": average_steps.get(n), **estimate_json(e)} for n, e in averaged.items()},
         "condition_number": {
             family: {step: finite(c) for step, c in outcome.condition.items()}
             for family, outcome in outcomes.items()
@@ -235,7 +235,7 @@ def _json(
 def _solved_by_steps(
     names: tuple[str, ...], steps: Sequence[StepRows], reject_noise: bool
 ) -> StepwiseFit:
-    """Solve one family step by step in both ways."""
+    """Solve one family step by step: each step alone, E1 and E2."""
     own: dict[str, list[StepValue]] = {name: [] for name in names}
     condition = {}
     for step in steps:
@@ -244,7 +244,7 @@ def _solved_by_steps(
         for name, value in _values(step.name, alone).items():
             if value.precise:
                 own[name].append(value)
-    first, lost = _use_first(names, steps, reject_noise)
+    first, lost = _solve_in_turn(names, steps, reject_noise)
     averaged = _average(names, steps, own, reject_noise)
     return StepwiseFit(
         names, own, first, averaged, condition,
@@ -262,24 +262,24 @@ def _values(step: str, solution: Solution) -> dict[str, StepValue]:
     }
 
 
-def _use_first(
+def _solve_in_turn(
     names: tuple[str, ...], steps: Sequence[StepRows], reject_noise: bool
 ) -> tuple[dict[str, StepValue], dict[str, str]]:
     """E1: solve each step with the parameters of the steps before it known."""
     known: dict[str, StepValue] = {}
     lost: dict[str, str] = {}
-    waiting: list[StepRows] = []
+    pending: list[StepRows] = []
     for place, step in enumerate(steps):
-        waiting.append(step)
+        pending.append(step)
         if len(known) == len(names):
             break
-        solution = _solve_unknown(names, waiting, known, reject_noise)
+        solution = _solve_unknown(names, pending, known, reject_noise)
         last = place == len(steps) - 1
         for name, value in _values(step.name, solution).items():
             if value.precise or last:
                 known[name] = value
         lost = solution.unidentifiable
-        waiting = [s for s in waiting if _has_unknown(names, s, known)]
+        pending = [s for s in pending if _has_unknown(names, s, known)]
     return known, {name: why for name, why in lost.items() if name not in known}
 
 

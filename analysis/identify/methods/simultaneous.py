@@ -1,4 +1,4 @@
-"""The simultaneous method: every joint excited at once, and nothing else (the paper's section V.C).
+"""Identify from records that excite every joint at once (simultaneous; the paper's section V.C).
 
 The rows and the solve are the coupled method's; only the choice of records differs. All parameters
 share one excitation, so columns that lock-and-excite separates are nearly collinear: the condition
@@ -29,22 +29,22 @@ def simultaneous(
 ) -> Identification:
     """Identify from the records without a locked joint; raises InputError where there is none."""
     rig = common_rig(runs)
-    kept = [replace(run, records=tuple(r for r in run.records if not r.locked)) for run in runs]
-    used = sum(len(run.records) for run in kept)
-    every = sum(len(run.records) for run in runs)
-    if not used:
+    filtered = [replace(run, records=tuple(r for r in run.records if not r.locked)) for run in runs]
+    count = sum(len(run.records) for run in filtered)
+    total = sum(len(run.records) for run in runs)
+    if not count:
         steps = " ".join(sorted({r.step for run in runs for r in run.records}))
         raise InputError(
             f"the simultaneous method needs records that excite all {len(rig.joints)} joints at "
             f"once; in the steps {steps} a joint is locked; record a step that locks none"
         )
-    chosen = [run for run in kept if run.records]
-    # Least squares as in the paper, despite its bias by noise: that is what is compared.
+    chosen = [run for run in filtered if run.records]
+    # Least squares despite its bias by noise: the method is compared as published.
     result = coupled(chosen, tuple(terms), filtering, reject_noise, estimator="ls")
     statements = (
         Check(
-            "records used", used == every,
-            f"{used} of {every} records excite all joints at once; the others were left out",
+            "records used", count == total,
+            f"{count} of {total} records excite all joints at once; the others were left out",
         ),
         *gravity_order(rig, {n: e for n, e in result.estimates.items() if e.identified}),
         *result.checks,

@@ -1,4 +1,4 @@
-"""Output error: the model simulated from free window starts is fitted to what was measured.
+"""Fit the model, simulated from free window starts, to the measured outputs (output error).
 
 Multiple shooting: each record is cut into windows, the state at each window's start is unknown
 too, and sum |measured - simulated|^2 / sigma^2 over piston and chamber pressures of the excited
@@ -87,8 +87,8 @@ class Search:
             step, inverse = self._step(theta, reduced)
             std = np.sqrt(np.diag(inverse))
             moved = float(np.max(np.abs(step[std > 0]) / std[std > 0], initial=0.0))
-            theta, starts, reduced, better = self._try(theta, starts, sigma, reduced, step)
-            if not better or (moved < IDENTIFY.fit_settled and rounds >= 2):
+            theta, starts, reduced, accepted = self._try(theta, starts, sigma, reduced, step)
+            if not accepted or (moved < IDENTIFY.fit_settled and rounds >= 2):
                 break
         return self._result(theta, reduced, rounds, moved)
 
@@ -100,7 +100,7 @@ class Search:
         reduced: list[ReducedWindow | None],
         step: Array,
     ) -> tuple[Array, list[Array], list[ReducedWindow | None], bool]:
-        """Take the step, halved until the cost falls."""
+        """Return parameters, starts, windows, True after the step, halved until the cost falls."""
         before = sum(r.cost for r in reduced if r is not None)
         for halving in range(IDENTIFY.fit_halvings):
             size = 0.5**halving
@@ -126,7 +126,7 @@ class Search:
             )
         A = np.sum([r.information for r in good], axis=0)
         g = np.sum([r.score for r in good], axis=0)
-        # Each prior is one more observation, in the same units of one sigma.
+        # Each prior is one more observation in units of its sigma, as the outputs are.
         for prior in nu.priors(self.names, theta):
             A = A + np.outer(prior.h, prior.h) / prior.std**2
             g = g - prior.h * float(prior.h @ theta) / prior.std**2
@@ -136,7 +136,7 @@ class Search:
     def _refined(
         self, reduced: Sequence[ReducedWindow | None], sigma: dict[int, Array]
     ) -> dict[int, Array]:
-        """Return each step's scatter of the outputs around the first fit."""
+        """Return the outputs' sigma (3 F,) by step from the residuals so far."""
         out = {}
         for stratum, old in sigma.items():
             residuals = [
@@ -171,7 +171,7 @@ class Search:
         )
         failed = len(self.placed) - len(pairs)
         settled = moved < 1.0
-        last = (
+        last_step = (
             f"the last moved no parameter by more than {moved:.2g} of its standard error"
             if settled
             else f"not settled: the last still moved a parameter by {moved:.2g} of its standard "
@@ -179,7 +179,7 @@ class Search:
         )
         detail = (
             f"{len(pairs)} windows of {IDENTIFY.window:g} s, {rounds} rounds from least squares, "
-            f"{last}"
+            f"{last_step}"
         )
         if failed:
             detail += f"; {failed} windows could not be simulated and were left out"

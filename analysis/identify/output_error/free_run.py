@@ -1,10 +1,10 @@
-"""Output error of an electric robot: free runs of whole records, as in `validate`.
+"""Fit an electric robot's parameters to free runs of whole records (output error).
 
-The least sum over records and joints of |measured - simulated position|^2, the model driven by the
-measured drive alone from each record's measured first state. A position sensor's noise is far below
-the error of a free run, so the first state is not fitted (it would be correlated with the constant
-torque). That error comes from friction that varies; a free run weighs it by its effect on the
-position, the rows weigh every instant alike, reversals included.
+Minimises the sum over records and joints of |measured - simulated position|^2, the model driven by
+the measured drive alone from each record's measured first state, as in `validate`. A position
+sensor's noise is far below the error of a free run, so the first state is not fitted (it would be
+correlated with the constant torque). That error comes from friction that varies; a free run weighs
+it by its effect on the position, the rows weigh every instant equally, reversals included.
 
 Where dry friction holds a joint the simulated position has kinks, so derivatives are taken over
 steps of one per cent; shorter steps resolve the kink, and the search stops too early. Source:
@@ -53,8 +53,8 @@ class _Record:
         measured = compared(rig, channels, signals)
         self.names = tuple(measured)
         self.loaded = record.loaded
-        self.here: Mask = arrived(rig, record)
-        self.measured: Array = np.column_stack(list(measured.values()))[self.here]
+        self.present: Mask = arrived(rig, record)
+        self.measured: Array = np.column_stack(list(measured.values()))[self.present]
 
     def residual(self, model: Model) -> Array:
         """Return measured less simulated positions (n, F)."""
@@ -63,13 +63,13 @@ class _Record:
         if result.failure:
             return np.full(self.measured.shape, IDENTIFY.failed_state)
         simulated = result.channels()
-        return self.measured - np.column_stack([simulated[n] for n in self.names])[self.here]
+        return self.measured - np.column_stack([simulated[n] for n in self.names])[self.present]
 
 
 def free_run_fit(
     rig: Rig, runs: Sequence[Run], terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Solution], Check]:
-    """Return the solutions with values of least free-run error, starting from their own.
+    """Return the solutions with the values of least free-run error, the search starting at theirs.
 
     Intervals are from repeats, or for a step with one repeat from ten parts of the record. Raises
     InputError where least squares left a parameter undetermined or terms keep parameters that are
@@ -80,16 +80,16 @@ def free_run_fit(
     records = [_Record(rig, record) for record in condition_runs(rig, runs)]
     scale = np.abs(solution.value)
 
-    def stacked(share: Array) -> Array:
+    def residuals(share: Array) -> Array:
         values = dict(zip(solution.names, map(float, share * scale), strict=True))
         model = model_of(rig, terms, values)
         return np.concatenate([record.residual(model).ravel() for record in records])
 
-    first = solution.value / scale
+    x0 = solution.value / scale
     optimum = least_squares(
-        stacked, first, diff_step=IDENTIFY.free_run_step, max_nfev=IDENTIFY.free_run_simulations
+        residuals, x0, diff_step=IDENTIFY.free_run_step, max_nfev=IDENTIFY.free_run_simulations
     )
-    before = float(np.sqrt(np.mean(stacked(first) ** 2)))
+    before = float(np.sqrt(np.mean(residuals(x0) ** 2)))
     after = float(np.sqrt(np.mean(optimum.fun**2)))
     jacobian = optimum.jac / scale
     inverse = scaled_inverse(jacobian.T @ jacobian)
@@ -102,12 +102,12 @@ def free_run_fit(
         f"{before:.3g} {unit} rms with least squares, {after:.3g} {unit} with these parameters"
         + ("" if optimum.success else f"; not settled after {optimum.nfev} steps"),
     )
-    new = replace(solution, value=optimum.x * scale, covariance=error.covariance, dof=error.dof)
-    return dict.fromkeys(solutions, new), check
+    updated = replace(solution, value=optimum.x * scale, covariance=error.covariance, dof=error.dof)
+    return dict.fromkeys(solutions, updated), check
 
 
 def _pieces(records: Sequence[_Record], result: OptimizeResult, jacobian: Array) -> Pieces:
-    """Return the scores of ten parts of every record."""
+    """Return scores and information of `period_segments` parts of every record."""
     strata = {key: k for k, key in enumerate(dict.fromkeys(r.key for r in records))}
     stratum, repeat, part, score, information = [], [], [], [], []
     start = 0

@@ -1,11 +1,11 @@
-"""Shapes of effects with a hidden state, by multiple shooting from the rows' estimates.
+"""Estimate shapes of effects with a hidden state by multiple shooting, from the rows' estimates.
 
-The rows have a lagging spool or a contact's deflection along the *measured* path, through filters
-that round every reversal; a simulation has it along its own. So the shapes of such an effect are
-searched again with the model run freely over short windows (`analysis.identify.output_error.fit`),
-beside the coefficients of the equations that the effect acts in; the others stay as the rows have
-them. This estimate is not always the better one: the measured spool's noise causes an error here
-that is only noise in the rows. `window_error` compares both on other records.
+In the rows a hidden state (a lagging spool, a contact's deflection) follows the *measured* path,
+through filters that round every reversal; in a simulation it follows the simulated one. So the
+shapes of such an effect are searched again with free runs over short windows
+(`analysis.identify.output_error.fit`), together with the coefficients of the equations that the
+effect acts in; the others keep the rows' estimates. This estimate is not always better: a free run
+integrates the measured spool's noise. `window_error` compares both on other records.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ShootingEstimate:
 
 
 def hidden_effects(model: Model) -> list[Effect]:
-    """Return the effects of a model that have hidden states in their present form."""
+    """Return the effects of a model whose present shapes have hidden states."""
     return [
         u.term
         for u in model.terms
@@ -62,20 +62,20 @@ def hidden_effects(model: Model) -> list[Effect]:
 
 
 def completed(runs: Sequence[Run], model: Model) -> Model | None:
-    """Return a model that can be simulated, unexcited parameters taken from nominal values.
+    """Return the model with nominal values for unidentified parameters of joints that never move.
 
     None where a parameter of a moving joint was not identified, or there is no nominal value.
     """
     rig = model.rig
-    still = set(range(1, len(rig.joints) + 1))
+    never_moved = set(range(1, len(rig.joints) + 1))
     for record in (r for run in runs for r in run.records):
-        still &= set(record.locked)
+        never_moved &= set(record.locked)
     values = {}
     for name, estimate in model.parameters.items():
         if estimate.identified:
             continue
         joints = {int(digit) for digit in name if digit.isdecimal()}
-        if not joints & still or name not in rig.nominal:
+        if not joints & never_moved or name not in rig.nominal:
             return None
         values[name] = replace(estimate, value=rig.nominal[name], ci95=(rig.nominal[name],) * 2)
     return replace(model, parameters={**model.parameters, **values})
@@ -120,11 +120,11 @@ def window_error(runs: Sequence[Run], model: Model, effect: Effect) -> float:
     good = [r for r in reduced if r is not None]
     if len(good) < len(reduced):
         return float("inf")
-    return float(np.sqrt(sum(r.rest for r in good) / sum(r.residual.size for r in good)))
+    return float(np.sqrt(sum(r.least_cost for r in good) / sum(r.residual.size for r in good)))
 
 
 def _windows(runs: Sequence[Run], model: Model, effect: Effect, free: frozenset[str]) -> Windows:
-    """Return windows of the records in which the effect's joint moves; InputError without one."""
+    """Return windows of the records that excite the effect's joint; InputError without one."""
     moving = [
         replace(run, records=tuple(r for r in run.records if effect.joint + 1 not in r.locked))
         for run in runs
@@ -154,12 +154,12 @@ def _theta(windows: Windows, model: Model) -> Array:
 def _free(model: Model, effect: Effect) -> frozenset[str]:
     """Return the effect's own parameters and its joint's parameters of the equations it acts in."""
     rig, joint = model.rig, effect.joint + 1
-    own = {c.parameter for c in effect.coefficients(rig)}
-    family = "mechanical" if own else "fluid"
+    effect_parameters = {c.parameter for c in effect.coefficients(rig)}
+    family = "mechanical" if effect_parameters else "fluid"
     others = {
         c.parameter
         for used in model.terms
         for c in used.term.coefficients(rig)
         if c.family == family and (c.parameter == "b" or c.parameter.endswith(str(joint)))
     }
-    return frozenset(own | others | {s.parameter for s in _shapes(model, effect)})
+    return frozenset(effect_parameters | others | {s.parameter for s in _shapes(model, effect)})

@@ -1,4 +1,4 @@
-"""Many trajectories of one window at once, all by the same fixed steps (RK4), compiled.
+"""Simulate many trajectories of one window, all with the same fixed steps (RK4), compiled.
 
 Sensitivities are differences of neighbouring trajectories. An adaptive integrator would choose
 different steps for each, and the resulting noise would spoil the small differences; with one grid
@@ -72,7 +72,7 @@ def _shoot(  # type: ignore[no-untyped-def]
 
 
 def parts_of(terms: Sequence[Used], rate: float) -> int:
-    """Return into how many steps two samples are cut, so that every hidden state is stable."""
+    """Return the number of steps in two samples that keeps every hidden state stable."""
     fastest = max((used.term.fastest(used.shape) for used in terms), default=0.0)
     return max(1, math.ceil(fastest * SAMPLES_PER_STEP / (rate * IDENTIFY.stable_step)))
 
@@ -91,8 +91,8 @@ def shoot(
 ) -> Array | None:
     """Return the states (P, points, size) from `starts` (P, size) with `pars` (P, parameters).
 
-    A point every 2 x `every` samples from the sample `first` on, each two samples in `parts` steps.
-    None where a simulation failed.
+    There is a point every 2 x `every` samples from the sample `first` on; two samples take `parts`
+    steps. None where a simulation failed.
     """
     out = np.zeros((len(starts), points, starts.shape[1]))
     good = _shoot(

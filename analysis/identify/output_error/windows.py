@@ -1,4 +1,4 @@
-"""Windows of the records for output error: cut, simulated with every perturbation, linearised."""
+"""Cut records into windows for output error, simulate and linearise them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlacedWindow:
-    """A window ready to simulate: its record and part, first sample, outputs (points, 3 F)."""
+    """A window: its record and part, first sample, outputs (points, 3 F) of F free joints."""
 
     record: int
     stratum: int
@@ -66,15 +66,16 @@ class WindowSource:
 
 @dataclass(frozen=True)
 class ReducedWindow:
-    """A window after its start was eliminated: score, information, cost and back substitution.
+    """A linearised window, its start eliminated: score (k,), information (k, k), cost.
 
-    `rest` is the cost at the best start.
+    `least_cost` is the cost at the best start; a step dtheta (k,) of the parameters changes that
+    start by offset - back dtheta.
     """
 
     score: Array
     information: Array
     cost: float
-    rest: float
+    least_cost: float
     back: Array
     offset: Array
     residual: Array
@@ -82,10 +83,10 @@ class ReducedWindow:
 
 @dataclass(frozen=True)
 class PerturbedModel:
-    """One record's model; `pars` (1 + k, parameters) as it is and with each parameter perturbed.
+    """One record's model; `pars` (1 + k, parameters) unperturbed, then with each perturbed.
 
     `sizes` (k,) are the perturbations, `hidden` the terms' hidden states (n, h) along the record
-    for each.
+    for each of `pars`.
     """
 
     ready: Compiled
@@ -97,8 +98,8 @@ class PerturbedModel:
 class Windows:
     """The data of one fit by windows, and their simulations.
 
-    Parameters are the terms' coefficients and those `shapes` of theirs that are named. With `free`
-    only those named there are free. At most `seconds` of data are used.
+    Parameters are the terms' coefficients and those of their shapes named in `shapes`. With `free`
+    only those named there may change. At most `seconds` of data are used.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class Windows:
         seconds: float = IDENTIFY.window_seconds, free: frozenset[str] | None = None,
     ) -> None:  # fmt: skip
         self.rig, self.terms, self.seconds, self.free = rig, ordered(terms), seconds, free
-        self.places = {
+        self.shape_places = {
             name: (k, j)
             for k, used in enumerate(self.terms)
             for j, name in enumerate(used.term.shape_names())
@@ -126,10 +127,10 @@ class Windows:
 
     def _cut(self, runs: Sequence[Run]) -> None:
         records = condition_runs(self.rig, runs)
-        strata = {s: k for k, s in enumerate(sorted({one.group for one in records}))}
+        strata = {s: k for k, s in enumerate(sorted({item.group for item in records}))}
         most = max(1, round(self.seconds / IDENTIFY.window) // len(records))
-        for one in records:
-            record, signals = one.record, sensor_corrected(self.rig, self.terms, one.signals)
+        for item in records:
+            record, signals = item.record, sensor_corrected(self.rig, self.terms, item.signals)
             drive = drive_of(signals)
             kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
             self.sources.append(WindowSource(signals, drive.inputs, drive.locked, kelvin))
@@ -139,8 +140,8 @@ class Windows:
             length = points * SAMPLES_PER_STEP * every
             # No sample of any joint may be lost: the locked ones drive the others.
             lost = signals.lost.any(axis=1)
-            good: Mask = np.asarray(signals.valid[:, free].all(axis=1) & ~lost)
-            firsts = self._fitting(good, length)
+            usable: Mask = np.asarray(signals.valid[:, free].all(axis=1) & ~lost)
+            firsts = self._window_starts(usable, length)
             chosen = firsts[:: max(1, -(-len(firsts) // most))][:most]
             measured = np.column_stack(
                 (signals.s[:, free], signals.p_cap[:, free], signals.p_rod[:, free])
@@ -149,7 +150,7 @@ class Windows:
                 at = first + SAMPLES_PER_STEP * every * np.arange(points)
                 self.placed.append(
                     PlacedWindow(
-                        len(self.sources) - 1, strata[one.group], record.repeat, part, first,
+                        len(self.sources) - 1, strata[item.group], record.repeat, part, first,
                         measured[at],
                     )
                 )  # fmt: skip
@@ -160,11 +161,11 @@ class Windows:
             )
 
     @staticmethod
-    def _fitting(good: Mask, length: int) -> list[int]:
+    def _window_starts(usable: Mask, length: int) -> list[int]:
         """Return the first samples of windows that lie end to end within good samples."""
         firsts, first = [], 0
-        bad = np.flatnonzero(~good)
-        for stop in (*bad.tolist(), len(good)):
+        unusable = np.flatnonzero(~usable)
+        for stop in (*unusable.tolist(), len(usable)):
             while first + length < stop:
                 firsts.append(first)
                 first += length
@@ -172,7 +173,7 @@ class Windows:
         return firsts
 
     def sigma(self) -> dict[int, Array]:
-        """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
+        """Return the outputs' standard deviations (3 F,) by step: the sensors' after filtering."""
         sensors = self.rig.sensors
         outputs = (sensors.piston, sensors.chamber_pressure, sensors.chamber_pressure)
         steps = np.array([converter_step(s) for s in outputs])
@@ -197,7 +198,7 @@ class Windows:
         return np.concatenate([kind * len(locked) + free for kind in range(4)])
 
     def moved(self, window: PlacedWindow, start: Array, change: Array) -> Array:
-        """Return a first state with the free joints' part changed."""
+        """Return a first state with `change` added to the states of the free joints."""
         moved = start.copy()
         moved[self._state_places(window)] += change
         return moved
@@ -212,9 +213,9 @@ class Windows:
         loaded = source.signals.loaded
         models = [as_loaded(self.model(row, source.kelvin), loaded) for row in rows]
         ready = [compiled(model, Effort.FIT) for model in models]
-        first = hidden_paths(models[0], source.signals)
+        base = hidden_paths(models[0], source.signals)
         hidden = [
-            hidden_paths(model, source.signals) if first.size and name in self.places else first
+            hidden_paths(model, source.signals) if base.size and name in self.shape_places else base
             for model, name in zip(models, ("", *self.names), strict=True)
         ]
         return PerturbedModel(ready[0], np.array([r.par for r in ready]), sizes, tuple(hidden))
@@ -223,7 +224,7 @@ class Windows:
         """Return the model of parameters theta (k,), the oil `kelvin` above nominal."""
         values = dict(zip(self.names, theta.tolist(), strict=True))
         terms = list(self.terms)
-        for name, (k, j) in self.places.items():
+        for name, (k, j) in self.shape_places.items():
             shape = list(terms[k].shape)
             shape[j] = values.pop(name)
             terms[k] = replace(terms[k], shape=tuple(shape))
@@ -247,9 +248,9 @@ class Windows:
         for k, window in enumerate(self.placed):
             if window.record not in self._without_influence:
                 reductions[k] = reduced(k)
-        rest = [k for k in range(len(self.placed)) if k not in reductions]
+        remaining = [k for k in range(len(self.placed)) if k not in reductions]
         with ThreadPoolExecutor(IDENTIFY.window_workers) as pool:
-            reductions |= zip(rest, pool.map(reduced, rest), strict=True)
+            reductions |= zip(remaining, pool.map(reduced, remaining), strict=True)
         return [reductions[k] for k in range(len(self.placed))]
 
     def _window(
@@ -266,11 +267,11 @@ class Windows:
         y0[:, : len(start)] = start
         for row, (place, size) in enumerate(zip(places, state_sizes, strict=True), start=1):
             y0[row, place] += size
-        chosen = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
+        selected = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
         if y0.shape[1] > len(start):
-            y0[:, len(start) :] = [perturbed.hidden[k][window.first] for k in chosen]
+            y0[:, len(start) :] = [perturbed.hidden[k][window.first] for k in selected]
         states = shoot(
-            ready, np.ascontiguousarray(perturbed.pars[chosen]), y0, source.inputs,
+            ready, np.ascontiguousarray(perturbed.pars[selected]), y0, source.inputs,
             source.signals.rate, source.locked, window.first, len(window.measured),
             _steps_between_points(source.signals.rate), parts_of(self.terms, source.signals.rate),
         )  # fmt: skip
@@ -279,29 +280,29 @@ class Windows:
         outputs = self._outputs(states, source.locked) / sigma
         residual = window.measured / sigma - outputs[0]
         change = (outputs[1:] - outputs[0]).reshape(len(outputs) - 1, -1)
-        Js = (change[: len(places)] / state_sizes[:, None]).T
-        J = np.zeros((Js.shape[0], len(sizes)))
+        J_start = (change[: len(places)] / state_sizes[:, None]).T
+        J = np.zeros((J_start.shape[0], len(sizes)))
         J[:, active] = (change[len(places) :] / sizes[active, None]).T
         if window.record not in self._without_influence:
             self._without_influence[window.record] = {int(k) for k in active if not J[:, k].any()}
         r = residual.ravel()
         # Project the window's start out by QR of its sensitivities.
-        Q, R = np.linalg.qr(Js)
-        inner, outer = Q.T @ J, Q.T @ r
-        J_out, r_out = J - Q @ inner, r - Q @ outer
+        Q, R = np.linalg.qr(J_start)
+        J_inside, r_inside = Q.T @ J, Q.T @ r
+        J_out, r_out = J - Q @ J_inside, r - Q @ r_inside
         return ReducedWindow(
             J_out.T @ r_out, J_out.T @ J_out, float(r @ r), float(r_out @ r_out),
-            np.linalg.solve(R, inner), np.linalg.solve(R, outer), residual,
+            np.linalg.solve(R, J_inside), np.linalg.solve(R, r_inside), residual,
         )  # fmt: skip
 
     def _active(self, record: int) -> NDArray[np.int64]:
         """Return the parameters with an influence in a record, as found from its first window."""
         locked = {str(i + 1) for i in np.flatnonzero(self.sources[record].locked)}
-        idle = self._without_influence.get(record, set())
+        without_influence = self._without_influence.get(record, set())
         return np.array(
             [
                 k for k, name in enumerate(self.names)
-                if k not in idle
+                if k not in without_influence
                 and (self.free is None or name in self.free)
                 and not (name.startswith(("C_", "Fv")) and name[-1] in locked)
             ],
@@ -319,5 +320,5 @@ class Windows:
 
 
 def _steps_between_points(rate: float) -> int:
-    """Return the integrator's steps between two points compared, at a sample rate [Hz]."""
+    """Return the integrator's steps between two compared points, at a sample rate [Hz]."""
     return max(1, round(rate / IDENTIFY.point_rate / SAMPLES_PER_STEP))

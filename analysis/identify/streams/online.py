@@ -1,4 +1,4 @@
-"""Identification while the bench runs: a square-root information filter, updated row by row.
+"""Identify while the bench runs: a square-root information filter, updated row by row.
 
 The rows equal those of `analysis.identify.identify`: samples are filtered in chunks with the
 overlap that zero-phase filters need, so that a row is available `RowFeed.delay` seconds late. A
@@ -58,45 +58,45 @@ class RowFeed:
         self._families = families
         self._chunk = round(IDENTIFY.online_chunk * head.sample_rate)
         self._locks = Locks(np.full(N, np.inf), np.zeros(N))
-        self._spare = overlap(rig, head.sample_rate, filtering, self._locks.bands)
+        self._overlap = overlap(rig, head.sample_rate, filtering, self._locks.bands)
         self._waiting: list[Mapping[str, Array]] = []
-        self._offset = self._first = self._total = 0
+        self._offset = self._next = self._received = 0
 
     @property
     def delay(self) -> float:
         """The largest delay of a row [s]."""
-        return (self._spare + self._chunk) / self.head.sample_rate
+        return (self._overlap + self._chunk) / self.head.sample_rate
 
     def feed(self, channels: Mapping[str, Array]) -> dict[str, Rows]:
-        """Take the next samples, NaN where lost; return the completed rows, if any."""
+        """Add the next samples, NaN where lost; return the completed rows by equation, if any."""
         self._waiting.append(channels)
-        self._total += len(next(iter(channels.values())))
-        last = self._total - self._spare
-        return self._work(last) if last - self._first >= self._chunk else {}
+        self._received += len(next(iter(channels.values())))
+        last = self._received - self._overlap
+        return self._rows_until(last) if last - self._next >= self._chunk else {}
 
     def finish(self) -> dict[str, Rows]:
-        """Return the remaining rows, which needed samples beyond the record's end."""
-        return self._work(self._total) if self._total else {}
+        """Return the remaining rows, up to the record's end."""
+        return self._rows_until(self._received) if self._received else {}
 
-    def _work(self, last: int) -> dict[str, Rows]:
+    def _rows_until(self, last: int) -> dict[str, Rows]:
         names = self._waiting[0]
         part: dict[str, Array] = {n: np.concatenate([w[n] for w in self._waiting]) for n in names}
-        own = (self._first, last)
+        interval = (self._next, last)
         rows = stretch_rows(
-            self._rig, self._terms, self.head.record(part), self._offset, own,
+            self._rig, self._terms, self.head.record(part), self._offset, interval,
             self._filtering, self._locks, self._families,
         )  # fmt: skip
         step = self._filtering.step
-        offset = max(0, last - self._spare) // step * step
+        offset = max(0, last - self._overlap) // step * step
         cut = offset - self._offset
         self._waiting = [{name: x[cut:] for name, x in part.items()}]
-        self._offset, self._first = offset, last
+        self._offset, self._next = offset, last
         return rows
 
 
 @dataclass(frozen=True)
 class OnlineResidual:
-    """Prediction error of a chunk by the estimates before it: rms of y - X beta and of y.
+    """Prediction error of a chunk by the estimates before it: `rms` of y - X beta, `size` of y.
 
     Both are in the rows' unit. The rows were not yet in the estimates, as with held-out rows.
     """
@@ -147,9 +147,9 @@ class _Filter:
         self._sum.merge(piece.triangle, piece.rows)
         self._peak = np.maximum(self._peak, _norms(self._sum.triangle))
         self._time = now
-        here = (head.step, head.repeat, len(self._segments))
+        place = (head.step, head.repeat, len(self._segments))
         self._segments = [s for s in self._segments if self._weight(s) > IDENTIFY.online_spent]
-        self._segments.append(_Segment(*here, piece.triangle, piece.rows, now))
+        self._segments.append(_Segment(*place, piece.triangle, piece.rows, now))
 
     def _predicted(self, piece: Accumulator) -> OnlineResidual | None:
         """Return the prediction error of a chunk; None where it has unknown columns.
@@ -161,8 +161,8 @@ class _Filter:
         beta = solve(self.names, [RowCluster(0, 0, self._sum.triangle, 1)]).value
         if not used.any() or np.isnan(beta[used]).any():
             return None
-        left = np.linalg.norm(T @ np.append(np.where(used, -beta, 0.0), 1.0))
-        return OnlineResidual(float(left), float(np.linalg.norm(T[:, -1])))
+        error = np.linalg.norm(T @ np.append(np.where(used, -beta, 0.0), 1.0))
+        return OnlineResidual(float(error), float(np.linalg.norm(T[:, -1])))
 
     def _weight(self, segment: _Segment) -> float:
         return float(np.exp((segment.time - self._time) / self._memory))
@@ -180,7 +180,7 @@ class _Filter:
             self._sum.merge(np.column_stack((lift, lift @ value)), 0)
 
     def condense(self) -> None:
-        """Merge each finished repeat into one segment, if nothing is forgotten and others exist."""
+        """Merge a repeat's segments, if nothing is forgotten and its step has other repeats."""
         if np.isfinite(self._memory):
             return
         pieces: dict[tuple[str, object], _Segment] = {}
@@ -193,7 +193,7 @@ class _Filter:
         self._segments = list(pieces.values())
 
     def _keys(self) -> list[tuple[str, object]]:
-        """Return stratum and cluster of every segment: repeats of a step where there are some."""
+        """Return stratum and cluster of every segment: repeats where a step has several."""
         repeats: dict[str, set[int]] = {}
         for segment in self._segments:
             repeats.setdefault(segment.step, set()).add(segment.repeat)
@@ -224,7 +224,7 @@ def _norms(R: Array) -> Array:
 
 
 class Tracker:
-    """Follows parameters through the records of a run: `begin`, `feed` ..., `end` or `discard`.
+    """Track the parameters through the records of a run: `begin`, `feed` ..., `end` or `discard`.
 
     `memory` [s] is the time constant of forgetting, infinite for none. Raises InputError for one
     that is not positive.
@@ -247,37 +247,37 @@ class Tracker:
             if any(c.family in self._families for c in term.coefficients(rig))
         )
         names = {family: parameters_of(rig, self._terms, family) for family in families}
-        self._kept = {family: _Filter(every, memory) for family, every in names.items()}
-        self._running = self._kept
+        self._finished = {family: _Filter(columns, memory) for family, columns in names.items()}
+        self._running = self._finished
         self._feed: RowFeed | None = None
         self._start = 0.0
         self._clock = -np.inf
         self.record_rows = 0  # of the present record, or of the last one
 
     def begin(self, head: RecordHead) -> None:
-        """Begin a record, of which `samples` may be unknown; `start` [s] is the device's time."""
+        """Begin the record `head`, at its device time `start` [s]; its `samples` may be unknown."""
         # Imported records all start at 0: they are then placed one after the other.
         self._start = max(head.start, self._clock)
         self.record_rows = 0
         filters = default_filtering(head.record({}))
         self._feed = RowFeed(self._rig, self._terms, head, filters, self._families)
-        self._running = copy.deepcopy(self._kept)
+        self._running = copy.deepcopy(self._finished)
 
     def feed(self, channels: Mapping[str, Array]) -> bool:
-        """Take the record's next samples, NaN where lost; return whether the estimates are new."""
+        """Add the record's next samples, NaN where lost; return whether the estimates changed."""
         return self._feed is not None and self._fold(self._feed.head, self._feed.feed(channels))
 
     def end(self) -> None:
         """End the record and keep its rows."""
         if self._feed is not None:
             self._fold(self._feed.head, self._feed.finish())
-            for solution in self._running.values():
-                solution.condense()
-        self._kept, self._feed = self._running, None
+            for running in self._running.values():
+                running.condense()
+        self._finished, self._feed = self._running, None
 
     def discard(self) -> None:
         """End the record and drop its rows."""
-        self._running, self._feed = self._kept, None
+        self._running, self._feed = self._finished, None
 
     def _fold(self, head: RecordHead, by_equation: Mapping[str, Rows]) -> bool:
         if not by_equation:
@@ -294,17 +294,17 @@ class Tracker:
         """Return every parameter followed; NaN until determined; without interval while held."""
         solutions = {family: running.solution() for family, running in self._running.items()}
         values, _ = estimates_of(self._rig, self._terms, solutions)
-        nothing = (float("nan"), float("nan"))
+        no_interval = (float("nan"), float("nan"))
         for running in self._running.values():
             for name in running.held & values.keys():
                 note = "not excited for long; the value is held"
-                values[name] = replace(values[name], std=float("nan"), ci95=nothing, note=note)
+                values[name] = replace(values[name], std=float("nan"), ci95=no_interval, note=note)
         return values
 
     def residuals(self) -> dict[str, OnlineResidual]:
         """Return, by family of rows, the prediction error of the newest chunk."""
-        by_family = {family: solution.residual for family, solution in self._running.items()}
-        return {family: left for family, left in by_family.items() if left is not None}
+        by_family = {family: running.residual for family, running in self._running.items()}
+        return {family: residual for family, residual in by_family.items() if residual is not None}
 
 
 def track(tracker: Tracker, record: Record, block: int = 10) -> None:

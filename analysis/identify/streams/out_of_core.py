@@ -1,4 +1,4 @@
-"""Identification from run folders that need not fit into memory, here or where the folders are.
+"""Identify from run folders that need not fit into memory, in this process or where they are.
 
 Every record is reduced where its samples are (in this process, in another, on a worker of a
 cluster), a long one chunk by chunk, and only the reductions (`analysis.identify.reduction`) are
@@ -56,7 +56,7 @@ class RecordTask:
     """A record of run number `run` to reduce; picklable as long as terms and filtering are.
 
     `bands` (N,) [Hz] is the decision for all repeats of its step (`analysis.signals.locks`), by
-    default of this record alone. A record is read in stretches of so many samples.
+    default of this record alone. A record is read in stretches of `stretch` samples.
     """
 
     rig: Rig
@@ -85,7 +85,7 @@ def identify_folders(
     baseline with `effects` (`analysis.terms.with_effects`). The records are read once more for
     every number of the rig with a tolerance (`analysis.identify.geometry`). With a `pool` each
     record is reduced in one of its processes, where the folders are read; only triangles come back.
-    `progress` receives the share of the records that are reduced, 0 to 1. Raises InputError as
+    `progress` receives the share of the records reduced, 0 to 1. Raises InputError as
     `identify` and `load_run` do, for a model of another rig, and for an effect whose shape is open.
     """
     workers = pool or Serial()
@@ -96,7 +96,7 @@ def identify_folders(
         for head in heads:
             refuse_other_rig(like, head.rig, head.source)
         used = tuple(like.terms)
-    _refuse_open(rig, used)
+    _refuse_open_shapes(rig, used)
     steps = [
         step
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
@@ -106,17 +106,17 @@ def identify_folders(
     bands = {(s.run, s.step): band for s, band in zip(steps, decisions, strict=True)}
     rigs = [rig, *map(rig.with_moved, rig.uncertain_numbers)]
     tasks = []
-    for changed in rigs:
+    for variant in rigs:
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True)):
-            seen: set[str] = set()
+            steps_seen: set[str] = set()
             for record in head.records:
                 # The noise of one record represents all repeats of its step.
-                with_noise = changed is rig and record.step not in seen
-                seen.add(record.step)
+                with_noise = variant is rig and record.step not in steps_seen
+                steps_seen.add(record.step)
                 band = bands.get((number, record.step))
                 tasks.append(
                     RecordTask(
-                        changed, number, folder, record.name, used, filtering, with_noise, band
+                        variant, number, folder, record.name, used, filtering, with_noise, band
                     )
                 )
     reductions: list[RecordReduction] = []
@@ -126,9 +126,9 @@ def identify_folders(
         if progress is not None:
             progress(len(reductions) / len(tasks))
     count = len(tasks) // len(rigs)
-    own, *moved = (reductions[k : k + count] for k in range(0, len(tasks), count))
-    geometry = shifts_of_reductions(rig, used, own, moved)
-    return conclude(rig, [head.source for head in heads], used, own, geometry=geometry)
+    unchanged, *moved = (reductions[k : k + count] for k in range(0, len(tasks), count))
+    geometry = shifts_of_reductions(rig, used, unchanged, moved)
+    return conclude(rig, [head.source for head in heads], used, unchanged, geometry=geometry)
 
 
 def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]:
@@ -136,16 +136,16 @@ def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]
 
     A cluster needs some milliseconds to send an item, as much as the reduction of a short record.
     """
-    most = max(1, min(RECORDS_TOGETHER, len(tasks) // (4 * workers)))
+    size = max(1, min(RECORDS_TOGETHER, len(tasks) // (4 * workers)))
     groups: list[list[RecordTask]] = []
     for task in tasks:
-        if not groups or len(groups[-1]) == most or groups[-1][0].path != task.path:
+        if not groups or len(groups[-1]) == size or groups[-1][0].path != task.path:
             groups.append([])
         groups[-1].append(task)
     return groups
 
 
-def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:
+def _refuse_open_shapes(rig: Rig, terms: Sequence[Used]) -> None:
     """Raise InputError for an effect whose shape must be searched with all rows in memory."""
     for used in terms:
         if open_shapes(rig, used):
@@ -166,7 +166,7 @@ def _locked_steps(rig: Rig, run: int, path: str, head: RunHead) -> list[StepTask
 
 
 def step_bands(task: StepTask) -> tuple[float, ...]:
-    """Return the band (N,) [Hz] in which each joint moves in a step; keeps only positions."""
+    """Return the band (N,) [Hz] in which each joint moves in a step, from all its repeats."""
     repeats = []
     for name in task.records:
         with open_record(task.path, name) as reader:
@@ -190,23 +190,23 @@ def reduce_records(tasks: Sequence[RecordTask]) -> list[RecordReduction]:
 def reduce_record(task: RecordTask, source: Source) -> RecordReduction:
     """Reduce one record, a long one chunk by chunk; raises InputError naming record and channel."""
     rig, terms, stretch, head = task.rig, task.terms, task.stretch, source.head
-    filters = task.filtering(source.read(0, min(head.samples, stretch)))
+    filtering = task.filtering(source.read(0, min(head.samples, stretch)))
     lost, clipped = _inspect(rig, source, stretch)
     if task.bands is None:
         bands = motion_bands(rig, [source.read(0, min(head.samples, SIGNALS.deciding_samples))])
     else:
         bands = np.array(task.bands)
-    chunks = source_rows(rig, terms, source, filters, bands, stretch)
+    chunks = source_rows(rig, terms, source, filtering, bands, stretch)
     duration = head.samples / head.sample_rate
     parts, masked = folded(rig, terms, chunks, duration, IDENTIFY.record_segments)
     noise = None
     if task.with_noise:
         # The first chunk represents a long record.
-        count = min(head.samples, stretch) if divisible(filters) else head.samples
+        count = min(head.samples, stretch) if divisible(filtering) else head.samples
         part = source.read(0, count)
-        signals = condition(rig, part, filters.channels, bands)
-        rows = record_rows(rig, terms, signals, filters)
-        conditioned = ConditionedRecord(task.run, part, signals, filters)
+        signals = condition(rig, part, filtering.channels, bands)
+        rows = record_rows(rig, terms, signals, filtering)
+        conditioned = ConditionedRecord(task.run, part, signals, filtering)
         moments = record_moments(rig, terms, conditioned, rows)
         noise = {family: moment * (head.samples / count) for family, moment in moments.items()}
     return RecordReduction(task.run, head, parts, masked, lost, clipped, noise)
@@ -223,7 +223,7 @@ def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int
         for name, count in ck.clipped_counts(rig, part).items():
             clipped[name] = clipped.get(name, 0) + count
         for name, (low, high) in ck.spans_of(part).items():
-            before = spans.get(name, (np.inf, -np.inf))
-            spans[name] = (min(low, before[0]), max(high, before[1]))
+            span = spans.get(name, (np.inf, -np.inf))
+            spans[name] = (min(low, span[0]), max(high, span[1]))
     ck.refuse_constant_channels(rig, head, spans)
     return lost, clipped
