@@ -38,20 +38,20 @@ def make(name: str, where: str = "bench") -> Term:
     try:
         return known()[name](where)
     except KeyError:
-        near = difflib.get_close_matches(name.replace(" ", "_"), known(), 1)
-        meant = f"did you mean {near[0]!r}? " if near else ""
+        similar = difflib.get_close_matches(name.replace(" ", "_"), known(), 1)
+        suggestion = f"did you mean {similar[0]!r}? " if similar else ""
         raise InputError(
-            f"unknown term {name!r}; {meant}this version knows: {' '.join(sorted(known()))}"
+            f"unknown term {name!r}; {suggestion}this version knows: {' '.join(sorted(known()))}"
         ) from None
 
 
 def baseline_of(rig: Rig) -> tuple[Term, ...]:
-    """Return the terms that every model of the rig has: no gravity in a horizontal plane."""
+    """Return the terms that every model of the rig has; without gravity in a horizontal plane."""
     if not isinstance(rig, ElectricRig):
         return tuple(term for term in baseline() if term.name != "gravity" or rig.gravity > 0)
     weight = INCLINED if rig.inclination == UNKNOWN else "gravity"
-    pulled = not rig.prismatic and rig.gravity > 0
-    return tuple(make(name) for name in (*ELECTRIC, *((weight,) if pulled else ())))
+    has_weight = not rig.prismatic and rig.gravity > 0
+    return tuple(make(name) for name in (*ELECTRIC, *((weight,) if has_weight else ())))
 
 
 def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
@@ -74,19 +74,20 @@ def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
 
 
 def _places(rig: Rig, name: str, where: str) -> list[str]:
-    """Return the place asked for, of several channels or chambers the one, or the bench or joints.
+    """Return the stated place `where`, or, where it is empty, the bench or every joint.
 
-    Raises InputError where the rig has no such place for the effect.
+    Raises InputError where the rig has no such place for the effect, or where the effect acts on
+    single channels or chambers, so that the place must be stated.
     """
     places = make(name).places(rig)
-    asked = [where] if where else [p for p in places if re.fullmatch(r"bench|joint \d+", p)]
-    if asked and set(asked) <= set(places):
-        return asked
+    chosen = [where] if where else [p for p in places if re.fullmatch(r"bench|joint \d+", p)]
+    if chosen and set(chosen) <= set(places):
+        return chosen
     if not places:
         raise InputError(f"effect {name!r} does not act on rig {rig.name!r}")
-    written = ", ".join(f"'{name}@{place}'" for place in places)
-    found = f"has no place {where!r}" if where else "needs its place"
-    raise InputError(f"effect {name!r} {found} on rig {rig.name!r}: write one of {written}")
+    options = ", ".join(f"'{name}@{place}'" for place in places)
+    problem = f"has no place {where!r}" if where else "needs its place"
+    raise InputError(f"effect {name!r} {problem} on rig {rig.name!r}: write one of {options}")
 
 
 def baseline() -> tuple[Term, ...]:

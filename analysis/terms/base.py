@@ -1,8 +1,7 @@
 """A term: columns of the regression and, in simulation, a part of the right-hand side.
 
-A model is a list of terms. Adding an effect is one file in this package (or one later listed in
-`analysis.terms.PACKAGES`) that holds a frozen dataclass derived from `Term` and names it in
-`TERMS`; nothing else changes.
+A model is a list of terms. A new effect is a frozen dataclass derived from `Term`, listed in
+`TERMS` of a module of one of the packages `analysis.terms.PACKAGES`; nothing else changes.
 
 Sign convention of every row: sum of columns times coefficients = right-hand side, with
 right-hand sides G F (torque_i), + A_cap ds/dt (flow_cap_i), - A_rod ds/dt (flow_rod_i).
@@ -22,10 +21,10 @@ Simulation. Each term has a kernel, a plain function of fixed signature that num
 
 A kernel is used in two ways with equal results. A model that is simulated seldom calls each kernel
 by its address (`analysis.simulation.interpreted`). For one that is simulated often, source is
-generated from the kernels' source and compiled once (`analysis.simulation.fused`); for that, a
-kernel keeps to loops over joints, `if`, assignments, functions of `math` and `numpy`, and functions
-marked `njit`. An index comes from a loop or is `int(par[k])`, where `par[k]` is a joint (0-based)
-and no parameter. Other kernels work term by term only.
+generated from the kernels' source and compiled once (`analysis.simulation.fused`). This requires a
+kernel of loops over joints, `if`, assignments, functions of `math` and `numpy`, and functions
+marked `njit`; an index must come from a loop or be `int(par[k])`, where `par[k]` is a joint
+(0-based) and not a parameter. Any other kernel is called by its address only.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ class Kernel:
     def address(self) -> int:
         """Machine address of the compiled function."""
         compiled = cfunc(KERNEL_SIGNATURE, cache=True, error_model="numpy")(self.function)
-        self._keep = compiled  # the code lives as long as this object
+        self._compiled = compiled  # the code lives as long as this object
         return int(compiled.address)
 
 
@@ -118,12 +117,12 @@ class Term:
     name: ClassVar[str]
     kernel: ClassVar[Kernel]  # the compiled contribution in simulation (see the module)
     prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
-    rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that simulation needs because of this term
+    rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that the integrator needs for this term
     where: str = "bench"
 
     @property
     def key(self) -> tuple[str, str]:
-        """Name and place."""
+        """The term's name and place, which identify it in a model."""
         return self.name, self.where
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
@@ -167,11 +166,11 @@ class Term:
         raise NotImplementedError
 
     def valid(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Mapping[str, Mask]:
-        """Return, by equation, where (n,) the term's equation holds (default: everywhere)."""
+        """Return, by equation, the samples (n,) at which the term is valid (default: all)."""
         return {}
 
     def tolerance(self, shape: Sequence[float]) -> float:
-        """Return the tolerance of rates [rad/s] that the simulation needs because of this term."""
+        """Return the tolerance of joint rates [rad/s] that the integrator needs for this term."""
         return self.rate_tolerance
 
     def hidden(self, rig: Rig) -> int:
@@ -225,6 +224,6 @@ class Used:
 
 
 def inverted(rig: Rig, terms: Sequence[Used], values: Mapping[str, float]) -> dict[str, float]:
-    """Convert parameters into the rows' coefficients, or those into parameters (b and 1/b)."""
+    """Convert parameters into the rows' coefficients or back: b [Pa] and 1/b change places."""
     reciprocal = {c.parameter for u in terms for c in u.term.coefficients(rig) if c.reciprocal}
     return {name: 1.0 / v if name in reciprocal and v else v for name, v in values.items()}

@@ -90,8 +90,8 @@ class Orifice(Term):
     cap: C_pp sqrt(p_s - p_cap) u [u>0] + C_pm sqrt(p_cap - p_t) u [u<0];
     rod: - C_mp sqrt(p_rod - p_t) u [u>0] - C_mm sqrt(p_s - p_rod) u [u<0].
     The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; here both
-    follow from first principles. Outside [p_t, p_s] the root has the drop's sign. Rows are masked
-    where measured pressures lie there.
+    follow from first principles. Outside [p_t, p_s] the root has the drop's sign in simulation, and
+    rows are masked.
     """
 
     name: ClassVar[str] = "orifice"
@@ -102,7 +102,7 @@ class Orifice(Term):
         return _gains(len(rig.joints))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return the four roots times the opening, in the chamber that each edge serves."""
+        """Return sqrt(drop) u of the four metering edges, in the flow rows of their chambers."""
         return edge_columns(signals, root_of_drop)
 
     def valid(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Mapping[str, Mask]:
@@ -117,9 +117,9 @@ class Orifice(Term):
 
 
 def edge_columns(signals: Signals, root: Callable[[Array], Array]) -> Columns:
-    """Return the columns of the gains of the excited joints: openings times `root` of the drops.
+    """Return the columns of the gains of the excited joints: u times `root` of the pressure drops.
 
-    `root` maps the pressure drops of an edge (n,) [Pa] to what its flow is proportional to (n,).
+    `root` maps the pressure drops of a metering edge (n,) [Pa] to its flow per gain and opening.
     """
     out: Columns = {}
     for i in signals.excited_joints:

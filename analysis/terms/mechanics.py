@@ -59,7 +59,7 @@ def _inertia(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-de
                 rate_j += x[QD, m]
             sine, cosine = sine_cosine(x[THETA, k] - x[THETA, j])
             c, s = R * cosine, R * sine
-            # Link k feels + s theta_j'^2, link j feels - s theta_k'^2; joints below carry both.
+            # On link k acts + s theta_j'^2, on link j - s theta_k'^2; joints up to k carry both.
             for a in range(j + 1):
                 if a <= k:
                     out[TORQUE, a] -= s * rate_j * rate_j
@@ -92,21 +92,21 @@ class Inertia(Term):
         N = signals.joints
         # Sums over joints as a loop: along an axis of two or three, numpy's sums take longer.
         rate, acceleration = (list(itertools.accumulate(x.T)) for x in (signals.qd, signals.qdd))
-        lowest = min(signals.excited_joints, default=N)  # its torque carries links from here on
-        feels: dict[tuple[int, int], Array] = {(k, k): acceleration[k] for k in range(N)}
+        innermost = min(signals.excited_joints, default=N)  # carries the links beyond
+        coupling: dict[tuple[int, int], Array] = {(k, k): acceleration[k] for k in range(N)}
         for k, j in itertools.combinations(range(N), 2):
-            if j < lowest:
+            if j < innermost:
                 continue
             turn = signals.theta[:, k] - signals.theta[:, j]
             c, s = np.cos(turn), np.sin(turn)
-            feels[j, k] = c * acceleration[k] - s * rate[k] ** 2
-            if k >= lowest:
-                feels[k, j] = c * acceleration[j] + s * rate[j] ** 2
+            coupling[j, k] = c * acceleration[k] - s * rate[k] ** 2
+            if k >= innermost:
+                coupling[k, j] = c * acceleration[j] + s * rate[j] ** 2
         out: Columns = {equation("torque", i): {} for i in signals.excited_joints}
         for weights, coefficient in zip(inertia_map(N), self.coefficients(rig), strict=True):
             pairs = list(map(tuple, np.argwhere(weights)))
             for i in signals.excited_joints:
-                carried = [weights[k, j] * feels[k, j] for k, j in pairs if k >= i]
+                carried = [weights[k, j] * coupling[k, j] for k, j in pairs if k >= i]
                 if carried:
                     total = functools.reduce(np.add, carried)
                     out[equation("torque", i)][coefficient.parameter] = total
@@ -118,7 +118,7 @@ class Inertia(Term):
 
 
 def inertia_map(joints: int) -> Array:
-    """Return (parameters, N, N): coefficients of each inertia parameter in the symmetric R."""
+    """Return dR/dparameter (parameters, N, N) of the symmetric R for each inertia parameter."""
     names = inertia_names(joints)
     weights = np.zeros((len(names), joints, joints))
     if joints == 2:
@@ -141,7 +141,7 @@ def chain_matrix(values: Mapping[str, float], joints: int) -> Array:
 
 
 def mass_matrix(R: Array, q: Array) -> Array:
-    """Return M(q) (N, N) of the chain: M_ij = sum_{k>=i, l>=j} R_kl cos(theta_k - theta_l)."""
+    """Return M(q) (N, N) [kg m^2]: M_ij = sum_{k>=i, l>=j} R_kl cos(theta_k - theta_l)."""
     theta = np.cumsum(q)
     turned = R * np.cos(theta[:, None] - theta[None, :])
     partial = np.cumsum(turned[::-1, ::-1], axis=0).cumsum(axis=1)
@@ -149,7 +149,7 @@ def mass_matrix(R: Array, q: Array) -> Array:
 
 
 def _one_per_joint(rig: Rig, stem: str) -> tuple[Coefficient, ...]:
-    """Return the coefficients of the torque rows that are named `stem` and 1 .. N."""
+    """Return the torque rows' coefficients of the joints, named `stem`1 .. `stem`N."""
     names = (f"{stem}{i}" for i in range(1, len(rig.joints) + 1))
     return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
 
@@ -202,9 +202,9 @@ class Gravity(Term):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return g sin(theta_k) in the rows of joints 1 .. k."""
-        pull = rig.gravity * np.sin(signals.theta)
+        weight = rig.gravity * np.sin(signals.theta)
         return {
-            equation("torque", i): {f"W{k + 1}": pull[:, k] for k in range(i, signals.joints)}
+            equation("torque", i): {f"W{k + 1}": weight[:, k] for k in range(i, signals.joints)}
             for i in range(signals.joints)
         }
 
@@ -228,7 +228,7 @@ def _inclined_gravity(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-u
 class InclinedGravity(Term):
     """V = - sum_k W_k g cos(theta_k + alpha), in place of `gravity`.
 
-    Link k pulls W_k g sin(theta_k + alpha) = g [W_k cos(alpha) sin(theta_k) + W_k sin(alpha)
+    Link k exerts W_k g sin(theta_k + alpha) = g [W_k cos(alpha) sin(theta_k) + W_k sin(alpha)
     cos(theta_k)]: linear in 2 N unknowns that share alpha. `reduction` maps them to the N + 1
     parameters (docs/n-joints.md; the common parameter of Sakai and Maeshima's last claim).
     """
@@ -238,7 +238,7 @@ class InclinedGravity(Term):
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return W_k cos(alpha), then W_k sin(alpha) [kg m]."""
-        names = _linear(len(rig.joints))
+        names = _linear_names(len(rig.joints))
         return tuple(Coefficient(name, "kg*m", "mechanical") for name in names)
 
     def parameters(self, rig: Rig) -> tuple[Coefficient, ...]:
@@ -252,7 +252,7 @@ class InclinedGravity(Term):
         N = len(rig.joints)
 
         def start(x: Array) -> Array:
-            # (W, alpha) and (-W, alpha + pi) pull alike; links hang down by their own weight.
+            # (W, alpha) and (-W, alpha + pi) give equal torques; a positive sum of W is chosen.
             alpha = math.atan2(float(x[N:].sum()), float(x[:N].sum()))
             return np.append(x[:N] * math.cos(alpha) + x[N:] * math.sin(alpha), alpha)
 
@@ -265,12 +265,12 @@ class InclinedGravity(Term):
             return np.column_stack((np.vstack((c * eye, s * eye)), by_angle))
 
         names = tuple(c.parameter for c in self.parameters(rig))
-        return ParameterReduction(_linear(N), names, start, value, slope)
+        return ParameterReduction(_linear_names(N), names, start, value, slope)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return g sin(theta_k) and g cos(theta_k) in the rows of joints 1 .. k."""
         N = signals.joints
-        names = _linear(N)
+        names = _linear_names(N)
         sine, cosine = (rig.gravity * f(signals.theta) for f in (np.sin, np.cos))
         return {
             equation("torque", i): {
@@ -286,7 +286,7 @@ class InclinedGravity(Term):
         return np.array([*weights, values[INCLINATION]])
 
 
-def _linear(joints: int) -> tuple[str, ...]:
+def _linear_names(joints: int) -> tuple[str, ...]:
     each = range(1, joints + 1)
     return (*(f"W{i} cos" for i in each), *(f"W{i} sin" for i in each))
 

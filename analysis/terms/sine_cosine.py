@@ -13,9 +13,9 @@ from numba import njit
 PER_HALF_TURN: Final = 0.3183098861837907
 # pi / 2 in two parts: products of the first with fewer than 2^20 half turns are exact.
 HALF_PI_1, HALF_PI_2 = 1.5707963267341256, 6.077100506506192e-11
-TO_WHOLE: Final = 6755399441055744.0  # 1.5 x 2^52: what is added to it is rounded to whole numbers
+TO_WHOLE: Final = 6755399441055744.0  # 1.5 x 2^52: a number added to it is rounded to an integer
 
-# Of fdlibm's k_sin.c and k_cos.c, exact to the last place up to pi / 4.
+# Coefficients of fdlibm's k_sin.c and k_cos.c: errors below one unit in the last place to pi / 4.
 S1, S2, S3, S4, S5, S6 = (
     -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04,
     2.75573137070700676789e-06, -2.50507602534068634195e-08, 1.58969099521155010221e-10,
@@ -30,7 +30,7 @@ C1, C2, C3, C4, C5, C6 = (
 def sine_cosine(x):  # type: ignore[no-untyped-def]
     """Return sine and cosine of x [rad]; the error is below 5e-16 up to a million radians."""
     turns = (x * PER_HALF_TURN + TO_WHOLE) - TO_WHOLE
-    h = (0.5 * x - turns * HALF_PI_1) - turns * HALF_PI_2  # half of what is left
+    h = (0.5 * x - turns * HALF_PI_1) - turns * HALF_PI_2  # half of the remainder
     z = h * h
     w = z * z
     s = h + h * z * ((S1 + z * S2) + w * (S3 + z * S4) + w * w * (S5 + z * S6))

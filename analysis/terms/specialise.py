@@ -46,9 +46,9 @@ class NotSpecialisable(Exception):
 
 @dataclass(frozen=True)
 class ScalarArray:
-    """An array whose elements are variables: `name` and indices shifted by `first` name them.
+    """An array whose elements are variables, named `name` and their indices increased by `first`.
 
-    `values` are known elements, where an integer made of one is a place.
+    `values` are elements known beforehand, from which `int(par[k])` takes a joint's index.
     """
 
     name: str
@@ -95,19 +95,19 @@ class Helpers:
         read = tuple(sorted(body.read))
         name = f"{function.__name__.strip('_')}_{len(self.names) + 1}"
         self.names[key] = name, read
-        kept = [a.arg for a in tree.args.args if a.arg not in arrays and a.arg not in numbers]
+        parameters = [a.arg for a in tree.args.args if a.arg not in arrays and a.arg not in numbers]
         model = dispatcher.targetoptions.get("error_model", "python")
-        head = f"@njit(error_model={model!r})\ndef {name}({', '.join([*kept, *read])}):\n"
+        head = f"@njit(error_model={model!r})\ndef {name}({', '.join([*parameters, *read])}):\n"
         self.texts[name] = head + textwrap.indent(_unparse(statements), "    ")
         return name, read
 
 
 @dataclass(frozen=True)
 class Specialised:
-    """Statements of a specialised kernel, the variables that they read, and the fixed places.
+    """Statements of a specialised kernel, the variables that they read, and its fixed indices.
 
-    `places` are the elements, by variable, that were read as integers and are constants in the
-    lines.
+    `places` holds, by variable, the elements that were read as integers: the lines have their
+    values as constants.
     """
 
     lines: tuple[str, ...]
@@ -122,7 +122,7 @@ def specialised(
     prefix: str,
     helpers: Helpers,
 ) -> Specialised:
-    """Return a kernel's statements; `prefix` begins its local variables.
+    """Return a kernel's statements; the names of its local variables begin with `prefix`.
 
     `numbers` are parameters known now (the phase), `arrays` the others. Raises NotSpecialisable.
     """
@@ -154,7 +154,7 @@ def _constant(node: ast.expr) -> Any:
 
 
 def _whole(node: ast.expr) -> int | None:
-    """Return the value of an integer constant (no truth value), None of anything else."""
+    """Return the value of an integer constant (not a bool), None for any other expression."""
     value = _constant(node)
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
@@ -176,44 +176,44 @@ class _Body(ast.NodeTransformer):
         stored = [n.id for n in names if isinstance(n.ctx, ast.Store)]
         self.stored = set(stored)
         self.locals = {*stored, *(a.arg for a in tree.args.args)}
-        self.once = {name for name in stored if stored.count(name) == 1}
+        self.stored_once = {name for name in stored if stored.count(name) == 1}
 
     # Statements.
 
     def block(self, statements: Sequence[ast.stmt]) -> list[ast.stmt]:
-        """Return the statements evaluated; early ends become the other branch of their `if`."""
+        """Return the statements evaluated; those after an early end become its `if`'s `else`."""
         out: list[ast.stmt] = []
         for k, statement in enumerate(statements):
             if isinstance(statement, ast.If):
                 test = self.visit(statement.test)
                 known = _constant(test)
                 body, rest = statement.body, [*statement.orelse, *statements[k + 1 :]]
-                leaves = self._leaves(body)
+                ends_block = self._ends_block(body)
                 if known is not None:
-                    if known and leaves:
+                    if known and ends_block:
                         return [*out, *self.block(body[:-1])]
                     out += self.block(body if known else statement.orelse)
                     continue
-                if leaves:
-                    return [*out, self._choice(test, body[:-1], rest)]
-                out.append(self._choice(test, body, statement.orelse))
-            elif self._leaves([statement]):
+                if ends_block:
+                    return [*out, self._if_statement(test, body[:-1], rest)]
+                out.append(self._if_statement(test, body, statement.orelse))
+            elif self._ends_block([statement]):
                 return out
             else:
                 out += self._plain(statement)
         return out
 
-    def _leaves(self, body: Sequence[ast.stmt]) -> bool:
-        """Return whether a block ends the inlined part: a kernel, or a pass of an unrolled loop."""
+    def _ends_block(self, body: Sequence[ast.stmt]) -> bool:
+        """Return whether a block ends in `return` or `continue` of an inlined kernel."""
         return self.inlined and isinstance(body[-1], ast.Return | ast.Continue)
 
-    def _choice(
+    def _if_statement(
         self, test: ast.expr, body: Sequence[ast.stmt], other: Sequence[ast.stmt]
     ) -> ast.stmt:
         return ast.If(test, self.block(body) or [ast.Pass()], self.block(other))
 
     def _plain(self, statement: ast.stmt) -> list[ast.stmt]:
-        """Return a statement that is no `if`, evaluated: none, itself or a loop's passes."""
+        """Return a statement other than `if`, evaluated: none, one, or the passes of a loop."""
         match statement:
             case ast.Pass() | ast.Expr(value=ast.Constant()):
                 out: list[ast.stmt] = []
@@ -237,7 +237,7 @@ class _Body(ast.NodeTransformer):
 
     def _assigned(self, target: ast.expr, value: ast.expr) -> list[ast.stmt]:
         whole = _whole(value)
-        if isinstance(target, ast.Name) and whole is not None and target.id in self.once:
+        if isinstance(target, ast.Name) and whole is not None and target.id in self.stored_once:
             self.known[target.id] = whole
             return []
         return [ast.Assign([self.visit(target)], value, lineno=0)]
@@ -248,15 +248,15 @@ class _Body(ast.NodeTransformer):
         if loop.orelse or any(end is None for end in ends):
             raise NotSpecialisable(f"line {loop.lineno}: the loop over {name} has no fixed length")
         numbers = [end for end in ends if end is not None]
-        leaving = (ast.Break, ast.Return) if self.inlined else (ast.Break, ast.Return, ast.Continue)
-        left = any(isinstance(n, leaving) for n in ast.walk(loop))
-        if left and self.inlined:
+        early = (ast.Break, ast.Return) if self.inlined else (ast.Break, ast.Return, ast.Continue)
+        ends_early = any(isinstance(n, early) for n in ast.walk(loop))
+        if ends_early and self.inlined:
             raise NotSpecialisable(f"line {loop.lineno}: the loop over {name} is left early")
         nodes = (n for part in loop.body for n in ast.walk(part))
-        if left or not any(isinstance(n, ast.Name) and n.id == name for n in nodes):
+        if ends_early or not any(isinstance(n, ast.Name) and n.id == name for n in nodes):
             target = ast.Name(self.prefix + name, ast.Store())
-            over = ast.Call(ast.Name("range", ast.Load()), list(map(ast.Constant, numbers)), [])
-            return [ast.For(target, over, self.block(loop.body) or [ast.Pass()], [], lineno=0)]
+            passes = ast.Call(ast.Name("range", ast.Load()), list(map(ast.Constant, numbers)), [])
+            return [ast.For(target, passes, self.block(loop.body) or [ast.Pass()], [], lineno=0)]
         out: list[ast.stmt] = []
         for value in range(*numbers):
             self.known[name] = value
@@ -302,9 +302,9 @@ class _Body(ast.NodeTransformer):
         """Replace an array's element by its variable, `x.shape[1]` by its number."""
         match node.value:
             case ast.Attribute(value=ast.Name(id=name), attr="shape") if name in self.arrays:
-                which = _whole(self.visit(node.slice))
-                if which is not None:
-                    return ast.Constant(self.arrays[name].shape[which])
+                axis = _whole(self.visit(node.slice))
+                if axis is not None:
+                    return ast.Constant(self.arrays[name].shape[axis])
             case ast.Name(id=name) if name in self.arrays:
                 parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
                 index = [_whole(self.visit(part)) for part in parts]
@@ -344,7 +344,7 @@ class _Body(ast.NodeTransformer):
         names = list(inspect.signature(dispatcher.py_func).parameters)
         if len(names) != len(node.args):
             raise NotSpecialisable(f"line {node.lineno}: {ast.unparse(node)} leaves arguments out")
-        handed = {
+        array_arguments = {
             parameter: self.arrays[argument.id]
             for parameter, argument in zip(names, node.args, strict=True)
             if isinstance(argument, ast.Name) and argument.id in self.arrays
@@ -352,17 +352,17 @@ class _Body(ast.NodeTransformer):
         values = {
             parameter: self.visit(argument)
             for parameter, argument in zip(names, node.args, strict=True)
-            if parameter not in handed
+            if parameter not in array_arguments
         }
         numbers = {p: whole for p, v in values.items() if (whole := _whole(v)) is not None}
-        name, read = self.helpers.copy(dispatcher, handed, numbers)
-        kept = [value for parameter, value in values.items() if parameter not in numbers]
+        name, read = self.helpers.copy(dispatcher, array_arguments, numbers)
+        others = [value for parameter, value in values.items() if parameter not in numbers]
         self.read.update(read)
         elements = [ast.Name(variable, ast.Load()) for variable in read]
-        return ast.Call(ast.Name(name, ast.Load()), [*kept, *elements], [])
+        return ast.Call(ast.Name(name, ast.Load()), [*others, *elements], [])
 
     def _place(self, element: ast.Subscript) -> int:
-        """Return the joint's number that a kernel reads from `par`."""
+        """Return the joint's index (0-based) that a kernel reads from `par`."""
         index = _whole(self.visit(element.slice))
         if isinstance(element.value, ast.Name) and index is not None:
             array = self.arrays.get(element.value.id)
@@ -382,7 +382,7 @@ class _Body(ast.NodeTransformer):
         return ast.BinOp(left, node.op, right)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
-        """Evaluate the sign of a known integer and the negation of a known truth."""
+        """Evaluate the sign of a known integer and `not` of a known bool."""
         operand = self.visit(node.operand)
         whole = _whole(operand)
         if isinstance(node.op, ast.USub) and whole is not None:
@@ -402,17 +402,17 @@ class _Body(ast.NodeTransformer):
     def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
         """Evaluate `and` and `or` as far as their parts are known."""
         decides = isinstance(node.op, ast.Or)
-        left: list[ast.expr] = []
+        undecided: list[ast.expr] = []
         for part in node.values:
             value = self.visit(part)
             if isinstance(_constant(value), bool):
                 if _constant(value) is decides:
                     return ast.Constant(decides)
                 continue
-            left.append(value)
-        if not left:
+            undecided.append(value)
+        if not undecided:
             return ast.Constant(not decides)
-        return left[0] if len(left) == 1 else ast.BoolOp(node.op, left)
+        return undecided[0] if len(undecided) == 1 else ast.BoolOp(node.op, undecided)
 
     def visit_IfExp(self, node: ast.IfExp) -> ast.expr:
         """Choose the branch where the test is known."""
