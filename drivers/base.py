@@ -33,7 +33,7 @@ class DeviceError(Exception):
 
 
 class DeviceLost(DeviceError):
-    """The device does not answer (any more)."""
+    """The device does not answer, or no longer."""
 
 
 class DeviceBusy(DeviceError):
@@ -42,10 +42,10 @@ class DeviceBusy(DeviceError):
 
 @runtime_checkable
 class ReportsDoubts(Protocol):
-    """A driver that can name settings that make a channel's values implausible."""
+    """A driver that can name channels whose values suggest a wrong setting."""
 
     def doubts(self) -> Mapping[str, str]:
-        """Return a question for each channel in doubt; reads, moves nothing. Raises DeviceError."""
+        """Return the suspected setting by channel; reads, moves nothing. Raises DeviceError."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ class ActiveLaw(OutputLaw):
 
     def volts(self, tick: int, position: float) -> float:
         """Return the output [V] at a tick and a position [m or rad]."""
-        played = self.gain * self.wave[(tick - self.start) % len(self.wave)] + self.bias
-        wanted = played + self.position_gain * (self.setpoint - position)
-        return float(min(max(wanted, -self.limit), self.limit))
+        command = self.gain * self.wave[(tick - self.start) % len(self.wave)] + self.bias
+        command += self.position_gain * (self.setpoint - position)
+        return float(min(max(command, -self.limit), self.limit))
 
 
 def check_count(laws: Sequence[OutputLaw], rig: Rig) -> None:
@@ -145,8 +145,8 @@ class SampleBlock:
     measured part; `backlog` counts the blocks still waiting in the device; `tripped` states that
     the device itself has zeroed its outputs (watchdog or fault). A host-timed driver adds
     `read_at`, shape (n,): when each row's own sample was taken [s since tick 0], NaN for an
-    interpolated row. `armed` is False where the device reports that no law may put out a voltage:
-    after laws that may, another client has zeroed the outputs.
+    interpolated row. `armed` is False where the device reports that no law can put out a voltage;
+    if those applied last could, another client has zeroed the outputs.
     """
 
     sequence: int
@@ -166,22 +166,22 @@ class WireSettings(Part):
     def of(cls, wire: Wire) -> Self:
         """Read the settings of a wire; raises InputError naming the key and what was expected."""
         try:
-            made = cls.model_validate(wire.settings)
+            settings = cls.model_validate(wire.settings)
         except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"])
+            problem = error.errors()[0]
+            key = ".".join(str(part) for part in problem["loc"])
             known = " ".join(cls.model_fields)
-            if first["type"] == "extra_forbidden":
+            if problem["type"] == "extra_forbidden":
                 usual = "kind timeout watchdog jitter"
                 text = f"unknown key of wire {wire.kind}; expected: {usual} {known}"
-            elif first["type"] == "missing":
+            elif problem["type"] == "missing":
                 text = f"wire {wire.kind} needs it"
             else:
-                text = problem_text(first)
+                text = problem_text(problem)
             raise InputError(f"wire: {key}: {text}") from error
-        for path in boolean_numbers(wire.settings, made):
+        for path in boolean_numbers(wire.settings, settings):
             raise InputError(f"wire: {'.'.join(map(str, path))}: {NO_NUMBER}")
-        return made
+        return settings
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
@@ -257,7 +257,7 @@ class AsksAhead(Protocol):
 
 @runtime_checkable
 class LatchesTrip(Protocol):
-    """A driver whose device can be left with a latched trip of its own, against any other host."""
+    """A driver that can leave its device with a latched trip, which stops any other host too."""
 
     def close_tripped(self) -> None:
         """Zero the outputs, then close so that the device latches a trip; never raises."""

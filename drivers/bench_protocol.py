@@ -1,4 +1,4 @@
-"""Common parts of all wires of this project's protocol: identity, waveforms, reasons.
+"""Parts of this project's protocol that all its wires share: identity, waveforms, reasons.
 
 Modbus TCP and the serial line transfer the same values in different frames
 (`rig.model.wire.registers`).
@@ -18,8 +18,8 @@ from rig.model.wire import registers as reg
 from rig.model.wire.codes import encode_output
 from rig.model.wire.registers import Refusal, TripCause
 
-# A virtual device's clock stands still between requests: a busy computer does not affect it.
-VIRTUAL_PATIENCE: Final = 10.0
+# On the time limit of answers: a device in virtual time waits for a busy computer anyway.
+VIRTUAL_TIMEOUT_FACTOR: Final = 10.0
 _VERSION = "protocol version"
 _TOLERANCE = 1e-6  # registers hold single precision
 _IDENTITY = struct.Struct(">IHHHfHHII")
@@ -100,9 +100,9 @@ def wave_codes(
 
 
 def number_in(data: bytes, register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
-    """Return an unsigned register's number from the bytes of the registers from `first` on."""
-    at = 2 * (register.address - first)
-    return int.from_bytes(data[at : at + 2 * register.words], "big")
+    """Return the number in an unsigned register from the bytes of the registers from `first` on."""
+    offset = 2 * (register.address - first)
+    return int.from_bytes(data[offset : offset + 2 * register.words], "big")
 
 
 def trip_text(status: bytes) -> str | None:

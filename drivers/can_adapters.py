@@ -21,7 +21,7 @@ if os.name == "posix":
 
 
 class SocketcandBus(SocketCanDaemonBus):
-    """python-can's client, corrected: a busy bus never opened, an ended one never stopped."""
+    """python-can's client, corrected to open a busy bus and to report a connection's end."""
 
     def _expect_msg(self, msg: str) -> None:
         # The last answer of the greeting may arrive together with the first frames.
@@ -46,11 +46,11 @@ class SocketcandBus(SocketCanDaemonBus):
 
 
 class SlcanBus(slcanBus):
-    """python-can's client, corrected: it reads byte by byte and ends at a damaged text.
+    """python-can's client, corrected to read whole texts and to skip a damaged one.
 
-    It also takes a port that another program has, sets the adapter anew, and takes bytes from that
-    program. Here the port is locked as pyserial does it; if `shared`, it is not, and the adapter is
-    left as it is.
+    python-can's opens a port that another program has, reconfigures the adapter and takes bytes
+    from that program. Here the port is locked as by pyserial; if `shared`, it is not locked, and
+    the adapter keeps its configuration.
     """
 
     def __init__(self, channel: str, *, shared: bool, **options: Any) -> None:
@@ -63,17 +63,17 @@ class SlcanBus(slcanBus):
             raise
 
     def open(self) -> None:
-        """Open the channel, unless another program has set the adapter."""
+        """Open the channel, unless the port is shared."""
         if not self._shared:
             super().open()
 
     def close(self) -> None:
-        """Close the channel, unless another program has set the adapter."""
+        """Close the channel, unless the port is shared."""
         if not self._shared:
             super().close()
 
     def set_bitrate(self, bitrate: int, data_bitrate: int | None = None) -> None:
-        """Set the rates [bit/s], unless another program has."""
+        """Set the rates [bit/s], unless the port is shared."""
         if not self._shared:
             super().set_bitrate(bitrate, data_bitrate)
 
@@ -96,21 +96,21 @@ class SlcanBus(slcanBus):
             return None, False
 
     def _read(self, timeout: float | None) -> str | None:
-        end = None if timeout is None else time.monotonic() + timeout
+        deadline = None if timeout is None else time.monotonic() + timeout
         port = self.serialPortOrig
         while True:
             if (text := _first_text(self._buffer)) is not None:
                 return text
-            left = DRIVER.can_wait if end is None else end - time.monotonic()
-            ready = select.select([port.fileno()], [], [], min(max(left, 0.0), DRIVER.can_wait))[0]
-            if ready:
+            remaining = DRIVER.can_wait if deadline is None else deadline - time.monotonic()
+            wait = min(max(remaining, 0.0), DRIVER.can_wait)
+            if select.select([port.fileno()], [], [], wait)[0]:
                 self._buffer.extend(port.read(port.in_waiting or 1))
-            elif end is not None and left <= 0.0:
+            elif deadline is not None and remaining <= 0.0:
                 return None
 
 
 def _locked(device: str) -> int:
-    """Lock a serial port against other programs; returns the file to close at the end.
+    """Lock a serial port against other programs; return the file whose closing unlocks it.
 
     Raises PortInUse where another program has locked it, OSError where there is no such port.
     """
@@ -123,11 +123,11 @@ def _locked(device: str) -> int:
     return file
 
 
-def _first_text(begun: bytearray) -> str | None:
-    """Take the first complete text, up to its end or error mark."""
-    ends = [at for mark in (b"\r", b"\a") if (at := begun.find(mark)) >= 0]
-    if not ends:
+def _first_text(buffer: bytearray) -> str | None:
+    """Remove the first complete text, up to its end or error mark, and return it."""
+    marks = [at for mark in (b"\r", b"\a") if (at := buffer.find(mark)) >= 0]
+    if not marks:
         return None
-    text = bytes(begun[: min(ends) + 1])
-    del begun[: len(text)]
+    text = bytes(buffer[: min(marks) + 1])
+    del buffer[: len(text)]
     return text.decode("ascii", "replace")

@@ -40,7 +40,7 @@ _ERRORS: Final = (can.CanError, OSError, ValueError, ImportError, NotImplemented
 
 @dataclass(frozen=True)
 class BusPlace:
-    """A bus: python-can's interface and what it needs to open it."""
+    """The address of a bus: python-can's interface, its channel, a socketcand's host and port."""
 
     text: str
     interface: str
@@ -50,7 +50,7 @@ class BusPlace:
 
     @classmethod
     def of(cls, text: str) -> BusPlace:
-        """Read ``INTERFACE/CHANNEL``; raises ValueError saying what was expected."""
+        """Read ``INTERFACE/CHANNEL``; raises ValueError naming what was expected."""
         interface, _, channel = text.partition("/")
         if interface not in can.VALID_INTERFACES:
             known = " ".join(sorted(can.VALID_INTERFACES))
@@ -93,9 +93,9 @@ class BusSettings(WireSettings):
 class CanPort:
     """A CAN bus that can be opened and closed any number of times.
 
-    `wanted` are the keys (`CanMessage.key`) of the frames to keep; where `deliver` is given, it is
-    called with each of them in the receive thread, and `receive` returns none. `seen` counts what
-    came since opening.
+    `keys` are the keys (`CanMessage.key`) of the frames to keep; where `deliver` is given, it is
+    called with each of them in the receive thread, and `receive` returns none. `counts` counts all
+    frames since opening.
     """
 
     def __init__(
@@ -103,13 +103,13 @@ class CanPort:
         place: BusPlace,
         bitrate: int,
         data_bitrate: int | None,
-        wanted: frozenset[int],
+        keys: frozenset[int],
         make: Callable[..., Any] = can.Bus,
         deliver: Callable[[int, bytes], object] | None = None,
     ) -> None:
         self._place, self._bitrate, self._data_bitrate = place, bitrate, data_bitrate
         self._deliver = deliver
-        self._identifiers = wanted
+        self._keys = keys
         self._make = make
         self._shared = False
         self._reader: _Reader | None = None
@@ -126,13 +126,13 @@ class CanPort:
 
     @property
     def fault(self) -> BaseException | None:
-        """Why the bus was lost, None while it is not."""
+        """The error by which the bus was lost, None while it is not."""
         return None if self._reader is None else self._reader.fault
 
     @property
-    def seen(self) -> FrameCounts:
+    def counts(self) -> FrameCounts:
         """Counts of frames since the bus was last opened."""
-        return FrameCounts() if self._reader is None else self._reader.seen
+        return FrameCounts() if self._reader is None else self._reader.counts
 
     def open(self, *, shared: bool = False) -> None:
         """Open the bus; raises DeviceLost where there is none, DeviceError where it may not be.
@@ -145,15 +145,15 @@ class CanPort:
         # python-can warns of normal conditions, such as half a line; faults are reported here.
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if self._place.interface == SOCKETCAND:
-            self._greeted()
-        reader = _Reader(self._opened, self._identifiers, self._deliver)
+            self._check_socketcand()
+        reader = _Reader(self._make_bus, self._keys, self._deliver)
         if not reader.opened.wait(DRIVER.can_open):
             reader.end()
             raise DeviceLost(f"{self.where} did not open within {DRIVER.can_open:g} s")
         if isinstance(reader.fault, PortInUse):
             raise reader.fault
         if reader.fault is not None:
-            raise self._why_not(reader.fault) from reader.fault
+            raise self._opening_error(reader.fault) from reader.fault
         self._reader = reader
 
     def send(self, frame: CanFrame) -> None:
@@ -183,15 +183,15 @@ class CanPort:
             else:
                 return
 
-    def receive(self, patience: float) -> list[tuple[int, bytes]]:
-        """Return (key, bytes) of the frames waiting; nothing after `patience` [s].
+    def receive(self, timeout: float) -> list[tuple[int, bytes]]:
+        """Return (key, bytes) of the frames waiting; nothing after `timeout` [s].
 
-        Raises DeviceLost when the bus has gone.
+        Raises DeviceLost when the bus is lost.
         """
         reader = self._usable()
         frames: list[tuple[int, bytes]] = []
         with suppress(queue.Empty):
-            frames.append(reader.frames.get(timeout=max(patience, 0.0)))
+            frames.append(reader.frames.get(timeout=max(timeout, 0.0)))
             while True:
                 frames.append(reader.frames.get_nowait())
         if not frames and reader.fault is not None:
@@ -213,16 +213,16 @@ class CanPort:
 
     def _loss(self, error: BaseException) -> DeviceLost:
         self.close()
-        return DeviceLost(f"the bus {self.where} has gone: {_line(error)}")
+        return DeviceLost(f"the bus {self.where} has gone: {_one_line(error)}")
 
-    def _greeted(self) -> None:
-        """Reject anything but a socketcand: python-can would wait for its answer for ever."""
+    def _check_socketcand(self) -> None:
+        """Raise DeviceError or DeviceLost for another server: python-can would wait for ever."""
         place = self._place
         try:
-            with socket.create_connection((place.host, place.port), DRIVER.can_greeting) as asked:
-                greeting = asked.recv(64)
-                asked.sendall(f"< open {place.channel} >".encode())
-                opened = asked.recv(64) if greeting.startswith(_GREETING) else b""
+            with socket.create_connection((place.host, place.port), DRIVER.can_greeting) as host:
+                greeting = host.recv(64)
+                host.sendall(f"< open {place.channel} >".encode())
+                opened = host.recv(64) if greeting.startswith(_GREETING) else b""
         except ConnectionError as error:
             raise DeviceLost(
                 f"nobody listens at {place.host}:{place.port} ({error.strerror}); is socketcand "
@@ -248,7 +248,7 @@ class CanPort:
                 f"{opened[:60]!r}"
             )
 
-    def _opened(self) -> Any:
+    def _make_bus(self) -> Any:
         place = self._place
         rates: dict[str, Any] = {"bitrate": self._bitrate}
         if place.interface == SOCKETCAND:
@@ -271,8 +271,8 @@ class CanPort:
             rates |= {"fd": True, "data_bitrate": self._data_bitrate}
         return self._make(interface=place.interface, channel=place.channel, **rates)
 
-    def _why_not(self, error: BaseException) -> DeviceError:
-        number, text = _errno(error), _line(error)
+    def _opening_error(self, error: BaseException) -> DeviceError:
+        number, text = _errno(error), _one_line(error)
         interface = self._place.interface
         if isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
             return DeviceError(f"the interface {interface} cannot be used here: {text}")
@@ -315,7 +315,7 @@ class _Reader:
     def __init__(
         self,
         make: Callable[[], Any],
-        wanted: frozenset[int],
+        keys: frozenset[int],
         deliver: Callable[[int, bytes], object] | None,
     ) -> None:
         self._deliver = deliver
@@ -323,8 +323,8 @@ class _Reader:
         self.opened = threading.Event()
         self.fault: BaseException | None = None
         self.frames: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
-        self.seen = FrameCounts()
-        self._make, self._identifiers = make, wanted
+        self.counts = FrameCounts()
+        self._make, self._keys = make, keys
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="can-receive", daemon=True)
         self._thread.start()
@@ -358,13 +358,13 @@ class _Reader:
     def _take(self, message: Any) -> None:
         key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if message.is_error_frame:
-            self.seen.errors += 1
-        elif message.is_remote_frame or key not in self._identifiers:
-            self.seen.foreign += 1
+            self.counts.errors += 1
+        elif message.is_remote_frame or key not in self._keys:
+            self.counts.foreign += 1
         elif self.frames.qsize() >= DRIVER.can_frames:
-            self.seen.overrun += 1
+            self.counts.overrun += 1
         else:
-            self.seen.accepted += 1
+            self.counts.accepted += 1
             if self._deliver is None:
                 self.frames.put((key, bytes(message.data)))
             else:
@@ -385,5 +385,5 @@ def _errno(error: BaseException | None) -> int | None:
     return None
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__

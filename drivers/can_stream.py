@@ -101,10 +101,10 @@ class CanLine:
         for frame in part_frames(self._layout.request, message):
             self._port.send(frame)
 
-    def receive(self, patience: float) -> list[WireFrame]:
+    def receive(self, timeout: float) -> list[WireFrame]:
         """Return the complete messages; raises DeviceLost when the bus is lost."""
         messages = []
-        for key, data in self._port.receive(patience):
+        for key, data in self._port.receive(timeout):
             if self._blocks.takes(key):
                 message = self._blocks.feed(key, data, *self._stream)
             else:
@@ -113,31 +113,31 @@ class CanLine:
                 messages.append(message)
         return messages
 
-    def complaint(self, heard: int) -> str:
+    def complaint(self, received: int) -> str:
         """Return what may explain missing answers, or ''."""
-        seen = self._port.seen
-        if seen.errors:
+        counts = self._port.counts
+        if counts.errors:
             return (
-                f"{seen.errors} error frames came: check that every node runs at {self._bitrate} "
+                f"{counts.errors} error frames came: check that every node runs at {self._bitrate} "
                 "bit/s, and the termination"
             )
-        if not heard and seen.accepted:
+        if not received and counts.accepted:
             return (
-                f"{seen.accepted} frames with the bench's identifiers came, none a whole message: "
+                f"{counts.accepted} frames of the bench's identifiers came, none a whole message: "
                 "another node uses them, or the device has another DBC file"
             )
-        if not heard and seen.foreign:
+        if not received and counts.foreign:
             return (
-                f"{seen.foreign} frames came, none with an identifier of {self._layout.source}: "
+                f"{counts.foreign} frames came, none with an identifier of {self._layout.source}: "
                 "check the DBC file and that this is the bench's bus"
             )
-        if not heard:
+        if not received:
             return (
                 "no frame came: check wiring, termination and that the bus runs at "
                 f"{self._bitrate} bit/s"
             )
-        if seen.overrun:
-            return f"{seen.overrun} frames came faster than this program took them"
+        if counts.overrun:
+            return f"{counts.overrun} frames came faster than this program took them"
         damaged = self.damaged - self._damaged
         return f"{damaged} messages came damaged: check wiring and termination" if damaged else ""
 
@@ -159,17 +159,17 @@ class CanStreamDriver(MessageStreamDriver):
         port: CanPort | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        at = CanSettings.of(wire)
-        self._bitrate = at.bitrate
-        layout = can_layout(at, rig)
+        settings = CanSettings.of(wire)
+        self._bitrate = settings.bitrate
+        layout = can_layout(settings, rig)
         block = reg.block_layout(len(rig.channels), len(rig.joints))
-        _check_load(layout, block, at, rig)
+        _check_load(layout, block, settings, rig)
         if port is None:
-            wanted = frozenset(message.key for message in layout.from_bench)
-            port = CanPort(BusPlace.of(at.bus), at.bitrate, at.data_bitrate, wanted)
-        super().__init__(wire, rig, CanLine(port, layout, block, at.bitrate), clock)
+            keys = frozenset(message.key for message in layout.from_bench)
+            port = CanPort(BusPlace.of(settings.bus), settings.bitrate, settings.data_bitrate, keys)
+        super().__init__(wire, rig, CanLine(port, layout, block, settings.bitrate), clock)
 
-    def _place(self) -> str:
+    def _address(self) -> str:
         """Return the bus and its rate."""
         return f"{self._link.where} ({self._bitrate} bit/s)"
 
@@ -200,15 +200,16 @@ def can_layout(settings: CanSettings, rig: Rig) -> CanLayout:
     return layout
 
 
-def _check_load(layout: CanLayout, block: reg.BlockLayout, at: CanSettings, rig: Rig) -> None:
-    seconds = stream_seconds(layout, block, at.bitrate, at.data_bitrate or at.bitrate)
+def _check_load(layout: CanLayout, block: reg.BlockLayout, settings: CanSettings, rig: Rig) -> None:
+    data_bitrate = settings.data_bitrate or settings.bitrate
+    seconds = stream_seconds(layout, block, settings.bitrate, data_bitrate)
     load = seconds * rig.sample_rate / block.samples
     if load > DRIVER.bus_load:
         faster = "" if layout.fd else ", or CAN FD (data_bitrate)"
         fits = DRIVER.bus_load * block.samples / seconds
         raise InputError(
             f"wire: bitrate: {len(rig.recorded)} values at {rig.sample_rate:g} Hz take "
-            f"{100 * load:.0f} % of a bus of {at.bitrate} bit/s at worst, "
+            f"{100 * load:.0f} % of a bus of {settings.bitrate} bit/s at worst, "
             f"{100 * DRIVER.bus_load:.0f} % expected at most: {fits:.0f} Hz fit; "
             f"choose a lower sample_rate, a higher bitrate{faster}"
         )

@@ -62,13 +62,13 @@ class CanOpenValves:
     """`drivers.polled.InputsOutputs` over the nodes of a bus."""
 
     def __init__(self, wire: Wire, rig: Rig, clock: Callable[[], float]) -> None:
-        at = ValveBusSettings.of(wire)
-        self._wire, self._rig, self._at, self._clock = wire, rig, at, clock
-        self._numbers = at.nodes or tuple(range(1, len(rig.joints) + 1))
-        if len(set(self._numbers)) != len(rig.joints) or at.host in self._numbers:
+        settings = ValveBusSettings.of(wire)
+        self._wire, self._rig, self._settings, self._clock = wire, rig, settings, clock
+        self._numbers = settings.nodes or tuple(range(1, len(rig.joints) + 1))
+        if len(set(self._numbers)) != len(rig.joints) or settings.host in self._numbers:
             raise InputError(
                 f"wire: nodes: {list(self._numbers)}; expected {len(rig.joints)} different "
-                f"numbers, none of them the host's {at.host}"
+                f"numbers, none of them the host's {settings.host}"
             )
         try:
             self._canopen = importlib.import_module(PACKAGE)
@@ -78,19 +78,18 @@ class CanOpenValves:
                 "pip install 'bramah[canopen]'"
             ) from error
         self._sdo_errors = self._canopen.SdoAbortedError, self._canopen.SdoCommunicationError
-        self._eds, self._source = _eds(at)
+        self._eds, self._source = _eds(settings)
         self._received = threading.Condition()
         self._awaited_ids: set[int] = set()
         self._network: Any = None
         self._nodes: list[Any] = []
-        self._places = self._find_sensors()
-        wanted = {0x580 + n for n in self._numbers} | self._tpdo_ids
-        wanted |= {cia408.HEARTBEAT_ID + n for n in (*self._numbers, at.host)}
-        self._port = CanPort(
-            BusPlace.of(at.bus), at.bitrate, None, frozenset(wanted), deliver=self._deliver
-        )
-        self._beat = 0.0
-        self._driven = False  # by this host: it has set the valves' supervision
+        self._mappings = self._find_sensors()
+        keys = {0x580 + n for n in self._numbers} | self._tpdo_ids
+        keys |= {cia408.HEARTBEAT_ID + n for n in (*self._numbers, settings.host)}
+        place = BusPlace.of(settings.bus)
+        self._port = CanPort(place, settings.bitrate, None, frozenset(keys), deliver=self._deliver)
+        self._last_heartbeat = 0.0
+        self._in_control = False  # whether the valves supervise this host's heartbeat
         self._other_host = False  # whether another host's heartbeat was heard
         self._states: list[int] = [ValveState.INIT] * len(rig.joints)
 
@@ -108,17 +107,17 @@ class CanOpenValves:
         self._port.open()
         self._make_network()
         self._refuse_other_host()
-        self._driven = True
+        self._in_control = True
         milliseconds = round(1e3 * self._wire.watchdog)
         for node in self._nodes:
-            self._settle(node, milliseconds)
+            self._configure(node, milliseconds)
         self._heartbeat(force=True)
         for number in self._numbers:
             self._network.send_message(0, bytes([1, number]))  # NMT: operational
         self._send(np.zeros(len(self._nodes)), Control.DISABLED)
         self.read()
         self._send(np.zeros(len(self._nodes)), Control.DISABLED | Control.HOLD)
-        return f"{len(self._nodes)} valve(s) of CiA 408 at {self._at.bus}"
+        return f"{len(self._nodes)} valve(s) of CiA 408 at {self._port.where}"
 
     def read(self) -> Array:
         """Return one sample of every channel [SI], (channels,), by SYNC and the nodes' TPDOs."""
@@ -136,12 +135,13 @@ class CanOpenValves:
                 self._received.wait(min(remaining, 0.05))
             missing = sorted({1 + (cob - 1) % 0x80 for cob in self._awaited_ids})
         if missing:
-            # A late answer would be taken as the next one.
+            # A late answer would be mistaken for the next one.
             self._port.close()
             nodes = " ".join(str(number) for number in missing)
             raise DeviceLost(
-                f"node {nodes} at {self._at.bus} did not answer SYNC for {self._wire.timeout:g} s; "
-                f"check wiring, node numbers and that the bus runs at {self._at.bitrate} bit/s"
+                f"node {nodes} at {self._port.where} did not answer SYNC for "
+                f"{self._wire.timeout:g} s; check wiring, node numbers and that the bus runs at "
+                f"{self._settings.bitrate} bit/s"
             )
         self._states = [node.tpdo[cia408.STATUS_WORD].raw & 0xF for node in self._nodes]
         return np.array([self._value(name) for name in self._rig.channels])
@@ -155,16 +155,16 @@ class CanOpenValves:
 
     def close(self) -> None:
         """Disable the valves if the bus works, and stop their supervision of the heartbeat."""
-        if self._port.is_open and self._driven:
+        if self._port.is_open and self._in_control:
             with suppress(DeviceError, *self._sdo_errors):
                 self._send(np.zeros(len(self._nodes)), Control.DISABLED)
                 for node in self._nodes:
                     node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
-        self._driven = False
+        self._in_control = False
         self._port.close()
 
     def zero_beside_host(self) -> None:
-        """Take the valves from a host that drives them: out of operation, and disabled.
+        """Disable the valves and take them out of operation, although another host drives them.
 
         That host then misses their samples and ends. Raises DeviceLost if a valve does not answer.
         """
@@ -175,10 +175,10 @@ class CanOpenValves:
                 self._network.send_message(0, bytes([_PRE_OPERATIONAL, node.id]))
             for node in self._nodes:
                 node.sdo[cia408.CONTROL_WORD].raw = int(Control.DISABLED)
-                # Out of operation it obeys nobody; the end of the other host is no fault.
+                # Out of operation a valve obeys no host, and the end of the other host is no fault.
                 node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
         except self._sdo_errors as error:
-            raise DeviceLost(f"a valve at {self._at.bus} has not confirmed: {error}") from error
+            raise DeviceLost(f"a valve at {self._port.where} has not confirmed: {error}") from error
         finally:
             self._port.close()
 
@@ -210,28 +210,28 @@ class CanOpenValves:
     # -- inside -----------------------------------------------------------------------------
 
     def _find_sensors(self) -> dict[str, tuple[int, int, int]]:
-        """Return (node index, TPDO, index in it) of every channel but the spools."""
+        """Return (node index, TPDO number, index in it) of every channel except the spools."""
         nodes = self._remote_nodes(self._canopen.Network())
         self._tpdo_ids = set()
-        places: dict[str, tuple[int, int, int]] = {}
+        mappings: dict[str, tuple[int, int, int]] = {}
         for index, node in enumerate(nodes):
             for number, pdo in node.tpdo.items():
-                for place, variable in enumerate(pdo):
+                for entry, variable in enumerate(pdo):
                     kind = variable.name.rpartition(".")[2]
                     name = kind if kind in _COMMON else ch.channel(kind, index + 1)
-                    if name in self._rig.channels and name not in places:
-                        places[name] = (index, number, place)
+                    if name in self._rig.channels and name not in mappings:
+                        mappings[name] = (index, number, entry)
                         self._tpdo_ids.add(pdo.cob_id)
-            for wanted in (cia408.STATUS_WORD, cia408.ACTUAL_VALUE):
-                pdo = next((p for p in node.tpdo.values() if _maps(p, wanted)), None)
+            for required in (cia408.STATUS_WORD, cia408.ACTUAL_VALUE):
+                pdo = next((p for p in node.tpdo.values() if _maps(p, required)), None)
                 if pdo is None:
-                    raise InputError(f"{self._source}: no TPDO carries object 0x{wanted:X}")
+                    raise InputError(f"{self._source}: no TPDO carries object 0x{required:X}")
                 self._tpdo_ids.add(pdo.cob_id)
         for name in self._rig.channels:
-            if ch.kind_of(name)[0] != ch.SPOOL and name not in places:
+            if ch.kind_of(name)[0] != ch.SPOOL and name not in mappings:
                 kind = ch.kind_of(name)[0]
                 raise InputError(f"{self._source}: no TPDO carries {kind}, which {name} needs")
-        return places
+        return mappings
 
     def _remote_nodes(self, network: Any) -> list[Any]:
         nodes = []
@@ -266,48 +266,48 @@ class CanOpenValves:
             node.tpdo.subscribe()
 
     def _refuse_other_host(self) -> None:
-        """Raise DeviceBusy where a host is heard whose heartbeat the valves already watch.
+        """Raise DeviceBusy if the heartbeat of another host that the valves supervise is received.
 
-        Two hosts of one number would take turns with the set points, and the end of one would
+        Two hosts of one number would overwrite each other's set points, and the end of one would
         switch the supervision of the other off.
         """
         self._other_host = False
         try:
             watched = [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in self._nodes]
         except self._sdo_errors:
-            return  # `_settle` says what is wrong
+            return  # `_configure` reports the cause
         end = time.monotonic() + self._wire.watchdog
         while any(watched) and time.monotonic() < end:
             if self._other_host:
                 self._port.close()
                 raise DeviceBusy(
-                    f"another host with the number {self._at.host} drives the valves at "
-                    f"{self._at.bus}: its heartbeat is heard; end its run, or stop it"
+                    f"another host with the number {self._settings.host} drives the valves at "
+                    f"{self._port.where}: its heartbeat is heard; end its run, or stop it"
                 )
             time.sleep(DRIVER.can_full)
 
-    def _settle(self, node: Any, milliseconds: int) -> None:
+    def _configure(self, node: Any, milliseconds: int) -> None:
         """Check a node's identity and configure its reaction to a lost host."""
         try:
-            kind = node.sdo[0x1000].raw & 0xFFFF
-            if kind != cia408.DEVICE_TYPE:
+            profile = node.sdo[0x1000].raw & 0xFFFF
+            if profile != cia408.DEVICE_TYPE:
                 raise DeviceError(
-                    f"node {node.id} at {self._at.bus} is of profile {kind}, expected "
+                    f"node {node.id} at {self._port.where} is of profile {profile}, expected "
                     f"{cia408.DEVICE_TYPE}"
                 )
-            node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = self._at.host << 16 | milliseconds
+            node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = self._settings.host << 16 | milliseconds
             node.sdo[cia408.DEVICE_MODE].raw = cia408.BY_BUS
             node.sdo[cia408.CONTROL_MODE].raw = cia408.POSITION_OPEN_LOOP
         except self._canopen.SdoAbortedError as error:
             raise DeviceError(f"node {node.id} refused its configuration: {error}") from error
         except self._canopen.SdoCommunicationError as error:
             raise DeviceLost(
-                f"no valve answers as node {node.id} at {self._at.bus}: check wiring, node numbers "
-                f"and that the bus runs at {self._at.bitrate} bit/s"
+                f"no valve answers as node {node.id} at {self._port.where}: check wiring, node "
+                f"numbers and that the bus runs at {self._settings.bitrate} bit/s"
             ) from error
 
     def _deliver(self, key: int, data: bytes) -> None:
-        if key == cia408.HEARTBEAT_ID + self._at.host:
+        if key == cia408.HEARTBEAT_ID + self._settings.host:
             self._other_host = True
             return
         network = self._network
@@ -322,10 +322,10 @@ class CanOpenValves:
     def _heartbeat(self, *, force: bool = False) -> None:
         # Sent by the thread that serves the outputs, so that a stopped host sends none.
         now = self._clock()
-        if force or now - self._beat > self._wire.watchdog / DRIVER.heartbeats:
+        if force or now - self._last_heartbeat > self._wire.watchdog / DRIVER.heartbeats:
             state = bytes([cia408.OPERATIONAL])
-            self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._at.host, state))
-            self._beat = now
+            self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._settings.host, state))
+            self._last_heartbeat = now
 
     def _send(self, volts: Array, word: int) -> None:
         for node, volt, joint in zip(self._nodes, volts, self._rig.joints, strict=True):
@@ -341,13 +341,13 @@ class CanOpenValves:
         if kind == ch.SPOOL:
             share = self._nodes[(joint or 1) - 1].tpdo[cia408.ACTUAL_VALUE].raw / cia408.FULL_SCALE
             return float(share * max(map(abs, sensor.range)))
-        node, pdo, place = self._places[name]
-        raw = self._nodes[node].tpdo[pdo][place].raw
+        node, pdo, entry = self._mappings[name]
+        raw = self._nodes[node].tpdo[pdo][entry].raw
         return float(decode_input(raw, *sensor.range, sensor.bits))
 
     def _usable(self) -> None:
         if not self._port.is_open:
-            raise DeviceLost(f"the bus {self._at.bus} is closed")
+            raise DeviceLost(f"the bus {self._port.where} is closed")
         if self._port.fault is not None:
             self._port.receive(0.0)
 
@@ -374,19 +374,19 @@ class CanOpen408Driver(PolledDriver):
     def connect(self) -> DeviceInfo:
         """Open the bus, zero the outputs; a fault in a valve stays until `reset`."""
         info = super().connect()
-        self._note()
+        self._latch_fault()
         return info
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; refused while a valve is in a fault."""
-        self._note()
+        self._latch_fault()
         return super().apply(laws, restart=restart)
 
     def trip_cause(self) -> str | None:
-        """Return why outputs were zeroed without a command, None if they were not."""
+        """Return why the outputs were zeroed without a command, None if they were not."""
         cause = super().trip_cause()
-        self._note()
-        return self._cause or cause
+        self._latch_fault()
+        return self._trip_cause or cause
 
     def reset(self) -> None:
         """Clear a latched trip, in the valves as well; only on a person's request."""
@@ -397,11 +397,11 @@ class CanOpen408Driver(PolledDriver):
         self._safely(self._valves.reset)
         super().reset()
 
-    def _note(self) -> None:
+    def _latch_fault(self) -> None:
         fault = self._valves.fault()
-        if fault is not None and self._cause is None:
+        if fault is not None and self._trip_cause is None:
             self._zero_laws()
-            self._cause = fault
+            self._trip_cause = fault
 
 
 def _maps(pdo: Any, index: int) -> bool:

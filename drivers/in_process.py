@@ -43,18 +43,18 @@ from rig.model.wire.codes import decode_input, decode_output
 logger = logging.getLogger(__name__)
 
 BLOCK_SAMPLES = 10
-_SILENCE = np.zeros(1)
+_ZERO_WAVE = np.zeros(1)
 
 
 class Advancing(Protocol):
-    """The interface of the object."""
+    """The interface of an object that advances in this process."""
 
     def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Run `ticks` samples under laws like `ActiveLaw`; return (measured, outputs)."""
 
 
 class InProcessSettings(WireSettings):
-    """The object, as the import path of a callable of the rig."""
+    """The object: the import path of a callable that takes the rig and returns it."""
 
     example: ClassVar = "in-process://package.module:name"
 
@@ -86,29 +86,29 @@ class InProcessDriver:
         self._object: Advancing | None = None
         self._tick = 0
         self._streaming = False
-        self._rest()
+        self._clear()
 
-    def _rest(self) -> None:
+    def _clear(self) -> None:
         joints = len(self._rig.joints)
         self._laws: tuple[OutputLaw, ...] = (OFF,) * joints
-        self._stored: list[Array] = [_SILENCE] * joints
-        self._played: list[Array] = [_SILENCE] * joints
-        self._origin = self._tick
+        self._uploaded: list[Array] = [_ZERO_WAVE] * joints
+        self._played: list[Array] = [_ZERO_WAVE] * joints
+        self._wave_start = self._tick
         self._sequence = 0
 
     def connect(self) -> DeviceInfo:
         """Make the object; raises DeviceError where it cannot be made or cannot advance."""
         make = self._make or self._imported()
         try:
-            made = make(self._rig)
+            device = make(self._rig)
         except Exception as error:
             raise DeviceError(f"the object of the wire in-process failed: {error!r}") from error
-        if not callable(getattr(made, "advance", None)):
-            raise DeviceError(f"{made!r} has no method advance(ticks, laws)")
-        self._object = made
+        if not callable(getattr(device, "advance", None)):
+            raise DeviceError(f"{device!r} has no method advance(ticks, laws)")
+        self._object = device
         self._streaming = False
-        self._rest()
-        name = type(made).__name__
+        self._clear()
+        name = type(device).__name__
         return DeviceInfo.of(self._rig, name, BLOCK_SAMPLES, virtual_time=True)
 
     def _imported(self) -> Callable[[Rig], Advancing]:
@@ -124,7 +124,7 @@ class InProcessDriver:
     def close(self) -> None:
         """Drop laws and object; never raises."""
         self._streaming = False
-        self._rest()
+        self._clear()
         self._object = None
 
     def zero_outputs(self) -> None:
@@ -133,44 +133,44 @@ class InProcessDriver:
 
     def reset(self) -> None:
         """Do nothing: the object does not trip."""
-        self._open()
+        self._require_connected()
 
     def trip_cause(self) -> str | None:
         """Return None: the object does not trip."""
-        self._open()
+        self._require_connected()
         return None
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store a waveform [V]; it acts from `apply` on."""
-        self._open()
-        self._stored[joint] = possible_wave(joint, wave, self._rig)
+        self._require_connected()
+        self._uploaded[joint] = possible_wave(joint, wave, self._rig)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws from the next sample on; returns its tick."""
-        self._open()
+        self._require_connected()
         self._laws = possible_laws(laws, self._rig)
-        self._played = list(self._stored)
+        self._played = list(self._uploaded)
         if restart:
-            self._origin = self._tick
+            self._wave_start = self._tick
         return self._tick
 
     def start(self) -> None:
         """Start a stream at the next sample."""
-        self._open()
-        self._streaming, self._sequence, self._origin = True, 0, self._tick
+        self._require_connected()
+        self._streaming, self._sequence, self._wave_start = True, 0, self._tick
 
     def stop(self) -> None:
         """Stop streaming."""
-        self._open()
+        self._require_connected()
         self._streaming = False
 
     def read_block(self) -> SampleBlock:
         """Advance the object by one block; raises DeviceLost where it fails."""
-        device = self._open()
+        device = self._require_connected()
         if not self._streaming:
             raise DeviceError("the object does not stream (not started)")
         laws = [
-            ActiveLaw(**asdict(law), wave=wave, start=self._origin)
+            ActiveLaw(**asdict(law), wave=wave, start=self._wave_start)
             for law, wave in zip(self._laws, self._played, strict=True)
         ]
         try:
@@ -189,7 +189,7 @@ class InProcessDriver:
         if (measured.shape, outputs.shape) != shapes:
             raise ValueError(f"advance returned {measured.shape} and {outputs.shape}, not {shapes}")
         data = np.empty((BLOCK_SAMPLES, len(rig.recorded)))
-        marks = np.empty(measured.shape, dtype=np.bool_)
+        saturated = np.empty(measured.shape, dtype=np.bool_)
         for column, name in enumerate(rig.channels):
             sensor = rig.sensors.of(ch.kind_of(name)[0])
             values = measured[:, column]
@@ -199,15 +199,15 @@ class InProcessDriver:
                 ends = (0, (1 << sensor.bits) - 1)
             else:
                 data[:, column] = values
-            marks[:, column] = (values <= ends[0]) | (values >= ends[1])
+            saturated[:, column] = (values <= ends[0]) | (values >= ends[1])
         for joint, column in enumerate(range(len(rig.channels), len(rig.recorded))):
             valve, values = rig.joints[joint].valve, outputs[:, joint]
             if np.issubdtype(outputs.dtype, np.integer):
                 values = decode_output(values, valve.command_range, valve.command_bits)
             data[:, column] = values
-        return SampleBlock(self._sequence, self._tick, data, marks, 0, tripped=False)
+        return SampleBlock(self._sequence, self._tick, data, saturated, 0, tripped=False)
 
-    def _open(self) -> Advancing:
+    def _require_connected(self) -> Advancing:
         if self._object is None:
             raise DeviceLost("the wire in-process is not connected")
         return self._object

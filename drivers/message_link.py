@@ -1,4 +1,4 @@
-"""One host's session on a wire of messages: requests with answers, and pushed blocks.
+"""One host's session over a line of messages: requests with answers, and pushed blocks.
 
 A request is repeated with the same number until its answer comes; the device executes it once. An
 answer counts only with the number and the session of the pending request, so that a late answer to
@@ -26,14 +26,14 @@ from rig.model.wire.serial_messages import ANSWER, Message
 
 logger = logging.getLogger(__name__)
 
-_NO_SUCH = "it knows no such request, or not of this size"
+_UNKNOWN_REQUEST = "it knows no such request, or not of this size"
 
 
 class RequestRefused(DeviceRefused):
     """A refusal with the device's reason; `what` names the request and the device."""
 
     def __init__(self, what: str, reason: Refusal) -> None:
-        text = _NO_SUCH if reason == Refusal.NO_SUCH_REGISTER else reg.REFUSAL_TEXT[reason]
+        text = _UNKNOWN_REQUEST if reason == Refusal.NO_SUCH_REGISTER else reg.REFUSAL_TEXT[reason]
         super().__init__(f"{what}: {text}")
         self.what, self.reason = what, reason
 
@@ -59,14 +59,14 @@ class MessageLine(Protocol):
     def send(self, message: WireFrame) -> None:
         """Send a message; raises DeviceLost when the line is lost."""
 
-    def receive(self, patience: float) -> Sequence[WireFrame]:
-        """Return waiting messages, at once if there are any; nothing after about `patience` [s].
+    def receive(self, timeout: float) -> Sequence[WireFrame]:
+        """Return waiting messages, at once if there are any; none after about `timeout` [s].
 
         Damaged ones are left out. Raises DeviceLost when the line is lost.
         """
 
-    def complaint(self, heard: int) -> str:
-        """Return what may explain missing answers after `heard` messages, or ''."""
+    def complaint(self, received: int) -> str:
+        """Return what may explain missing answers after `received` messages, or ''."""
 
     def close(self) -> None:
         """Close the line; never raises."""
@@ -83,7 +83,7 @@ class MessageLink:
         self, line: MessageLine, timeout: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._line = line
-        self._timeout = self._patience = timeout
+        self._timeout = self._answer_timeout = timeout
         self._clock = clock
         self._session = 0
         self._number = 0
@@ -103,22 +103,22 @@ class MessageLink:
         return self._line.is_open
 
     @property
-    def patience(self) -> float:
+    def answer_timeout(self) -> float:
         """Time limit for an answer [s]."""
-        return self._patience
+        return self._answer_timeout
 
     def open(self, *, shared: bool = False) -> None:
         """Open the line for a new session; raises as `MessageLine.open`."""
         self._line.open(shared=shared)
         self._received = 0
         self._session = secrets.randbits(32)
-        self._patience = self._timeout
+        self._answer_timeout = self._timeout
         self._answers.clear()
         self.blocks.clear()
 
-    def be_patient(self, factor: float) -> None:
+    def extend_timeout(self, factor: float) -> None:
         """Multiply the time limit of answers by `factor` until the line is reopened."""
-        self._patience = factor * self._timeout
+        self._answer_timeout = factor * self._timeout
 
     def close(self) -> None:
         """Close the line if it is open; never raises."""
@@ -128,22 +128,22 @@ class MessageLink:
         """Return the number that the next request will have."""
         return (self._number + 1) & 0xFFFF
 
-    def request(self, kind: Message, payload: bytes = b"", size: int = 0, about: str = "") -> bytes:
+    def request(self, kind: Message, payload: bytes = b"", size: int = 0, label: str = "") -> bytes:
         """Return the answer's payload, `size` bytes.
 
         Raises DeviceSilent without an answer in time, DeviceRefused with the device's reason,
-        DeviceError for an answer of another size or version, DeviceLost when the line has gone.
+        DeviceError for an answer of another size or version, DeviceLost when the line is lost.
         """
         self._number = self.next_number()
         self._answers.clear()
         message = WireFrame(kind, self._number, self._session, payload)
-        end = self._clock() + self._patience
+        end = self._clock() + self._answer_timeout
         while (now := self._clock()) < end:
             self._line.send(message)
-            answer = self._awaited(min(end, now + self._timeout / DRIVER.tries))
+            answer = self._wait_for_answer(min(end, now + self._timeout / DRIVER.tries))
             if answer is not None:
-                return self._checked(answer, kind, size, about)
-        raise DeviceSilent(self._silence())
+                return self._payload_of(answer, kind, size, label)
+        raise DeviceSilent(self._silence_text())
 
     def send_unanswered(self, kind: Message) -> None:
         """Send a request once without waiting; raises DeviceLost when the line is lost."""
@@ -154,12 +154,12 @@ class MessageLink:
         """Send a message without answer; raises DeviceLost when the line is lost."""
         self._line.send(WireFrame(kind, number, self._session, payload))
 
-    def listen(self, patience: float) -> None:
-        """Receive what is waiting, or arrives within `patience` [s]; raises DeviceLost."""
-        for frame in self._line.receive(patience):
-            self._sort(frame)
+    def listen(self, timeout: float) -> None:
+        """Receive what is waiting, or arrives within `timeout` [s]; raises DeviceLost."""
+        for frame in self._line.receive(timeout):
+            self._dispatch(frame)
 
-    def _awaited(self, end: float) -> WireFrame | None:
+    def _wait_for_answer(self, end: float) -> WireFrame | None:
         while self._number not in self._answers:
             remaining = end - self._clock()
             if remaining <= 0.0:
@@ -167,7 +167,7 @@ class MessageLink:
             self.listen(remaining)
         return self._answers.pop(self._number)
 
-    def _sort(self, frame: WireFrame) -> None:
+    def _dispatch(self, frame: WireFrame) -> None:
         self._received += 1
         if frame.session != self._session:
             self.late += 1
@@ -179,8 +179,8 @@ class MessageLink:
             self.late += 1
             logger.debug("late answer to request %d dropped", frame.number)
 
-    def _checked(self, answer: WireFrame, kind: Message, size: int, about: str) -> bytes:
-        about = about or kind.name.lower()
+    def _payload_of(self, answer: WireFrame, kind: Message, size: int, label: str) -> bytes:
+        label = label or kind.name.lower()
         if answer.version != FRAME_VERSION:
             raise DeviceError(
                 f"the device at {self.where} speaks version {answer.version} of the "
@@ -188,22 +188,22 @@ class MessageLink:
                 "the two"
             )
         if answer.type == Message.REFUSED:
-            raise self._refused(answer.payload, about)
+            raise self._refused(answer.payload, label)
         if answer.type != kind | ANSWER or len(answer.payload) != size:
             raise DeviceError(
-                f"the device at {self.where} answered {about} with a message of type "
+                f"the device at {self.where} answered {label} with a message of type "
                 f"0x{answer.type:02X} and {len(answer.payload)} bytes; type "
                 f"0x{kind | ANSWER:02X} and {size} bytes expected"
             )
         return answer.payload
 
-    def _refused(self, payload: bytes, about: str) -> DeviceError:
+    def _refused(self, payload: bytes, label: str) -> DeviceError:
         try:
             refusal = msg.unpack_refusal(payload)
         except struct.error:
-            return DeviceError(f"the device at {self.where} refused {about} without a reason")
+            return DeviceError(f"the device at {self.where} refused {label} without a reason")
         at = f" (joint {refusal.joint})" if refusal.joint else ""
-        what = f"device at {self.where} refused {about}{at}"
+        what = f"device at {self.where} refused {label}{at}"
         if refusal.reason not in Refusal.__members__.values():
             return DeviceRefused(f"{what}: reason {refusal.reason}")
         if refusal.reason == Refusal.NOT_IN_CONTROL:
@@ -214,7 +214,7 @@ class MessageLink:
         """Return what may explain missing messages, or ''."""
         return self._line.complaint(self._received)
 
-    def _silence(self) -> str:
-        text = f"the device at {self.where} has not answered for {self._patience:g} s"
+    def _silence_text(self) -> str:
+        text = f"the device at {self.where} has not answered for {self._answer_timeout:g} s"
         complaint = self.complaint()
         return f"{text}; {complaint}" if complaint else text

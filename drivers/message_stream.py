@@ -1,4 +1,4 @@
-"""The driver of a bench with messages, on any line."""
+"""The driver of a bench that exchanges messages, over any line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from drivers.base import (
     check_count,
 )
 from drivers.bench_protocol import (
-    VIRTUAL_PATIENCE,
+    VIRTUAL_TIMEOUT_FACTOR,
     DeviceRefused,
     DeviceSilent,
     check_identity,
@@ -53,7 +53,7 @@ _IDENTITY_BYTES = 2 * (reg.IDENTITY_SPAN[1] - reg.IDENTITY_SPAN[0])
 class MessageStreamDriver:
     """`drivers.base.Driver` over a `MessageLine`; see there for each call.
 
-    The class of a kind of wire makes its line and names its settings.
+    A subclass for each kind of wire makes the line and names its settings.
     """
 
     settings: ClassVar[type[WireSettings]] = WireSettings
@@ -77,7 +77,7 @@ class MessageStreamDriver:
         self._stream: int | None = None  # number of the request that started it
         self._expected = 0  # number of the next block, modulo 2^16
         self._ready: deque[msg.PushedBlock] = deque()
-        self._asked_for: int | None = None  # the block before which a gap was reported
+        self._gap_reported_at: int | None = None  # the block already requested again after a gap
         self.info: DeviceInfo | None = None
 
     # -- session ----------------------------------------------------------------------------
@@ -89,7 +89,7 @@ class MessageStreamDriver:
         try:
             self.info = self._identify()
             if self.info.virtual_time:
-                self._link.be_patient(VIRTUAL_PATIENCE)
+                self._link.extend_timeout(VIRTUAL_TIMEOUT_FACTOR)
             # This also zeroes the outputs and stops a stream.
             self._command(Message.OPEN, struct.pack(">H", round(self._wire.watchdog * 1e3)))
             self._decoder.restart(number_in(self._status(), reg.STATUS_TICK))
@@ -139,11 +139,11 @@ class MessageStreamDriver:
                 return
         with suppress(DeviceBusy):
             self._link.open()
-            self._zero_once()
+            self._zero_or_close()
             return
         # Another program has the line; messages of both arrive complete, and any host may zero.
         self._link.open(shared=True)
-        self._zero_once()
+        self._zero_or_close()
         self._link.close()
 
     def reset(self) -> None:
@@ -159,15 +159,15 @@ class MessageStreamDriver:
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
         codes = wave_codes(self._rig, joint, wave, self._capacity)
-        about = f"waveform of joint {joint + 1}"
+        label = f"waveform of joint {joint + 1}"
         begin = msg.pack_upload_begin(joint + 1, len(codes))
-        self._command(Message.UPLOAD_BEGIN, begin, about=about)
+        self._command(Message.UPLOAD_BEGIN, begin, label=label)
         samples = codes.astype(">i2").tobytes()
         for first in range(0, len(codes), msg.PAGE_SAMPLES):
             page = samples[2 * first : 2 * (first + msg.PAGE_SAMPLES)]
-            self._command(Message.UPLOAD_PAGE, msg.pack_u32(first) + page, about=about)
+            self._command(Message.UPLOAD_PAGE, msg.pack_u32(first) + page, label=label)
         end = msg.pack_u32(reg.wave_checksum(codes))
-        self._command(Message.UPLOAD_END, end, about=about)
+        self._command(Message.UPLOAD_END, end, label=label)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
@@ -185,7 +185,7 @@ class MessageStreamDriver:
         """Start streaming blocks, with new sequence numbers and waveform phase."""
         self._decoder.restart()
         self._ready.clear()
-        self._expected, self._asked_for = 0, None
+        self._expected, self._gap_reported_at = 0, None
         # The first block may come before the answer, if that is lost once.
         self._stream = self._link.next_number()
         self._command(Message.START)
@@ -198,36 +198,36 @@ class MessageStreamDriver:
     def read_block(self) -> SampleBlock:
         """Return the next block, waiting for it; also feeds the device's watchdog."""
         if self._stream is None:
-            self._why_no_block(overdue=True)
-        self._alive()
+            self._check_stream(overdue=True)
+        self._send_heartbeat()
         period = self._layout.samples / self._rig.sample_rate
         pause = period + min(DRIVER.resend, self._wire.watchdog / 5)
-        deadline = self._clock() + period + self._link.patience
-        known = ""  # the line's errors before the wait
-        for asked in count(1):
+        deadline = self._clock() + period + self._link.answer_timeout
+        earlier = ""  # the line's errors before the wait
+        for waits in count(1):
             due = min(self._clock() + pause, deadline)
             while not self._ready and (remaining := due - self._clock()) > 0.0:
                 self._link.listen(remaining)
-                self._accept()
+                self._queue_blocks()
             if self._ready:
                 break
-            if asked == 1:
-                known = self._link.complaint()
-            # The note or the block was lost; the watchdog needs another note in any case.
-            self._alive(resend=True)
-            if asked % DRIVER.notes_before_status == 0:
-                self._why_no_block(overdue=self._clock() >= deadline, known=known)
+            if waits == 1:
+                earlier = self._link.complaint()
+            # The heartbeat or the block was lost; the watchdog needs a heartbeat in any case.
+            self._send_heartbeat(resend=True)
+            if waits % DRIVER.notes_before_status == 0:
+                self._check_stream(overdue=self._clock() >= deadline, earlier=earlier)
         block = self._ready.popleft()
         return self._decoder.decode_samples(block.header, block.samples)
 
     # -- inside -----------------------------------------------------------------------------
 
-    def _place(self) -> str:
-        """Return the device's place for messages of a first contact."""
+    def _address(self) -> str:
+        """Return the line's name and rate, for errors before the device's identity is known."""
         return self._link.where
 
     def _identify(self) -> DeviceInfo:
-        where = self._place()
+        where = self._address()
         try:
             data = self._link.request(Message.IDENTIFY, size=_IDENTITY_BYTES)
         except DeviceRefused as refused:
@@ -241,7 +241,7 @@ class MessageStreamDriver:
         self._capacity = number_in(data, reg.IDENTITY_CAPACITY, reg.IDENTITY_SPAN[0])
         return info
 
-    def _zero_once(self) -> None:
+    def _zero_or_close(self) -> None:
         try:
             self._link.request(Message.ZERO)
         except DeviceError:
@@ -252,25 +252,25 @@ class MessageStreamDriver:
         return self._link.request(Message.STATUS, size=_STATUS_BYTES)
 
     def _command(
-        self, kind: Message, payload: bytes = b"", size: int = 0, about: str = ""
+        self, kind: Message, payload: bytes = b"", size: int = 0, label: str = ""
     ) -> bytes:
         try:
-            return self._link.request(kind, payload, size, about)
+            return self._link.request(kind, payload, size, label)
         except RequestRefused as refused:
             if refused.reason != Refusal.TRIPPED:
                 raise
             text = refusal_text(refused.reason, self.trip_cause())
             raise DeviceRefused(f"{refused.what}: {text}") from refused
 
-    def _alive(self, *, resend: bool = False) -> None:
+    def _send_heartbeat(self, *, resend: bool = False) -> None:
         if self._stream is None:  # no block is expected between two streams
             return
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF
         alive = msg.Alive((self._expected - 1) & 0xFFFF, self._heartbeat, resend)
         self._link.note(Message.ALIVE_NOTE, self._stream, msg.pack_alive(alive))
 
-    def _accept(self) -> None:
-        """Move received blocks that are in order to the ready ones."""
+    def _queue_blocks(self) -> None:
+        """Move received blocks that are in order to the ready ones; request missing ones again."""
         while self._link.blocks:
             frame = self._link.blocks.popleft()
             if frame.number != self._stream:
@@ -282,22 +282,25 @@ class MessageStreamDriver:
                 self._link.close()
                 raise DeviceError(f"the device at {self._link.where} sent a {error}") from error
             ahead = (block.header.sequence - self._expected) & 0xFFFF
-            gone = (block.oldest - self._expected) & 0xFFFF
-            if 0 < ahead == gone <= 0x7FFF:
-                ahead = 0  # blocks between are lost in the device; the decoder counts them
+            oldest_ahead = (block.oldest - self._expected) & 0xFFFF
+            if 0 < ahead == oldest_ahead <= 0x7FFF:
+                ahead = 0  # the device has dropped those between; the decoder counts them
             if ahead == 0:
                 self._ready.append(block)
                 self._expected = (block.header.sequence + 1) & 0xFFFF
-                self._asked_for = None
-            elif ahead <= 0x7FFF and self._asked_for != self._expected:
+                self._gap_reported_at = None
+            elif ahead <= 0x7FFF and self._gap_reported_at != self._expected:
                 logger.warning(
                     "block %d from %s is missing; asking again", self._expected, self._link.where
                 )
-                self._asked_for = self._expected
-                self._alive(resend=True)
+                self._gap_reported_at = self._expected
+                self._send_heartbeat(resend=True)
 
-    def _why_no_block(self, *, overdue: bool, known: str = "") -> None:
-        """Raise the reason of missing blocks, if it is permanent; `known` was there before."""
+    def _check_stream(self, *, overdue: bool, earlier: str = "") -> None:
+        """Raise DeviceError or DeviceLost if no block will come, naming the cause.
+
+        `earlier` is the line's complaint from before the wait.
+        """
         where = self._link.where
         try:
             status = self._status()
@@ -312,11 +315,11 @@ class MessageStreamDriver:
             raise DeviceError(f"the device at {where} does not stream ({cause or 'not started'})")
         if number_in(status, reg.STATUS_CAUSE) == TripCause.FAULT:
             raise DeviceError(f"the device at {where} measures nothing any more: {cause}")
-        self._accept()
+        self._queue_blocks()
         if overdue and not self._ready:
             complaint = self._link.complaint()
-            damaged = complaint and complaint != known
+            damaged = complaint and complaint != earlier
             what = f"no block came whole; {complaint}" if damaged else "it has measured nothing"
             raise DeviceLost(
-                f"the device at {where} answers, but for {self._link.patience:g} s {what}"
+                f"the device at {where} answers, but for {self._link.answer_timeout:g} s {what}"
             )

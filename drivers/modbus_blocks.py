@@ -1,4 +1,4 @@
-"""Decoding of a block's bytes to SI samples, with checks against the previous block."""
+"""Decode a block's bytes to SI samples, with checks against the previous block."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def unwrap(raw: int, near: int, bits: int) -> int:
 
 
 class BlockDecoder:
-    """Decodes the blocks of one stream in order; knows the expected next numbers."""
+    """Decodes the blocks of one stream in order, and knows the next number and tick expected."""
 
     def __init__(self, rig: Rig) -> None:
         self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
@@ -47,9 +47,9 @@ class BlockDecoder:
         volt = np.array([j.valve.command_range for j in rig.joints]) / most
         # An output's code counts from -most; with `most` added all codes count from 0. One below
         # -most becomes one of the largest, so that a single comparison finds every impossible code.
-        self._shift = self._rows([np.zeros(len(top)), most], np.uint16)
-        self._span = self._rows([top, 2 * most], np.uint16)
-        self._one = np.ones(self._shape, np.uint16)
+        self._code_offset = self._rows([np.zeros(len(top)), most], np.uint16)
+        self._code_span = self._rows([top, 2 * most], np.uint16)
+        self._ones = np.ones(self._shape, np.uint16)
         self._almost_top = self._rows([top - 1, 2 * most], np.uint16)
         self._scale = self._rows([step, volt], np.float64)
         self._offset = self._rows([low, -(most * volt)], np.float64)
@@ -71,13 +71,13 @@ class BlockDecoder:
         if tick is not None:
             self.tick = tick
 
-    def seen(self, header: BlockHeader) -> bool:
+    def was_decoded(self, header: BlockHeader) -> bool:
         """Return whether a block was decoded recently: a late copy of an answer."""
         behind = (self.acknowledge - header.sequence) & 0xFFFF
         return self._sequence is not None and behind <= min(self._sequence, DRIVER.late_blocks)
 
     def refuse_restarted(self, tick: int) -> None:
-        """Raise DeviceLost if a device counts `tick` (modulo 2^32) after higher ones."""
+        """Raise DeviceLost if a device that has counted further is at `tick` (modulo 2^32)."""
         now = unwrap(tick, self.tick, 32)
         if now < self.tick:
             raise DeviceLost(
@@ -90,13 +90,13 @@ class BlockDecoder:
         return self.decode_samples(header, answer[2 * reg.HEADER_WORDS :])
 
     def decode_samples(self, header: BlockHeader, samples: bytes) -> SampleBlock:
-        """Return the block in SI; raises DeviceError if it cannot follow the last one."""
-        sequence, tick = self._follow(header)
+        """Return the block in SI; raises DeviceError if it cannot follow the previous one."""
+        sequence, tick = self._unwrapped(header)
         codes = np.frombuffer(samples, ">u2").reshape(self._shape).astype(np.uint16)
-        codes += self._shift
-        ends = codes - self._one >= self._almost_top  # 0 wraps to the top
-        if np.count_nonzero(ends):  # values beyond an end count as at the end
-            impossible = codes > self._span
+        codes += self._code_offset
+        at_end = codes - self._ones >= self._almost_top  # 0 wraps to the top
+        if np.count_nonzero(at_end):  # values beyond an end count as at the end
+            impossible = codes > self._code_span
             if np.count_nonzero(impossible):
                 raise self._impossible(impossible, codes)
         data = codes.astype(np.float64)
@@ -109,13 +109,13 @@ class BlockDecoder:
             sequence=sequence,
             tick=tick,
             data=data,
-            saturated=ends[:, : self.layout.channels],
+            saturated=at_end[:, : self.layout.channels],
             backlog=header.backlog,
             tripped=status & _TRIPPED != 0,
             armed=status & _ARMED != 0,
         )
 
-    def _follow(self, header: BlockHeader) -> tuple[int, int]:
+    def _unwrapped(self, header: BlockHeader) -> tuple[int, int]:
         """Return unwrapped (sequence, tick) if the numbers can be those of the next block."""
         in_order = header.sequence == (self.acknowledge + 1) & 0xFFFF
         if in_order and self._sequence is not None and header.tick == self.tick & 0xFFFFFFFF:
@@ -134,10 +134,10 @@ class BlockDecoder:
             logger.warning("the device dropped %d blocks before sample %d", lost, tick)
         return last + 1 + lost, tick
 
-    def _impossible(self, marks: Flags, codes: Codes) -> DeviceError:
-        """Return the error of the first code that is marked."""
-        row, column = np.argwhere(marks)[0]
-        code = codes[row, column] - self._shift[row, column]
+    def _impossible(self, selected: Flags, codes: Codes) -> DeviceError:
+        """Return the error of the first selected code."""
+        row, column = np.argwhere(selected)[0]
+        code = codes[row, column] - self._code_offset[row, column]
         signed = code if column < self.layout.channels else code.view(np.int16)
         return DeviceError(
             f"impossible block: channel {self._names[column]} has the converter code {signed}, "

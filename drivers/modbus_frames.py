@@ -1,4 +1,4 @@
-"""Modbus as bytes: requests, and frames of TCP and serial lines.
+"""Encode Modbus requests, and frames of TCP and serial lines; decode answers.
 
 Glossary: a *PDU* is a function code and its data, a *frame* a PDU with its wire's header and
 checksum. Sources: MODBUS Application Protocol V1.1b3, Messaging on TCP/IP V1.0b, MODBUS over Serial

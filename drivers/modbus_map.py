@@ -1,4 +1,4 @@
-"""The driver of any I/O module or PLC on Modbus TCP, by a register map in the rig file.
+"""The driver of an I/O module or PLC on Modbus TCP, by a register map in the rig file.
 
 Format: docs/wire-modbus-map.md. The device has no sample clock: `drivers.polled` reads and writes
 it at the host's rate. Answers have the transaction number of their request, and one with another
@@ -52,8 +52,8 @@ MAX_READ: Final = 125  # registers in one answer: the protocol's own limit
 MAX_WRITE: Final = 123
 _LAST_REGISTER: Final = 0xFFFF
 _NO_WATCHDOG: Final = "none"
-_KEY: Final = "word_order"
-_OTHER: Final = {WordOrder.BIG: WordOrder.LITTLE, WordOrder.LITTLE: WordOrder.BIG}
+_WORD_ORDER: Final = "word_order"
+_OTHER_ORDER: Final = {WordOrder.BIG: WordOrder.LITTLE, WordOrder.LITTLE: WordOrder.BIG}
 
 
 class MapSettings(WireSettings):
@@ -75,7 +75,7 @@ class MapSettings(WireSettings):
         raise ValueError(f"no register map in {url.geturl()}")
 
 
-class _Number(Part):
+class _NumberEntry(Part):
     address: int = Field(ge=0, le=_LAST_REGISTER)
     type: RegisterType
     word_order: WordOrder = WordOrder.BIG
@@ -83,13 +83,13 @@ class _Number(Part):
     offset: str | float | None = None
 
 
-class InputEntry(_Number):
+class InputEntry(_NumberEntry):
     """One channel: value = offset + scale * number in its registers."""
 
     function: Literal[3, 4]
 
 
-class OutputEntry(_Number):
+class OutputEntry(_NumberEntry):
     """One joint's valve: the number is (voltage - offset) / scale."""
 
 
@@ -102,7 +102,7 @@ class ZeroByEntry(Part):
 
 @dataclass(frozen=True)
 class Point:
-    """One number of the map: its registers, its form, and value = offset + scale * number."""
+    """One number of the map: its registers, its type, and value = offset + scale * number."""
 
     name: str
     function: int
@@ -173,9 +173,9 @@ def register_map(settings: MapSettings, rig: Rig) -> RegisterMap:
     _refuse_overlap("outputs", outputs)
     for point in inputs:
         if (numbers := integers(point.form)) is not None:
-            least, most = (point.offset + point.scale * number for number in numbers)
+            low, high = (point.offset + point.scale * number for number in numbers)
             step = abs(point.scale)
-            refuse_short_reach(rig, point.name, (least, most), rig.range_of(point.name), step)
+            refuse_short_reach(rig, point.name, (low, high), rig.range_of(point.name), step)
     for point, joint in zip(outputs, rig.joints, strict=True):
         _refuse_narrow(point, joint.valve.command_range)
     if settings.zero_by == _NO_WATCHDOG:
@@ -190,7 +190,7 @@ def register_map(settings: MapSettings, rig: Rig) -> RegisterMap:
     return RegisterMap(inputs, outputs, watchdog)
 
 
-def _point(key: str, name: str, entry: _Number, function: int, unit: str) -> Point:
+def _point(key: str, name: str, entry: _NumberEntry, function: int, unit: str) -> Point:
     point = Point(
         name,
         function,
@@ -258,9 +258,9 @@ def spans(points: Iterable[Point], most: int = MAX_READ) -> tuple[Span, ...]:
 class UnitConnection(TcpConnection):
     """A connection to one unit of an address, closed at the first unanswered request."""
 
-    def _end(self, number: int, within: float | None) -> bytes:
+    def _finish_request(self, number: int, limit: float | None) -> bytes:
         try:
-            return super()._end(number, within)
+            return super()._finish_request(number, limit)
         except DeviceLost:
             self.close()  # late answers are then ignored
             raise
@@ -276,11 +276,11 @@ class MappedModule:
         ranges: Sequence[tuple[float, float]],
         timeout: float,
     ) -> None:
-        """Store a map and the range [SI] of every channel's sensor; open nothing."""
+        """Store a map and the range [SI] of every channel's sensor; open no connection."""
         self._link = UnitConnection(settings.host, settings.port, timeout, settings.unit)
         self._unit = settings.unit
         self._ranges = ranges
-        self._who = f"I/O module at {settings.host}:{settings.port}, unit {settings.unit}"
+        self._identity = f"I/O module at {settings.host}:{settings.port}, unit {settings.unit}"
         self._map = registers
         self._reads = spans(registers.inputs)
         self._writes = spans(registers.outputs, MAX_WRITE)
@@ -299,7 +299,7 @@ class MappedModule:
         except DeviceError:
             self._link.close()
             raise
-        return self._who
+        return self._identity
 
     def read(self) -> Array:
         """Return one value [SI] of every channel, (channels,), in the order of the rig."""
@@ -312,18 +312,18 @@ class MappedModule:
         """Read once; return the channels that would be plausible with another word order."""
         reasons = {}
         for index, point, data in self._registers():
-            other = replace(point, order=_OTHER[point.order])
+            other = replace(point, order=_OTHER_ORDER[point.order])
             low, high = self._ranges[index]
             if not _plausible(point, data, low, high) and _plausible(other, data, low, high):
                 reasons[point.name] = (
-                    f"word order? {other.value(data):.5g} with {_KEY}: {other.order}"
+                    f"word order? {other.value(data):.5g} with {_WORD_ORDER}: {other.order}"
                 )
         return reasons
 
     def _registers(self) -> Iterator[tuple[int, Point, bytes]]:
         """Yield (index among the inputs, point, its registers' bytes)."""
         for span in self._reads:
-            with self._explained(str(span)):
+            with self._naming_registers(str(span)):
                 data = self._link.read(span.address, span.words, span.function)
             for index, point in span.points:
                 first = 2 * (point.address - span.address)
@@ -335,7 +335,7 @@ class MappedModule:
             words: list[int] = []
             for index, point in span.points:
                 words += point.registers(float(volts[index]))
-            with self._explained(str(span)):
+            with self._naming_registers(str(span)):
                 self._link.write(span.address, words)
 
     def close(self) -> None:
@@ -343,7 +343,7 @@ class MappedModule:
         self._link.close()
 
     @contextmanager
-    def _explained(self, registers: str) -> Iterator[None]:
+    def _naming_registers(self, registers: str) -> Iterator[None]:
         try:
             yield
         except DeviceRefused as refused:
@@ -357,13 +357,13 @@ class MappedModule:
         if entry is None:
             return
         where = f"register {entry.watchdog_register} (zero_by.watchdog_register)"
-        with self._explained(where):
+        with self._naming_registers(where):
             self._link.write(entry.watchdog_register, [entry.milliseconds])
             data = self._link.read(entry.watchdog_register, 1)
         stored = int.from_bytes(data, "big")
         if stored != entry.milliseconds:
             raise DeviceError(
-                f"{where} of the {self._who} holds {stored} after {entry.milliseconds} was "
+                f"{where} of the {self._identity} holds {stored} after {entry.milliseconds} was "
                 "written; it is no watchdog time in milliseconds"
             )
 

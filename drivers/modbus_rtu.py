@@ -48,10 +48,10 @@ class RtuConnection(ModbusConnection):
 
     pipelines = False  # an answer without a number could be to any request
 
-    def __init__(self, at: RtuSettings, timeout: float) -> None:
-        super().__init__(at.device, UNIT, timeout)
-        self._at = at
-        self._port = PySerialTransport(at.device, at.baud, at.parity)
+    def __init__(self, settings: RtuSettings, timeout: float) -> None:
+        super().__init__(settings.device, UNIT, timeout)
+        self._settings = settings
+        self._port = PySerialTransport(settings.device, settings.baud, settings.parity)
 
     @property
     def is_open(self) -> bool:
@@ -69,10 +69,10 @@ class RtuConnection(ModbusConnection):
         self._port.write(rtu_frame(self._unit, request))
         return 0
 
-    def _receive(self, number: int, patience: float) -> bytes:
-        until, received = time.monotonic() + patience, b""
-        while (left := until - time.monotonic()) > 0.0:
-            received += self._port.read(left)
+    def _receive(self, number: int, timeout: float) -> bytes:
+        until, received = time.monotonic() + timeout, b""
+        while (remaining := until - time.monotonic()) > 0.0:
+            received += self._port.read(remaining)
             if (answer := read_rtu_answer(received, self._unit)) is not None:
                 return answer
         raise self._no_answer(len(received)) if received else self._silent()
@@ -81,7 +81,7 @@ class RtuConnection(ModbusConnection):
         self.settle()
         return AnswerDamaged(
             f"no valid frame in {received} bytes from {self.where}: check `baud` "
-            f"({self._at.baud}), `parity` ({self._at.parity}) and the cable"
+            f"({self._settings.baud}), `parity` ({self._settings.parity}) and the cable"
         )
 
     def _mismatch(self, text: str) -> DeviceError:
@@ -90,8 +90,8 @@ class RtuConnection(ModbusConnection):
 
     def _never_answered(self) -> str:
         return (
-            f"not a byte came: check the cable, `device`, `baud` ({self._at.baud}) and that the "
-            "device is on"
+            f"not a byte came: check the cable, `device`, `baud` ({self._settings.baud}) and that "
+            "the device is on"
         )
 
     def settle(self) -> None:
@@ -99,9 +99,9 @@ class RtuConnection(ModbusConnection):
 
         Raises DeviceLost where the line is lost or does not become quiet.
         """
-        began = time.monotonic()
+        start = time.monotonic()
         while self._port.read(DRIVER.quiet):
-            if time.monotonic() - began > DRIVER.babble:
+            if time.monotonic() - start > DRIVER.babble:
                 self.close()
                 raise DeviceLost(f"{self.where} sends without end; does another host talk on it?")
 

@@ -27,7 +27,7 @@ from drivers.base import (
     check_count,
 )
 from drivers.bench_protocol import (
-    VIRTUAL_PATIENCE,
+    VIRTUAL_TIMEOUT_FACTOR,
     AnswerDamaged,
     DeviceRefused,
     DeviceSilent,
@@ -81,7 +81,7 @@ class ModbusTcpDriver:
         self._wire = wire
         self._rig = rig
         self._sleep = sleep
-        # Two tries within the time after which a silent device counts as lost.
+        # Two tries before a silent device counts as lost.
         self._link = self.connection(wire, wire.timeout / 2)
         # A block is requested again early enough that a lost answer trips neither watchdog.
         self._wait = min(wire.timeout / 2, wire.watchdog / 4)
@@ -100,8 +100,8 @@ class ModbusTcpDriver:
     @staticmethod
     def connection(wire: Wire, timeout: float) -> ModbusConnection:
         """Return the closed connection to the device, which waits `timeout` [s] for an answer."""
-        at = TcpSettings.of(wire)
-        return TcpConnection(at.host, at.port, timeout)
+        settings = TcpSettings.of(wire)
+        return TcpConnection(settings.host, settings.port, timeout)
 
     # -- session ----------------------------------------------------------------------------
 
@@ -111,7 +111,7 @@ class ModbusTcpDriver:
         try:
             self.info = self._identify()
             if self.info.virtual_time:
-                self._link.be_patient(VIRTUAL_PATIENCE)
+                self._link.extend_timeout(VIRTUAL_TIMEOUT_FACTOR)
             self._command(reg.CONTROL_WATCHDOG, round(self._wire.watchdog * 1e3))
             self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
             self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
@@ -136,7 +136,7 @@ class ModbusTcpDriver:
             self._link.close()
 
     def _command_before_closing(self, register: reg.Register, value: int) -> bool:
-        """Write one command, again after a late or damaged answer; return whether it succeeded."""
+        """Write one command, twice if the first answer is late or damaged; return its success."""
         for _ in range(2):
             if not self._link.is_open:
                 return False
@@ -177,13 +177,13 @@ class ModbusTcpDriver:
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
         codes = wave_codes(self._rig, joint, wave)
-        about = f"waveform of joint {joint + 1}"
+        label = f"waveform of joint {joint + 1}"
         words = codes.view(np.uint16).tolist()
-        self._control(reg.UPLOAD_JOINT.address, [joint + 1, *_u32(len(words))], about)
+        self._control(reg.UPLOAD_JOINT.address, [joint + 1, *_u32(len(words))], label)
         for first in range(0, len(words), reg.PAGE_SAMPLES):
             page = words[first : first + reg.PAGE_SAMPLES]
-            self._control(reg.UPLOAD_OFFSET.address, [*_u32(first), *page], about)
-        self._control(reg.UPLOAD_COMMIT.address, _u32(reg.wave_checksum(codes)), about)
+            self._control(reg.UPLOAD_OFFSET.address, [*_u32(first), *page], label)
+        self._control(reg.UPLOAD_COMMIT.address, _u32(reg.wave_checksum(codes)), label)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
@@ -198,7 +198,7 @@ class ModbusTcpDriver:
                 reg.CONTROL_APPLY.address, [flag], reg.STATUS_APPLY_TICK.address, 2
             )
         except DeviceRefused as refused:
-            raise self._explained(refused, "apply") from refused
+            raise self._with_reason(refused, "apply") from refused
         tick = int.from_bytes(answer, "big")
         self._decoder.refuse_restarted(tick)
         return unwrap(tick, self._decoder.tick, 32)
@@ -229,9 +229,9 @@ class ModbusTcpDriver:
         deadline = now + period + self._wire.timeout
         at_once = True
         while True:
-            answer = self._exchange()
+            answer = self._request_block()
             header = reg.unpack_header(answer)
-            if header.status & _BLOCK and self._decoder.seen(header):
+            if header.status & _BLOCK and self._decoder.was_decoded(header):
                 # The device does not repeat an acknowledged block: a late answer.
                 logger.warning("block %d came a second time; asking again", header.sequence)
                 self._link.settle()
@@ -270,11 +270,11 @@ class ModbusTcpDriver:
             return time.monotonic() + DRIVER.retry * period
         return self._due + (1.0 - DRIVER.earlier) * period
 
-    def _exchange(self) -> bytes:
-        last: DeviceSilent | None = None
-        for number in range(self._tries):
+    def _request_block(self) -> bytes:
+        last_error: DeviceSilent | None = None
+        for attempt in range(self._tries):
             try:
-                if number:
+                if attempt:
                     self._link.settle()
                 if self._link.asked_ahead:
                     answer = self._link.answer_ahead(self._wait)
@@ -282,19 +282,19 @@ class ModbusTcpDriver:
                     request = self._next_request()
                     answer = self._link.registers(request, self._layout.words, self._wait)
             except DeviceRefused as refused:
-                raise self._explained(refused, "block") from refused
+                raise self._with_reason(refused, "block") from refused
             except DeviceSilent as silent:
                 # The block stays in the device until acknowledged, so that it is sent again.
-                last = silent
-                if number < self._tries - 1:
+                last_error = silent
+                if attempt < self._tries - 1:
                     logger.warning("%s; asking again", silent)
                 continue
-            if number:
+            if attempt:
                 # This may have been the late answer to the first try; another may follow.
                 self._link.settle()
             return answer
         self._link.close()
-        damaged = f"; {last}" if isinstance(last, AnswerDamaged) else ""
+        damaged = f"; {last_error}" if isinstance(last_error, AnswerDamaged) else ""
         raise DeviceLost(
             f"the device at {self._link.where} has not answered for {self._wire.timeout:g} s"
             f"{damaged}"
@@ -314,25 +314,25 @@ class ModbusTcpDriver:
     def _command(self, register: reg.Register, value: int) -> None:
         self._control(register.address, [value], register.name)
 
-    def _control(self, address: int, words: list[int], about: str) -> None:
+    def _control(self, address: int, words: list[int], label: str) -> None:
         try:
             self._link.write(address, words)
         except DeviceRefused as refused:
-            raise self._explained(refused, about) from refused
+            raise self._with_reason(refused, label) from refused
 
-    def _explained(self, refused: DeviceRefused, about: str) -> DeviceError:
-        """Return the refusal with the reason from the device's registers."""
+    def _with_reason(self, refused: DeviceRefused, label: str) -> DeviceError:
+        """Return the refusal's error with the reason that the device's registers state."""
         status = self._status()
         reason = number_in(status, reg.STATUS_REFUSAL)
         joint = number_in(status, reg.STATUS_REFUSAL_JOINT)
         if reason not in Refusal.__members__.values():
-            return DeviceRefused(f"{refused} (reason {reason}): {about}")
+            return DeviceRefused(f"{refused} (reason {reason}): {label}")
         if reason == Refusal.NOT_IN_CONTROL:
             return DeviceBusy(f"another client has control of the device at {self._link.where}")
         trip = self.trip_cause() if reason == Refusal.TRIPPED else None
         text = refusal_text(Refusal(reason), trip)
         at = f" (joint {joint})" if joint else ""
-        return DeviceRefused(f"device at {self._link.where} refused {about}{at}: {text}")
+        return DeviceRefused(f"device at {self._link.where} refused {label}{at}: {text}")
 
     def _identify(self) -> DeviceInfo:
         first, end = reg.IDENTITY_SPAN

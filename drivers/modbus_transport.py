@@ -1,4 +1,4 @@
-"""A Modbus connection as requests that return bytes or raise DeviceLost / DeviceError."""
+"""Modbus requests over a connection: they return bytes, or raise DeviceLost or DeviceError."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ModbusConnection(ABC):
     answer was taken makes that answer a late one, which is dropped.
     """
 
-    pipelines: ClassVar[bool]  # requests are numbered, so that two may be under way
+    pipelines: ClassVar[bool]  # requests are numbered, so that two may be pending
 
     def __init__(self, where: str, unit: int, timeout: float) -> None:
         """Store the device's address `where`, its unit, and the time limit of an answer [s]."""
@@ -45,7 +45,7 @@ class ModbusConnection(ABC):
         self._factor = 1.0
         self._answered = False  # since it was opened
         self._ahead: tuple[int, bytes, int] | None = None  # number, request, registers
-        self._given_up = -1  # number of a request ahead whose answer is dropped
+        self._abandoned = -1  # number of a request ahead whose answer is dropped
 
     @property
     @abstractmethod
@@ -76,19 +76,19 @@ class ModbusConnection(ABC):
     def settle(self) -> None:
         """Let a late answer pass before the next request."""
 
-    def be_patient(self, factor: float) -> None:
+    def extend_timeout(self, factor: float) -> None:
         """Multiply the time limit of answers on the open connection by `factor`."""
         self._factor = factor
 
     def read(self, address: int, count: int, function: int = READ_HOLDING) -> bytes:
         """Read `count` registers (function 3 or 4) as big-endian bytes."""
         request = read_request(function, address, count)
-        return self._payload(request, self._ask(request), count)
+        return self._payload(request, self._exchange(request), count)
 
     def write(self, address: int, words: list[int]) -> None:
         """Write registers from `address` on (functions 6 and 16)."""
         request = write_request(address, words)
-        if self._ask(request) != request[:5]:
+        if self._exchange(request) != request[:5]:
             raise self._mismatch(
                 f"the device at {self.where} confirmed another write than that of "
                 f"{registers_in_words(address, len(words))}"
@@ -98,9 +98,10 @@ class ModbusConnection(ABC):
         """Write, then read, in one transaction (function 23)."""
         return self.registers(write_and_read_request(write_at, words, read_at, count), count)
 
-    def registers(self, request: bytes, count: int, within: float | None = None) -> bytes:
-        """Return the `count` registers for which a request (a PDU) asks, within `within` [s]."""
-        return self._payload(request, self._end(self._begin(request), within), count)
+    def registers(self, request: bytes, count: int, limit: float | None = None) -> bytes:
+        """Return the `count` registers for which a request (a PDU) asks, within `limit` [s]."""
+        answer = self._finish_request(self._start_request(request), limit)
+        return self._payload(request, answer, count)
 
     @property
     def asked_ahead(self) -> bool:
@@ -113,30 +114,30 @@ class ModbusConnection(ABC):
         A failed connection is reported at the next request.
         """
         with suppress(DeviceError):
-            self._ahead = self._begin(request), request, count
+            self._ahead = self._start_request(request), request, count
 
-    def answer_ahead(self, within: float | None = None) -> bytes:
+    def answer_ahead(self, limit: float | None = None) -> bytes:
         """Return the registers requested by `ask_ahead`; raises as `registers`."""
         ahead, self._ahead = self._ahead, None
         if ahead is None:
             raise ValueError("nothing was asked ahead")
         number, request, count = ahead
-        return self._payload(request, self._end(number, within), count)
+        return self._payload(request, self._finish_request(number, limit), count)
 
-    def _ask(self, request: bytes) -> bytes:
+    def _exchange(self, request: bytes) -> bytes:
         """Return the answer to a request; raises DeviceRefused for a refused one."""
-        return self._end(self._begin(request), None)
+        return self._finish_request(self._start_request(request), None)
 
-    def _begin(self, request: bytes) -> int:
+    def _start_request(self, request: bytes) -> int:
         """Send a request; returns its number."""
         if self._ahead is not None:
-            self._given_up, self._ahead = self._ahead[0], None
+            self._abandoned, self._ahead = self._ahead[0], None
         return self._send(request)
 
-    def _end(self, number: int, within: float | None) -> bytes:
+    def _finish_request(self, number: int, limit: float | None) -> bytes:
         """Return the answer to a request by its number."""
-        patience = self._timeout if within is None else min(within, self._timeout)
-        answer = self._receive(number, self._factor * patience)
+        timeout = self._timeout if limit is None else min(limit, self._timeout)
+        answer = self._receive(number, self._factor * timeout)
         self._answered = True
         if answer[0] & REFUSED:
             raise DeviceRefused(
@@ -150,8 +151,8 @@ class ModbusConnection(ABC):
         """Send a PDU; returns its number. Raises DeviceLost where the connection is closed."""
 
     @abstractmethod
-    def _receive(self, number: int, patience: float) -> bytes:
-        """Return the PDU that answers request `number` within `patience` [s].
+    def _receive(self, number: int, timeout: float) -> bytes:
+        """Return the PDU that answers request `number` within `timeout` [s].
 
         Raises DeviceLost where the connection is closed.
         """
@@ -202,7 +203,7 @@ class TcpConnection(ModbusConnection):
         super().__init__(f"{host}:{port}", unit, timeout)
         self._address = host, port
         self._socket: socket.socket | None = None
-        self._waiting = b""  # received and not yet read
+        self._buffer = b""  # received and not yet read
         self._limit = 0.0  # [s] for which the system waits for bytes
         self._transaction = 0
 
@@ -224,7 +225,7 @@ class TcpConnection(ModbusConnection):
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         # With Python's own timeout every call needs two system calls.
         self._socket.setblocking(True)
-        self._waiting, self._limit = b"", 0.0
+        self._buffer, self._limit = b"", 0.0
 
     def _disconnect(self) -> None:
         opened, self._socket = self._socket, None
@@ -244,37 +245,37 @@ class TcpConnection(ModbusConnection):
             self._lost(None)
         return self._transaction
 
-    def _receive(self, number: int, patience: float) -> bytes:
-        until = time.monotonic() + patience
-        if not self._waiting:
-            self._waiting = self._more(patience)
+    def _receive(self, number: int, timeout: float) -> bytes:
+        deadline = time.monotonic() + timeout
+        if not self._buffer:
+            self._buffer = self._receive_bytes(timeout)
         while True:
             try:
-                frame = read_tcp_frame(self._waiting)
+                frame = read_tcp_frame(self._buffer)
             except ValueError:
-                raise self._no_answer(len(self._waiting)) from None
+                raise self._no_answer(len(self._buffer)) from None
             if frame is None:
-                self._waiting += self._more(until - time.monotonic())
+                self._buffer += self._receive_bytes(deadline - time.monotonic())
                 continue
-            self._waiting = self._waiting[frame.used :]
+            self._buffer = self._buffer[frame.used :]
             if frame.transaction == number and frame.unit == self._unit:
                 return frame.pdu
-            if frame.transaction != self._given_up:
+            if frame.transaction != self._abandoned:
                 logger.warning("a late answer from %s is dropped", self.where)
 
-    def _more(self, patience: float) -> bytes:
-        """Return the bytes that arrive within `patience` [s]."""
+    def _receive_bytes(self, timeout: float) -> bytes:
+        """Return the bytes that arrive within `timeout` [s]."""
         if self._socket is None:
             raise self._closed()
         try:
-            if patience != self._limit:
+            if timeout != self._limit:
                 # The system waits in the call that receives; zero would be for ever.
-                self._limit = max(patience, _SHORTEST)
-                limit = struct.pack("@ll", *divmod(round(self._limit * 1e6), 1_000_000))
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+                self._limit = max(timeout, _SHORTEST)
+                option = struct.pack("@ll", *divmod(round(self._limit * 1e6), 1_000_000))
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, option)
             data = self._socket.recv(_CHUNK)
         except BlockingIOError:
-            raise self._no_answer(len(self._waiting)) if self._waiting else self._silent() from None
+            raise self._no_answer(len(self._buffer)) if self._buffer else self._silent() from None
         except OSError as error:
             self._lost(error)
         if not data:

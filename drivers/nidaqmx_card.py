@@ -107,17 +107,16 @@ def wiring(settings: CardSettings, rig: Rig) -> Wiring:
     for key, volts in zip(keys, ranges, strict=True):
         if volts <= 0.0:
             raise InputError(f"wire: {key}.range: {volts:g} V, expected one above 0 V")
-    used = [*keys, *(f"outputs.{i + 1}" for i in range(len(outputs)))]
+    all_keys = [*keys, *(f"outputs.{i + 1}" for i in range(len(outputs)))]
     names = [*(entry.channel for entry in entries), *(entry.channel for entry in outputs)]
-    for place, name in enumerate(names):
-        if name in names[:place]:
-            raise InputError(
-                f"wire: {used[place]}.channel: {name} is that of {used[names.index(name)]} as well"
-            )
-    wired = zip(keys, entries, units, strict=True)
+    key_of: dict[str, str] = {}
+    for key, name in zip(all_keys, names, strict=True):
+        if (other := key_of.setdefault(name, key)) != key:
+            raise InputError(f"wire: {key}.channel: {name} is that of {other} as well")
+    named_entries = zip(keys, entries, units, strict=True)
     values = [
         (scale_of(e.scale, unit, f"{k}.scale", "/V"), offset_of(e.offset, unit, f"{k}.offset"))
-        for k, e, unit in wired
+        for k, e, unit in named_entries
     ]
     scales, offsets = np.array(values).T
     for name, (scale, offset), volts in zip(rig.channels, values, ranges, strict=True):
@@ -154,9 +153,9 @@ def _package() -> ModuleType:
 class NidaqmxCard:
     """`drivers.polled.InputsOutputs` over one task of inputs, one of outputs and a watchdog."""
 
-    def __init__(self, lines: Wiring, timeout: float) -> None:
+    def __init__(self, wiring_: Wiring, timeout: float) -> None:
         self._daq = _package()
-        self._wiring, self._timeout = lines, timeout
+        self._wiring, self._timeout = wiring_, timeout
         self._tasks: list[Any] = []
 
     @property
@@ -169,7 +168,7 @@ class NidaqmxCard:
         """Make and start the tasks; return the names of the cards."""
         self.close()
         wiring = self._wiring
-        with self._failing_as_lost(), ExitStack() as undo:
+        with self._errors_as_lost(), ExitStack() as undo:
             undo.callback(self.close)
             reading, writing = self._task(), self._task()
             for channel, volts in zip(wiring.inputs, wiring.ranges, strict=True):
@@ -185,7 +184,7 @@ class NidaqmxCard:
 
     def read(self) -> Array:
         """Return one value [SI] of every channel, (channels,), in the order of the rig."""
-        with self._failing_as_lost():
+        with self._errors_as_lost():
             volts = np.atleast_1d(self._opened(0).read(timeout=self._timeout))
         values: Array = self._wiring.offsets + self._wiring.scales * volts
         return values
@@ -193,7 +192,7 @@ class NidaqmxCard:
     def write(self, volts: Array) -> None:
         """Put out one voltage [V] per joint, and feed the card's watchdog."""
         data: float | Sequence[float] = volts.tolist() if len(volts) > 1 else float(volts[0])
-        with self._failing_as_lost():
+        with self._errors_as_lost():
             self._opened(1).write(data, auto_start=True, timeout=self._timeout)
             if self._wiring.watchdog is not None:
                 self._opened(2).reset_timer()
@@ -228,7 +227,7 @@ class NidaqmxCard:
         task.start()
 
     @contextmanager
-    def _failing_as_lost(self) -> Iterator[None]:
+    def _errors_as_lost(self) -> Iterator[None]:
         try:
             yield
         except self._daq.errors.Error as error:

@@ -86,7 +86,7 @@ class ZeroesBesideHost(Protocol):
 
 @dataclass(frozen=True)
 class Timing:
-    """How well a host has kept its sample clock since connecting.
+    """Counts of the ticks that a host has served, late or not, since connecting.
 
     `served` ticks were read and written, `late` of them more than half a period after their time,
     the worst by `worst` [s]; `missing` ticks are in no block.
@@ -99,7 +99,7 @@ class Timing:
 
 
 class PolledDriver:
-    """`drivers.base.Driver` over an `InputsOutputs`; see there for what each call promises.
+    """`drivers.base.Driver` over an `InputsOutputs`; see there for each call.
 
     Only `read_block` serves ticks: between two calls the outputs hold their voltage. After a pause
     longer than `wire.watchdog` (or the device's own watchdog), the next tick zeroes the outputs and
@@ -129,8 +129,8 @@ class PolledDriver:
         self._silence_allowed = _silence_allowed(wire, rig, device.watchdog, accept_no_watchdog)
         self._wire, self._rig, self._device = wire, rig, device
         self._clock, self._sleep = clock, sleep
-        wanted = max(1, round(DRIVER.block_seconds * rig.sample_rate))
-        self._block_samples = min(DRIVER.block_samples, wanted)
+        samples = max(1, round(DRIVER.block_seconds * rig.sample_rate))
+        self._block_samples = min(DRIVER.block_samples, samples)
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         low, high = np.array([sensor.range for sensor in sensors], dtype=np.float64).T
         rounding = DRIVER.rounding * (high - low)
@@ -149,8 +149,8 @@ class PolledDriver:
         self._last = -1  # newest tick that was served or is in a row
         self._volts = np.zeros(len(rig.joints))
         self._written = 0.0
-        self._cause: str | None = None
-        self._loss: str | None = None  # why the device was lost, until it is reopened
+        self._trip_cause: str | None = None
+        self._lost_cause: str | None = None  # why the device was lost, until it is reopened
         self._timing = Timing()
 
     @property
@@ -165,12 +165,12 @@ class PolledDriver:
         self._zero_laws()
         self._streaming = False
         identity = self._safely(self._device.open)
-        self._open, self._loss = True, None
+        self._open, self._lost_cause = True, None
         try:
-            self._put(self._volts)
-            self._prove_speed()
+            self._write(self._volts)
+            self._check_speed()
         except BaseException:
-            self._drop()
+            self._close_device()
             raise
         if self._device.watchdog is None:
             logger.warning(
@@ -188,11 +188,11 @@ class PolledDriver:
         self._streaming = False
         try:
             if self._open:
-                self._put(self._volts)
+                self._write(self._volts)
         except DeviceError as error:
             logger.debug("while closing: %s", error)
         finally:
-            self._drop()
+            self._close_device()
         timing = self.timing
         if timing.served:
             logger.info(
@@ -208,13 +208,13 @@ class PolledDriver:
         self._zero_laws()
         if self._open:
             try:
-                self._put(self._volts)
+                self._write(self._volts)
             except DeviceError as error:
                 logger.warning("zeroing needs a second try: %s", error)
             else:
                 return
         self._streaming = False
-        self._drop()
+        self._close_device()
         try:
             self._safely(self._device.open)
         except DeviceBusy:
@@ -222,11 +222,11 @@ class PolledDriver:
                 raise
             self._safely(self._device.zero_beside_host)
             return
-        self._open, self._loss = True, None
+        self._open, self._lost_cause = True, None
         try:
-            self._put(self._volts)
+            self._write(self._volts)
         except DeviceError:
-            self._drop()
+            self._close_device()
             raise
 
     def trip_cause(self) -> str | None:
@@ -234,12 +234,12 @@ class PolledDriver:
         self._require_open()
         if self._streaming:
             self._trip_on_silence()
-        return self._cause
+        return self._trip_cause
 
     def reset(self) -> None:
         """Clear a latched trip; only on a person's request."""
-        if self._cause is not None:
-            self._cause = None
+        if self._trip_cause is not None:
+            self._trip_cause = None
             self._written = self._clock()  # the pause that caused the trip is over
 
     # -- outputs ----------------------------------------------------------------------------
@@ -255,8 +255,8 @@ class PolledDriver:
         if self._streaming:
             self._trip_on_silence()
         laws = possible_laws(laws, self._rig)
-        if self._cause is not None and any(law.limit > 0.0 for law in laws):
-            raise DeviceError(f"tripped: {self._cause}; find the cause, then reset it")
+        if self._trip_cause is not None and any(law.limit > 0.0 for law in laws):
+            raise DeviceError(f"tripped: {self._trip_cause}; find the cause, then reset it")
         tick = self._next_tick()
         starts = [tick if restart else law.start for law in self._laws]
         self._laws = [
@@ -276,7 +276,7 @@ class PolledDriver:
         self._written = self._clock()
         self._last = max(self._last, math.floor(self._periods(self._written) + DRIVER.early))
         self._laws = [replace(law, start=self._last + 1) for law in self._laws]
-        values, at = self._take()  # sample from which the first tick is interpolated
+        values, at = self._read_sample()  # sample from which the first tick is interpolated
         self._resampler.add(at, values, self._saturated(values))
         self._streaming = True
 
@@ -286,7 +286,7 @@ class PolledDriver:
         self._streaming = False
         self._rows.clear()
         self._zero_laws()
-        self._put(self._volts)
+        self._write(self._volts)
 
     def read_block(self) -> SampleBlock:
         """Serve ticks until a block is full or a gap ends it, and return it.
@@ -295,23 +295,23 @@ class PolledDriver:
         writes.
         """
         if not self._streaming:
-            if self._loss is not None:
-                raise DeviceLost(self._loss)
+            if self._lost_cause is not None:
+                raise DeviceLost(self._lost_cause)
             raise DeviceError(f"the device of wire {self._wire.kind} is not started; start it")
-        patience = self._wire.timeout + self._block_samples / self._rig.sample_rate
-        patience += self._silence_allowed
-        deadline, cause = self._clock() + patience, self._cause
+        longest = self._wire.timeout + self._block_samples / self._rig.sample_rate
+        longest += self._silence_allowed
+        deadline, cause = self._clock() + longest, self._trip_cause
         try:
             while (block := self._block(full=self._clock() <= deadline)) is None:
                 if self._clock() > deadline:
                     self._trip_on_silence()
-                    if self._cause == cause:
+                    if self._trip_cause == cause:
                         raise DeviceError(
                             f"no two samples of wire {self._wire.kind} came within {LONGEST:g} "
                             f"periods of {self._rig.sample_rate:g} Hz; lower the rig's sample_rate"
                         )
-                    # This host stood still, not the device: a block has to bring the trip.
-                    deadline, cause = self._clock() + patience, self._cause
+                    # This host stood still, not the device: the next block must report the trip.
+                    deadline, cause = self._clock() + longest, self._trip_cause
                 self._serve()
         except BaseException:
             self._make_safe()
@@ -321,18 +321,18 @@ class PolledDriver:
     # -- inside -----------------------------------------------------------------------------
 
     def _serve(self) -> None:
-        """Wait for the next tick; read, evaluate the laws, write; keep the rows that result."""
+        """Wait for the next tick; read, evaluate the laws, write; append the resulting rows."""
         self._trip_on_silence()
         tick = self._wait()
-        values, at = self._take()
+        values, at = self._read_sample()
         self._trip_on_silence()
-        held, self._volts = self._volts, self._wanted(tick, values[self._positions])
-        self._put(self._volts)
+        held, self._volts = self._volts, self._outputs(tick, values[self._positions])
+        self._write(self._volts)
         lateness = at - tick
-        own = at / self._rig.sample_rate
+        read_at = at / self._rig.sample_rate
         for row in self._resampler.add(at, values, self._saturated(values)):
             commands = self._volts if row.tick == tick else held
-            self._rows.append((row, commands, own if row.tick == tick else math.nan))
+            self._rows.append((row, commands, read_at if row.tick == tick else math.nan))
             self._last = row.tick
         self._last = max(self._last, tick)
         old = self._timing
@@ -353,19 +353,19 @@ class PolledDriver:
             count += 1
         if count == 0 or (full and count < self._block_samples and count == len(rows)):
             return None
-        taken = [rows.popleft() for _ in range(count)]
-        first = taken[0][0].tick
+        selected = [rows.popleft() for _ in range(count)]
+        first = selected[0][0].tick
         if self._block_end is not None and first > self._block_end:
             self._sequence += 1  # a gap counts as one block
         self._block_end = first + count
         block = SampleBlock(
             sequence=self._sequence,
             tick=first,
-            data=np.array([np.concatenate((row.values, volts)) for row, volts, _ in taken]),
-            saturated=np.array([row.saturated for row, _, _ in taken]),
+            data=np.array([np.concatenate((row.values, volts)) for row, volts, _ in selected]),
+            saturated=np.array([row.saturated for row, _, _ in selected]),
             backlog=0,
-            tripped=self._cause is not None,
-            read_at=np.array([at for _, _, at in taken]),
+            tripped=self._trip_cause is not None,
+            read_at=np.array([at for _, _, at in selected]),
         )
         self._sequence += 1
         return block
@@ -388,15 +388,15 @@ class PolledDriver:
                 return tick
             self._sleep(ahead / self._rig.sample_rate)
 
-    def _take(self) -> tuple[Array, float]:
+    def _read_sample(self) -> tuple[Array, float]:
         """Read one sample; return it with its time [periods], the middle of the reading."""
         before = self._clock()
         values = np.asarray(self._safely(self._device.read), dtype=np.float64)
         after = self._clock()
-        wanted = (len(self._rig.channels),)
-        if values.shape != wanted:
+        shape = (len(self._rig.channels),)
+        if values.shape != shape:
             raise DeviceError(
-                f"a sample of shape {values.shape} came, expected {wanted}: one value for each of "
+                f"a sample of shape {values.shape} came, expected {shape}: one value for each of "
                 f"{' '.join(self._rig.channels)}"
             )
         return values, self._periods((before + after) / 2)
@@ -405,8 +405,8 @@ class PolledDriver:
         marks: NDArray[np.bool_] = (values <= self._low) | (values >= self._high)
         return marks
 
-    def _wanted(self, tick: int, positions: Array) -> Array:
-        """Return the outputs (n,) [V] at a tick; zero for a joint whose position is NaN."""
+    def _outputs(self, tick: int, positions: Array) -> Array:
+        """Return the outputs (joints,) [V] at a tick; zero for a joint whose position is NaN."""
         return np.array(
             [
                 law.volts(tick, position) if math.isfinite(position) else 0.0
@@ -414,31 +414,31 @@ class PolledDriver:
             ]
         )
 
-    def _put(self, volts: Array) -> None:
+    def _write(self, volts: Array) -> None:
         self._safely(lambda: self._device.write(volts.copy()))
         self._written = self._clock()
 
     def _trip_on_silence(self) -> None:
-        """Zero and trip if the outputs were not written for longer than the watchdog allows."""
+        """Zero the outputs and trip if they were not written within the watchdog's time."""
         silence = self._clock() - self._written
         if silence <= self._silence_allowed:
             return
         self._zero_laws()
-        if self._cause is None:
-            self._cause = (
+        if self._trip_cause is None:
+            self._trip_cause = (
                 f"watchdog: the host did not serve the outputs for {silence:.3g} s, allowed "
                 f"{self._silence_allowed:g} s (before sample {self._next_tick()})"
             )
-            logger.warning("%s", self._cause)
-        self._put(self._volts)
+            logger.warning("%s", self._trip_cause)
+        self._write(self._volts)
 
-    def _prove_speed(self) -> None:
+    def _check_speed(self) -> None:
         period = 1.0 / self._rig.sample_rate
         fastest = math.inf
         for _ in range(DRIVER.trials):
             before = self._clock()
-            self._take()
-            self._put(self._volts)
+            self._read_sample()
+            self._write(self._volts)
             fastest = min(fastest, self._clock() - before)
         if fastest > period:
             raise DeviceError(
@@ -457,15 +457,15 @@ class PolledDriver:
         self._streaming = False
         if self._open:
             with suppress(DeviceError):
-                self._put(self._volts)
+                self._write(self._volts)
 
     def _require_open(self) -> None:
         if not self._open or self._origin is None:
             raise DeviceLost(
-                self._loss or f"the device of wire {self._wire.kind} is closed; connect first"
+                self._lost_cause or f"the device of wire {self._wire.kind} is closed; connect first"
             )
 
-    def _drop(self) -> None:
+    def _close_device(self) -> None:
         self._open = False
         try:
             self._device.close()
@@ -477,13 +477,13 @@ class PolledDriver:
         try:
             return call()
         except DeviceLost as error:
-            self._loss = str(error)
+            self._lost_cause = str(error)
             raise
         except DeviceError:
             raise
         except OSError as error:
-            self._loss = f"the device of wire {self._wire.kind} is gone: {error}"
-            raise DeviceLost(self._loss) from error
+            self._lost_cause = f"the device of wire {self._wire.kind} is gone: {error}"
+            raise DeviceLost(self._lost_cause) from error
         except (Exception, SystemExit) as error:  # a library's sys.exit() would end a run as done
             raise DeviceError(
                 f"the device of wire {self._wire.kind} failed: {type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Numbers in 16-bit registers: type and word order to values and back.
+"""Convert numbers to and from 16-bit registers, by type and word order.
 
 A register has its high byte first, as in Modbus. A wider number has consecutive registers; `big`
 has its high word first, `little` its low word.
@@ -13,7 +13,7 @@ from typing import Final
 
 
 class RegisterType(StrEnum):
-    """Form of a number."""
+    """Type of a number in registers."""
 
     INT16 = "int16"
     UINT16 = "uint16"
@@ -43,7 +43,7 @@ _FORMS: Final = {
 
 
 def integers(form: RegisterType) -> tuple[int, int] | None:
-    """Return the least and the largest number of a type of integers, None for other types."""
+    """Return the least and the largest number of an integer type, None for other types."""
     if form in (RegisterType.FLOAT32, RegisterType.FLOAT64):
         return None
     bits = 8 * struct.calcsize(_FORMS[form])

@@ -58,8 +58,8 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
     try:
         values = settings.of_endpoint(url)
     except ValueError as error:
-        wanted = f"the settings of {url.scheme} in the rig file's section `wire`"
+        expected = f"the settings of {url.scheme} in the rig file's section `wire`"
         if settings.example:
-            wanted = f"one like {settings.example}"
-        raise InputError(f"--endpoint {endpoint}: expected {wanted}") from error
+            expected = f"one like {settings.example}"
+        raise InputError(f"--endpoint {endpoint}: expected {expected}") from error
     return wire.reached_by(url.scheme, values)

@@ -1,4 +1,4 @@
-"""A driver that plays a recorded run as if it were a device (docs/runs.md, "records.h5").
+"""A driver that plays a recorded run like a device (docs/runs.md, "records.h5").
 
 All records and the samples between them are played in the order of recording. The commands in the
 samples are the recorded ones, whatever the host requests. Laws with an output are therefore
@@ -44,7 +44,7 @@ BETWEEN = "between"
 
 
 class ReplaySettings(WireSettings):
-    """The run played, and how.
+    """The run to play, and how.
 
     `run` is a run folder or a records.h5; `pace` is how many times as fast as recorded (0: as fast
     as it is read); `ignore_outputs` accepts laws that a recording cannot follow.
@@ -82,8 +82,8 @@ class ReplayDriver:
         self._settings = ReplaySettings.of(wire)
         self._rig = rig
         self._clock, self._sleep = clock, sleep
-        given = Path(self._settings.run)
-        self._path = given / ARCHIVE if given.is_dir() else given
+        path = Path(self._settings.run)
+        self._path = path / ARCHIVE if path.is_dir() else path
         self._data: Array | None = None
         self._streaming = False
         self._tick = self._sequence = 0
@@ -95,9 +95,9 @@ class ReplayDriver:
         self._data = self._read()
         self._streaming = False
         self._tick = self._sequence = 0
-        at = self._settings
+        pace = self._settings.pace
         name = f"recording {self._path}"
-        return DeviceInfo.of(self._rig, name, at.block_samples, virtual_time=not at.pace)
+        return DeviceInfo.of(self._rig, name, self._settings.block_samples, virtual_time=not pace)
 
     def close(self) -> None:
         """Drop the recording; never raises."""
@@ -108,21 +108,21 @@ class ReplayDriver:
 
     def reset(self) -> None:
         """Do nothing: a recording does not trip."""
-        self._open()
+        self._require_connected()
 
     def trip_cause(self) -> str | None:
         """Return None: a recording does not trip."""
-        self._open()
+        self._require_connected()
         return None
 
     def upload(self, joint: int, wave: Array) -> None:
         """Check a waveform [V] and discard it."""
-        self._open()
+        self._require_connected()
         possible_wave(joint, wave, self._rig)
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Accept laws without output, others only with `ignore_outputs`; return the tick."""
-        self._open()
+        self._require_connected()
         for number, law in enumerate(possible_laws(laws, self._rig), start=1):
             drives = law.limit > 0.0 and (law.gain, law.bias, law.position_gain) != (0.0, 0.0, 0.0)
             if drives and not self._settings.ignore_outputs:
@@ -136,26 +136,26 @@ class ReplayDriver:
 
     def start(self) -> None:
         """Start a stream at the end of the previous one; pacing begins here."""
-        self._open()
+        self._require_connected()
         self._streaming, self._sequence = True, 0
-        self._began, self._first = self._clock(), self._tick
+        self._pace_start, self._pace_tick = self._clock(), self._tick
 
     def stop(self) -> None:
         """Stop streaming."""
-        self._open()
+        self._require_connected()
         self._streaming = False
 
     def read_block(self) -> SampleBlock:
         """Return the next samples up to a lost one; raises DeviceLost at the end."""
-        data = self._open()
+        data = self._require_connected()
         if not self._streaming:
             raise DeviceError("the recording does not stream (not started)")
         first = self._tick
-        kept = np.flatnonzero(~np.isnan(data[first:]).all(axis=1))
-        if not len(kept):
+        present = np.flatnonzero(~np.isnan(data[first:]).all(axis=1))
+        if not len(present):
             self._streaming = False
             raise DeviceLost(f"{self._path} has ended at sample {len(data)}; play a longer run")
-        first += int(kept[0])
+        first += int(present[0])
         rows = data[first : first + self._settings.block_samples]
         gaps = np.flatnonzero(np.isnan(rows).all(axis=1))
         rows = rows[: gaps[0]] if len(gaps) else rows
@@ -163,8 +163,9 @@ class ReplayDriver:
             self._sequence += -(-(first - self._tick) // self._settings.block_samples)
         self._tick = first + len(rows)
         backlog = self._wait(self._tick)
-        marks = (rows[:, : len(self._low)] <= self._low) | (rows[:, : len(self._low)] >= self._high)
-        block = SampleBlock(self._sequence, first, rows.copy(), marks, backlog, tripped=False)
+        measured = rows[:, : len(self._low)]
+        saturated = (measured <= self._low) | (measured >= self._high)
+        block = SampleBlock(self._sequence, first, rows.copy(), saturated, backlog, tripped=False)
         self._sequence += 1
         return block
 
@@ -173,7 +174,7 @@ class ReplayDriver:
         rate = self._settings.pace * self._rig.sample_rate
         if not rate:
             return 0
-        due = self._began + (tick - self._first) / rate
+        due = self._pace_start + (tick - self._pace_tick) / rate
         late = self._clock() - due
         if late < 0.0:
             self._sleep(-late)
@@ -184,7 +185,7 @@ class ReplayDriver:
 
     # -- the file ---------------------------------------------------------------------------
 
-    def _open(self) -> Array:
+    def _require_connected(self) -> Array:
         if self._data is None:
             raise DeviceLost("the wire replay is not connected")
         return self._data
@@ -211,11 +212,11 @@ class ReplayDriver:
                 f"{self._path}: {group.name} was sampled at {rate:g} Hz, rig {self._rig.name!r} "
                 f"has {self._rig.sample_rate:g} Hz"
             )
-        have, want = {str(name) for name in group}, set(self._rig.recorded)
-        if have != want:
+        names, expected = {str(name) for name in group}, set(self._rig.recorded)
+        if names != expected:
             raise DeviceError(
                 f"{self._path}: {group.name} is of another rig: "
-                f"lacks {sorted(want - have)}, has in addition {sorted(have - want)}"
+                f"lacks {sorted(expected - names)}, has also {sorted(names - expected)}"
             )
         columns: list[NDArray[np.float64]] = [
             np.asarray(group[name][:], dtype=np.float64) for name in self._rig.recorded
@@ -228,7 +229,7 @@ def _in_order(file: Any) -> Iterator[Any]:
     groups = [group for name, group in file.items() if name != BETWEEN]
     groups += list(file.get(BETWEEN, {}).values())
 
-    def taken(group: Any) -> tuple[int, int, str]:
+    def order(group: Any) -> tuple[int, int, str]:
         attributes = group.attrs
         return (
             int(attributes.get("stream", 0)),
@@ -236,4 +237,4 @@ def _in_order(file: Any) -> Iterator[Any]:
             str(group.name),
         )
 
-    yield from sorted(groups, key=taken)
+    yield from sorted(groups, key=order)

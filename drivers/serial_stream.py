@@ -64,16 +64,16 @@ class SerialLine:
         """Send a message; raises DeviceLost when the port is lost."""
         self.transport.write(encode_frame(message))
 
-    def receive(self, patience: float) -> list[WireFrame]:
+    def receive(self, timeout: float) -> list[WireFrame]:
         """Return the complete messages; raises DeviceLost when the port is lost."""
-        return self._decoder.feed(self.transport.read(patience))
+        return self._decoder.feed(self.transport.read(timeout))
 
     def complaint(self, heard: int) -> str:
         """Return what may explain missing answers, or ''."""
-        came = self._decoder.received - self._received
-        if came and not heard:
+        received = self._decoder.received - self._received
+        if received and not heard:
             return (
-                f"no valid frame in {came} bytes: check `baud`, which both ends must have, and "
+                f"no valid frame in {received} bytes: check `baud`, which both ends must have, and "
                 "that this is the bench's port"
             )
         damaged = self._decoder.damaged - self._damaged
@@ -97,9 +97,9 @@ class SerialStreamDriver(MessageStreamDriver):
         transport: Transport | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        at = SerialSettings.of(wire)
-        self._baud = at.baud
-        port = PySerialTransport(at.device, at.baud) if transport is None else transport
+        settings = SerialSettings.of(wire)
+        self._baud = settings.baud
+        port = PySerialTransport(settings.device, settings.baud) if transport is None else transport
         super().__init__(wire, rig, SerialLine(port), clock)
 
     def connect(self) -> DeviceInfo:
@@ -115,6 +115,6 @@ class SerialStreamDriver(MessageStreamDriver):
             )
         return super().connect()
 
-    def _place(self) -> str:
+    def _address(self) -> str:
         """Return the port and its speed."""
         return f"{self._link.where} ({self._baud} baud)"

@@ -47,8 +47,8 @@ class Transport(Protocol):
     def write(self, data: bytes) -> None:
         """Send bytes; raises DeviceLost when the port is lost."""
 
-    def read(self, patience: float) -> bytes:
-        """Return waiting bytes, at once if there are any; nothing after about `patience` [s].
+    def read(self, timeout: float) -> bytes:
+        """Return waiting bytes, at once if there are any; none after about `timeout` [s].
 
         Raises DeviceLost when the port is lost.
         """
@@ -57,8 +57,8 @@ class Transport(Protocol):
         """Close the port; never raises."""
 
 
-def why_not_opened(device: str, baud: int, error: Exception) -> DeviceError:
-    """Return the error of a serial port that cannot be opened, with a remedy."""
+def opening_error(device: str, baud: int, error: Exception) -> DeviceError:
+    """Return the error of a serial port that cannot be opened, with the remedy."""
     text = str(error)
     if "exclusively lock" in text:
         return port_in_use(device)
@@ -127,7 +127,7 @@ class PySerialTransport:
                 exclusive=None if shared else True,
             )
         except OPENING_ERRORS as error:
-            raise why_not_opened(self._device, self._baud, error) from error
+            raise opening_error(self._device, self._baud, error) from error
         self._file = self._port.fileno() if os.name == "posix" else None
 
     def write(self, data: bytes) -> None:
@@ -142,17 +142,18 @@ class PySerialTransport:
         except _ERRORS as error:
             raise self._loss() from error
 
-    def read(self, patience: float) -> bytes:
+    def read(self, timeout: float) -> bytes:
         """Return what is waiting; see `Transport`."""
         port = self._usable()
-        end = time.monotonic() + patience
+        end = time.monotonic() + timeout
         try:
             # One wait and one read where the port is a file: pyserial needs twice as many calls.
             while self._file is not None:
-                left = end - time.monotonic()
-                if select.select([self._file], [], [], min(max(left, 0.0), DRIVER.serial_wait))[0]:
+                remaining = end - time.monotonic()
+                wait = min(max(remaining, 0.0), DRIVER.serial_wait)
+                if select.select([self._file], [], [], wait)[0]:
                     return self._read_file(port, self._file)
-                if left <= 0.0:
+                if remaining <= 0.0:
                     return b""
             while True:
                 if waiting := port.in_waiting:
@@ -179,15 +180,15 @@ class PySerialTransport:
         except BlockingIOError:  # another program that shares the port was quicker
             return b""
         if not data:
-            _ = port.in_waiting  # raises OSError where the port has gone
+            _ = port.in_waiting  # raises OSError where the port is lost
         return data
 
     def _read_port(self, port: serial.Serial, size: int) -> bytes:
         try:
             return port.read(size) if size else b""
         except serial.SerialException:
-            # Another program took the bytes (one that zeroes the outputs, say), or the port has
-            # gone: then this raises OSError.
+            # Another program took the bytes (one that zeroes the outputs, say), or the port is
+            # lost: then this raises OSError.
             _ = port.in_waiting
             return b""
 

@@ -1,7 +1,7 @@
-"""The tables of a rig file's section `wire`: one entry for every channel and for every output.
+"""Read the tables of a rig file's section `wire`: one entry per channel and per output.
 
-Errors of all such tables are reported with the key's name: a channel that the rig does not measure,
-a missing one, a wrong key, a unit of another dimension.
+Every error names the key: a channel that the rig does not measure, a missing one, a wrong key, a
+unit of another dimension.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def read_entry(model: type[Entry], raw: Any, key: str) -> Entry:
     if not isinstance(raw, Mapping):
         raise InputError(f"wire: {key}: expected keys and values, found {raw!r}")
     try:
-        made = model.model_validate(raw)
+        entry = model.model_validate(raw)
     except ValidationError as error:
         problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         problem = problems[0]
@@ -39,9 +39,9 @@ def read_entry(model: type[Entry], raw: Any, key: str) -> Entry:
         else:
             text = problem_text(problem)
         raise InputError(f"wire: {where}: {text}") from error
-    for path in boolean_numbers(raw, made):
+    for path in boolean_numbers(raw, entry):
         raise InputError(f"wire: {key}.{'.'.join(map(str, path))}: {NO_NUMBER}")
-    return made
+    return entry
 
 
 def inputs_by_channel(model: type[Entry], raw: Mapping[str, Any], rig: Rig) -> tuple[Entry, ...]:
@@ -57,11 +57,11 @@ def outputs_by_joint(model: type[Entry], raw: Mapping[int, Any], rig: Rig) -> tu
     return tuple(read_entry(model, raw[i], f"outputs.{i}") for i in joints)
 
 
-def _complete(table: str, given: Sequence[str], wanted: Sequence[str], about: str) -> None:
-    for name in given:
-        if name not in wanted:
-            raise InputError(f"wire: {table}.{name}: unknown; {about}: {' '.join(wanted)}")
-    missing = [name for name in wanted if name not in given]
+def _complete(table: str, names: Sequence[str], expected: Sequence[str], description: str) -> None:
+    for name in names:
+        if name not in expected:
+            raise InputError(f"wire: {table}.{name}: unknown; {description}: {' '.join(expected)}")
+    missing = [name for name in expected if name not in names]
     if missing:
         raise InputError(f"wire: {table}: no entry for: {' '.join(missing)}")
 
@@ -75,19 +75,19 @@ def scale_of(text: Any, unit: str, key: str, per: str = "") -> float:
 
 
 def offset_of(text: Any, unit: str, key: str) -> float:
-    """Read the value [SI] at a reading of zero, 0 where none is given; raises InputError."""
+    """Read the value [SI] at a reading of zero, by default 0; raises InputError."""
     return 0.0 if text is None else read_quantity(text, unit, f"wire: {key}")
 
 
 def refuse_short_reach(
     rig: Rig, name: str, ends: tuple[float, float], needed: tuple[float, float], step: float
 ) -> None:
-    """Raise InputError where the numbers of an input end before what a channel needs.
+    """Raise InputError where the numbers of an input do not cover the range that a channel needs.
 
     `ends` [SI] are the values at both ends of the register or converter, `needed` [SI] the range of
-    the sensor or its limits, `step` [SI] one code. A limit beyond an end could never trip, and a
-    controller would push on. The lower end of a pressure or temperature may be anywhere: numbers
-    without a sign are common there.
+    the sensor or its limits, `step` [SI] one code. A limit beyond an end could never trip, and the
+    drive would go on. The lower end of a pressure or temperature is not checked: numbers without a
+    sign are common there.
     """
     least, most = min(ends), max(ends)
     unit = rig.unit_of(name)

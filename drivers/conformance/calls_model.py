@@ -1,4 +1,4 @@
-"""The model for random calls: which law acts from which tick on, and what must be zero."""
+"""Model a device under random calls: the law of every tick, and when outputs must be zero."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class DeviceModel:
     """One sequence of calls on one fresh bench, and the expected samples after them."""
 
     def __init__(self, subject: Subject) -> None:
-        self._stack = ExitStack()
-        self.trial = Trial(subject, self._stack.enter_context(subject.make()))
+        self._open_bench = ExitStack()
+        self.trial = Trial(subject, self._open_bench.enter_context(subject.make()))
         self.rig = self.trial.rig
-        self.drives = subject.capabilities.outputs
+        self.has_outputs = subject.capabilities.outputs
         self.driver: Watched = self.trial.driver()
         self.connected = False
         self._clear()
@@ -32,8 +32,8 @@ class DeviceModel:
         self.streaming = False
         self.tripped = False
         self.waves: dict[int, Array] = {}  # as uploaded, for the next apply
-        self.last: SampleBlock | None = None
-        self.fresh = False  # the next block is the first of its stream
+        self.last_block: SampleBlock | None = None
+        self.first_block = False  # the next block is the first of its stream
         self.phase_known = False
         self.settling = 0  # blocks that may still contain the law before the last zero
         self.segments: list[tuple[int, Playing]] = [(0, self.trial.playing(self.trial.off()))]
@@ -62,14 +62,14 @@ class DeviceModel:
             for j, (gain, bias, limit) in enumerate(numbers)
         ]
         restart = restart or not self.phase_known
-        if not self.drives:
+        if not self.has_outputs:
             laws = self.trial.off()
         elif self.tripped:
             driving = self.trial.driving()
             self.trial.refused("a driving law after a trip", lambda: self.driver.apply(driving))
             laws = self.trial.off()
         tick = self.driver.apply(laws, restart=restart)
-        require(tick >= self._end(), f"apply acts from tick {tick}, which was read before")
+        require(tick >= self._next_tick(), f"apply acts from tick {tick}, which was read before")
         origin = tick if restart else self.segments[-1][1].origin
         self.phase_known = True
         self.segments.append((tick, self.trial.playing(laws, dict(self.waves), origin)))
@@ -82,7 +82,7 @@ class DeviceModel:
     def start(self) -> None:
         """Start a stream; waveforms begin at its first sample."""
         self.driver.start()
-        self.streaming, self.fresh, self.phase_known = True, True, True
+        self.streaming, self.first_block, self.phase_known = True, True, True
         self.segments = [(0, replace(self.segments[-1][1], origin=_PENDING))]
 
     def read(self) -> None:
@@ -90,12 +90,12 @@ class DeviceModel:
         if not self.streaming:
             self.trial.refused("read_block without a stream", self.driver.read_block)
             return
-        self._seen(self.driver.read_block())
+        self._compare(self.driver.read_block())
 
     def zero(self) -> None:
         """Zero the outputs."""
         self.driver.zero_outputs()
-        self.segments = [(self._end(), self.trial.playing(self.trial.off()))]
+        self.segments = [(self._next_tick(), self.trial.playing(self.trial.off()))]
         self.settling = 0 if self.trial.claims.virtual_time else SETTLING
         self.waves.clear()  # the device may keep them or not
         self.phase_known = False
@@ -107,7 +107,7 @@ class DeviceModel:
         self.streaming = False
         if self.trial.claims.host_timed:
             self.trial.zero_at_device("after stop")
-            self.segments = [(self._end(), self.trial.playing(self.trial.off()))]
+            self.segments = [(self._next_tick(), self.trial.playing(self.trial.off()))]
 
     def reset(self) -> None:
         """Clear a trip, if there is one."""
@@ -122,7 +122,7 @@ class DeviceModel:
         self.trial.zero_at_device("after close")
 
     def cut(self) -> None:
-        """End the link, then check that calls report it and zero is reached."""
+        """End the link, then check that calls report it and the outputs are zero."""
         assert self.trial.bench.cut is not None
         self.trial.bench.cut()
         if self.trial.bench.silence is not None:
@@ -141,7 +141,7 @@ class DeviceModel:
         self.close()
 
     def spoiled(self, fault: str, name: str) -> None:
-        """Make one call while the wire damages answers; after an error reach zero and close."""
+        """Make one call while the wire damages answers; after an error zero outputs and close."""
         calls: dict[str, Callable[[], None]] = {
             "read": self.read,
             "start": self.start,
@@ -150,7 +150,7 @@ class DeviceModel:
             "apply": lambda: self.apply([(1.0, 0.5, 0.8)] * self.trial.joints, True),
             "upload": lambda: self.upload(0, 61),
         }
-        # If the model expects an error anyway, the session may have ended with it.
+        # Where an error is due anyway, the session may have ended with it.
         failed = self.tripped if name == "apply" else name == "read" and not self.streaming
         self.trial.spoil(fault)
         try:
@@ -161,7 +161,7 @@ class DeviceModel:
             self.trial.spoil(HEALTHY)
         if failed:
             self.trial.zero_somehow(self.driver, f"{fault}: after an error of {name}")
-        if failed or name == "zero":  # zeroing may have taken a new link, which ends the session
+        if failed or name == "zero":  # zeroing may have opened a new link, which ends the session
             self.close()
 
     def end(self) -> None:
@@ -170,38 +170,38 @@ class DeviceModel:
             self.trial.end()
             self.trial.zero_at_device("after the last close")
         finally:
-            self._stack.close()
+            self._open_bench.close()
 
     # -- expected samples -------------------------------------------------------------------
 
-    def _end(self) -> int:
+    def _next_tick(self) -> int:
         """Return the tick after the last sample read in this session."""
-        return 0 if self.last is None else self.last.tick + len(self.last.data)
+        return 0 if self.last_block is None else self.last_block.tick + len(self.last_block.data)
 
-    def _seen(self, block: SampleBlock) -> None:
-        if self.fresh:
+    def _compare(self, block: SampleBlock) -> None:
+        if self.first_block:
             require(block.sequence == 0, f"a stream begins with block {block.sequence}")
-            end = self._end()
+            end = self._next_tick()
             require(block.tick >= end, f"a stream begins at tick {block.tick}, before {end}")
             self.segments = [
                 (at, replace(p, origin=block.tick) if p.origin == _PENDING else p)
                 for at, p in self.segments
             ]
-        elif self.last is not None:
-            follows(self.last, block)
-        self.fresh, self.last = False, block
+        elif self.last_block is not None:
+            follows(self.last_block, block)
+        self.first_block, self.last_block = False, block
         if self.settling:
             self.settling -= 1
-        elif self.drives:
+        elif self.has_outputs:
             self._follow_law(block)
-        while len(self.segments) > 1 and self.segments[1][0] <= self._end():
+        while len(self.segments) > 1 and self.segments[1][0] <= self._next_tick():
             self.segments.pop(0)
 
     def _follow_law(self, block: SampleBlock) -> None:
         """Require each row of a block to follow the law of its tick."""
-        last = block.tick + len(block.data)
-        ends = [*(tick for tick, _ in self.segments[1:]), last]
+        end_of_block = block.tick + len(block.data)
+        ends = [*(tick for tick, _ in self.segments[1:]), end_of_block]
         for (first, playing), end in zip(self.segments, ends, strict=True):
-            low, high = max(first, block.tick), min(end, last)
+            low, high = max(first, block.tick), min(end, end_of_block)
             if low < high:
                 require_law(rows_of(block, low - block.tick, high - block.tick), playing, self.rig)

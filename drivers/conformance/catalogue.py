@@ -1,4 +1,4 @@
-"""The list of checks: each is a function of a `Trial` with a docstring, listed by its name."""
+"""List the checks: each is a function of a `Trial` with a docstring, listed by its name."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ConformanceCheck:
     body: Body
 
 
-_found: list[ConformanceCheck] = []
+_CHECKS: list[ConformanceCheck] = []
 
 
 def described(body: Body) -> str:
@@ -47,19 +47,19 @@ def described(body: Body) -> str:
 
 
 def check(*needs: str, moves: bool = True) -> Callable[[Body], Body]:
-    """Enter a function into the catalogue under its name, with its docstring as description."""
+    """List a function in the catalogue under its name, with its docstring as description."""
 
-    def enter(body: Body) -> Body:
-        wanted = (OUTPUTS, *needs) if moves else needs
-        _found.append(ConformanceCheck(body.__name__, described(body), wanted, moves, body))
+    def register(body: Body) -> Body:
+        needed = (OUTPUTS, *needs) if moves else needs
+        _CHECKS.append(ConformanceCheck(body.__name__, described(body), needed, moves, body))
         return body
 
-    return enter
+    return register
 
 
 def catalogue() -> tuple[ConformanceCheck, ...]:
     """Return every check whose module was imported."""
-    return tuple(_found)
+    return tuple(_CHECKS)
 
 
 def lacking(check: ConformanceCheck, bench: DeviceUnderTest, claims: Capabilities) -> str | None:

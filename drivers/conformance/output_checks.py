@@ -110,11 +110,11 @@ def limit_bounds_the_sum(trial: Trial) -> None:
     ):
         laws = trial.law(0, **values)
         tick = driver.apply(laws, restart=True)
-        most = values["limit"] + steps(trial.rig)[0] + 1e-9
+        bound = values["limit"] + steps(trial.rig)[0] + 1e-9
         for block in driver.read(3):
             rows = block.data[max(0, tick - block.tick) :, len(trial.rig.channels)]
             peak = float(np.abs(rows).max(initial=0.0))
-            require(peak <= most, f"{peak:.3f} V under a limit of {values['limit']:.3f} V")
+            require(peak <= bound, f"{peak:.3f} V under a limit of {values['limit']:.3f} V")
         if "position_gain" not in values:
             trial.until_law(driver, trial.playing(laws, {0: wave}, tick), tick, 1)
 
@@ -124,18 +124,18 @@ def position_law_pulls_to_setpoint(trial: Trial) -> None:
     """A position law's command has the sign of the setpoint minus the position."""
     driver, rig = trial.ready(), trial.rig
     column = rig.recorded.index(f"{rig.position_kind}_1")
-    at = float(driver.read_block().data[-1, column])
-    for away in (0.01, -0.01):
-        laws = trial.law(position_gain=0.5 * trial.volts / abs(away), setpoint=at + away)
+    position = float(driver.read_block().data[-1, column])
+    for error in (0.01, -0.01):
+        laws = trial.law(position_gain=0.5 * trial.volts / abs(error), setpoint=position + error)
         tick = driver.apply(laws)
         block = driver.read_block()
         while block.tick + len(block.data) <= tick:
             block = driver.read_block()
         command = float(block.data[max(0, tick - block.tick), len(rig.channels)])
-        wanted = 0.5 * trial.volts * np.sign(away)
-        fits = abs(command - wanted) < 0.3 * trial.volts
-        require(fits, f"{command:.3f} V at {away:+g} m to the setpoint, expected {wanted:.3f} V")
-        at = float(block.data[-1, column])
+        expected = 0.5 * trial.volts * np.sign(error)
+        fits = abs(command - expected) < 0.3 * trial.volts
+        require(fits, f"{command:.3f} V at {error:+g} m to the setpoint, expected {expected:.3f} V")
+        position = float(block.data[-1, column])
 
 
 @check()
@@ -190,12 +190,12 @@ def zero_within_one_block(trial: Trial) -> None:
     driver = trial.ready()
     for joint in range(trial.joints):
         driver.upload(joint, trial.wave())
-    each = {
+    terms = {
         "waveform": {"gain": 1.0},
         "bias": {"bias": 0.8 * trial.volts},
         "position law": {"position_gain": 1e4, "setpoint": 0.01},
     }
-    for what, values in each.items():
+    for what, values in terms.items():
         laws = [OutputLaw(limit=trial.volts, **values) for _ in range(trial.joints)]
         driver.apply(laws, restart=True)
         driver.read(2)
@@ -267,9 +267,9 @@ def probe_agrees_with_samples(trial: Trial) -> None:
     driver.read(3)
     assert trial.bench.outputs is not None
     probed = np.asarray(trial.bench.outputs(), dtype=np.float64)
-    wanted = np.array([law.bias for law in laws])
-    fits = np.abs(probed - wanted) <= 1.1 * steps(trial.rig) + 1e-9
-    require(fits.all(), f"the device puts out {probed} V, the samples show {wanted} V")
+    expected = np.array([law.bias for law in laws])
+    fits = np.abs(probed - expected) <= 1.1 * steps(trial.rig) + 1e-9
+    require(fits.all(), f"the device puts out {probed} V, the samples show {expected} V")
 
 
 @check(SATURATION, moves=False)
@@ -283,6 +283,6 @@ def saturation_is_marked(trial: Trial) -> None:
     driver.read(2)
     after = driver.read_block()
     require(after.saturated[:, column].all(), f"{name} at the end of its range is not marked")
-    fresh = np.flatnonzero(after.saturated.all(axis=0) & ~before.saturated.any(axis=0))
-    others = [trial.rig.channels[k] for k in fresh if k != column]
+    newly_marked = np.flatnonzero(after.saturated.all(axis=0) & ~before.saturated.any(axis=0))
+    others = [trial.rig.channels[k] for k in newly_marked if k != column]
     require(not others, f"{' '.join(others)} marked as well as {name}")

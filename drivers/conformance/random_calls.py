@@ -1,4 +1,4 @@
-"""Calls in random order, with losses and faults: a state machine around `calls_model`.
+"""Make calls in random order, with losses and faults: a state machine around `calls_model`.
 
 Every block read must continue the one before and follow the law of each of its ticks; after zero,
 close and any error the device's outputs are zero. Hypothesis draws the calls and shortens a
@@ -14,7 +14,7 @@ from drivers.conformance.calls_model import DeviceModel
 from drivers.conformance.subject import Subject
 from drivers.conformance.watched import NotConforming, Skipped
 
-_HISTORY: Final = 14  # calls named in the message
+_CALLS_SHOWN: Final = 14  # calls named in the message
 _LAW = tuple[float, float, float]
 
 
@@ -27,8 +27,8 @@ class RandomCallBudget:
     shorten: bool = True
 
 
-def _machine(subject: Subject, last: dict[str, list[str]]) -> Any:
-    """Return the state machine's class; `last` keeps the calls of the sequence tried last."""
+def _machine(subject: Subject, recent: dict[str, list[str]]) -> Any:
+    """Return the state machine's class; `recent["calls"]` holds the calls of the last sequence."""
     from hypothesis import strategies as st  # noqa: PLC0415 - a dependency of development only
     from hypothesis.stateful import RuleBasedStateMachine, precondition, rule  # noqa: PLC0415
 
@@ -50,7 +50,7 @@ def _machine(subject: Subject, last: dict[str, list[str]]) -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.model = DeviceModel(subject)
-            last["calls"] = self.model.driver.log
+            recent["calls"] = self.model.driver.log
 
         def read_blocks(self, blocks: int) -> None:
             for _ in range(blocks if self.model.streaming else 0):
@@ -147,11 +147,11 @@ def try_random_calls(subject: Subject, effort: RandomCallBudget) -> None:
         from hypothesis.stateful import run_state_machine_as_test  # noqa: PLC0415
     except ImportError as error:
         raise Skipped("needs the package hypothesis: pip install hypothesis") from error
-    last: dict[str, list[str]] = {"calls": []}
+    recent: dict[str, list[str]] = {"calls": []}
     phases = (Phase.generate, Phase.shrink) if effort.shorten else (Phase.generate,)
     try:
         run_state_machine_as_test(
-            _machine(subject, last),
+            _machine(subject, recent),
             settings=settings(
                 max_examples=effort.sequences,
                 stateful_step_count=effort.calls,
@@ -165,7 +165,7 @@ def try_random_calls(subject: Subject, effort: RandomCallBudget) -> None:
             ),
         )
     except Exception as error:
-        calls = last["calls"]
-        cut = "... " if len(calls) > _HISTORY else ""
-        shown = f"{cut}{', '.join(calls[-_HISTORY:])}"
+        calls = recent["calls"]
+        cut = "... " if len(calls) > _CALLS_SHOWN else ""
+        shown = f"{cut}{', '.join(calls[-_CALLS_SHOWN:])}"
         raise NotConforming(f"{error} (calls: {shown})") from error

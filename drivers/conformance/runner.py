@@ -1,4 +1,4 @@
-"""Execution of the checks: named results with a reason in one line each."""
+"""Run the checks and return named results, each with a reason in one line."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def run_check(
                 if need is not None:
                     raise Skipped(f"not claimed: {need}")
                 _run_on(check, Trial(subject, bench))
-    except Skipped as why:
-        return Result(check.name, CheckVerdict.SKIPPED, str(why))
+    except Skipped as skipped:
+        return Result(check.name, CheckVerdict.SKIPPED, str(skipped))
     except NotConforming as error:
         return Result(check.name, CheckVerdict.FAILED, _line(str(error)))
     except DeviceError as error:

@@ -19,18 +19,18 @@ def identity(trial: Trial) -> None:
     info = trial.connected().info
     assert info is not None
     rig = trial.rig
-    for what, is_so, wanted in (
+    for what, actual, expected in (
         ("joints", info.joints, len(rig.joints)),
         ("channels", info.channels, len(rig.channels)),
         ("sample rate [Hz]", info.sample_rate, rig.sample_rate),
         ("virtual time", info.virtual_time, trial.claims.virtual_time),
     ):
-        require(is_so == wanted, f"{what} {is_so}, expected {wanted}")
+        require(actual == expected, f"{what} {actual}, expected {expected}")
     require(info.identity, "the device has no name")
     require(info.block_samples > 0, f"{info.block_samples} samples in a block")
 
 
-def _others(rig: Rig) -> Iterator[tuple[str, Rig]]:
+def _other_rigs(rig: Rig) -> Iterator[tuple[str, Rig]]:
     yield "twice the sample rate", rig.model_copy(update={"sample_rate": 2 * rig.sample_rate})
     if len(rig.joints) > 1:
         yield "a joint less", rig.model_copy(update={"joints": rig.joints[:-1]})
@@ -42,7 +42,7 @@ def _others(rig: Rig) -> Iterator[tuple[str, Rig]]:
 @check(IDENTITY, moves=False)
 def other_rig_refused(trial: Trial) -> None:
     """A device of another rate, number of joints or channels is refused by `connect`."""
-    for what, rig in _others(trial.rig):
+    for what, rig in _other_rigs(trial.rig):
         try:
             driver = trial.driver(rig)
         except InputError:

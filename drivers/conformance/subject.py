@@ -18,7 +18,7 @@ from rig.model.rig import Rig
 Probe = Callable[[], Sequence[float]]
 Act = Callable[[], None]
 
-_PART = 0.1  # of the smallest command limit, requested where outputs are allowed
+_SHARE_OF_LIMIT = 0.1  # of the smallest command limit: the most that a real device puts out
 
 HEALTHY = "pass"  # no fault
 
@@ -96,14 +96,14 @@ def live_subject(rig: Rig) -> Subject:
 
     @contextmanager
     def make() -> Iterator[DeviceUnderTest]:
-        yield DeviceUnderTest(rig, lambda wanted: make_driver(wanted.wire, wanted))
+        yield DeviceUnderTest(rig, lambda other: make_driver(other.wire, other))
 
     host_timed = driver_class(rig.wire.kind).host_timed
     claims = Capabilities(
         host_timed=host_timed,
         virtual_time=info.virtual_time,
-        # Inputs and outputs that the host clocks hold neither a rate nor a rig to compare.
+        # A device that only reads and writes stores neither a sample rate nor a rig.
         refuses_other_rigs=not host_timed,
     )
-    volts = _PART * min(joint.limits.command for joint in rig.joints)
+    volts = _SHARE_OF_LIMIT * min(joint.limits.command for joint in rig.joints)
     return Subject(rig.wire.kind, make, claims, volts)

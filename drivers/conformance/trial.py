@@ -1,4 +1,4 @@
-"""The tools of a check: drivers of a fresh bench, requirements, the law that commands must follow.
+"""Tools of a check: drivers of a fresh bench, requirements, the law that commands must follow.
 
 The law is computed from the formula of `drivers.base`, independently of every driver.
 """
@@ -26,7 +26,7 @@ SETTLING = 3  # blocks after zeroing that may still contain the previous law, in
 
 @dataclass(frozen=True)
 class Playing:
-    """The law and waveform [V] of each joint, begun at tick `origin`."""
+    """The law and waveform [V] of each joint; waveforms begin at tick `origin`."""
 
     laws: tuple[OutputLaw, ...]
     waves: tuple[Array, ...]
@@ -58,14 +58,14 @@ def commands(block: SampleBlock, rig: Rig) -> Array:
 def require_law(block: SampleBlock, playing: Playing, rig: Rig) -> None:
     """Require that every row of a block follows the law, to 1.1 steps of the converter."""
     ticks = block.tick + np.arange(len(block.data))
-    wanted, measured = playing.volts(rig, ticks, block.data), commands(block, rig)
-    near = np.abs(measured - wanted) <= 1.1 * steps(rig) + 1e-9  # NaN is never near
-    wrong = np.flatnonzero(~near.all(axis=1))
+    expected, measured = playing.volts(rig, ticks, block.data), commands(block, rig)
+    fits = np.abs(measured - expected) <= 1.1 * steps(rig) + 1e-9  # NaN never fits
+    wrong = np.flatnonzero(~fits.all(axis=1))
     if len(wrong):
         row = int(wrong[0])
         raise NotConforming(
             f"at tick {ticks[row]} the commands are {in_volts(measured[row])}, "
-            f"the law makes {in_volts(wanted[row])}"
+            f"the law makes {in_volts(expected[row])}"
         )
 
 
@@ -84,14 +84,14 @@ class Trial:
         self.claims = subject.capabilities
         self.volts = subject.volts
         self.joints = len(bench.rig.joints)
-        self._made: list[Watched] = []
+        self._drivers: list[Watched] = []
 
     def driver(self, rig: Rig | None = None) -> Watched:
         """Return an unconnected driver of the bench's rig or another one."""
-        wanted = self.rig if rig is None else rig
-        made = Watched(self.bench.driver(wanted), wanted)
-        self._made.append(made)
-        return made
+        chosen = self.rig if rig is None else rig
+        watched = Watched(self.bench.driver(chosen), chosen)
+        self._drivers.append(watched)
+        return watched
 
     def connected(self, driver: Watched | None = None) -> Watched:
         """Return a connected driver; waits while the device still serves the previous session."""
@@ -116,7 +116,7 @@ class Trial:
         """Close every driver, the wire healthy again; raises nothing but NotConforming."""
         if self.bench.spoil is not None:
             self.bench.spoil(HEALTHY)
-        for driver in self._made:
+        for driver in self._drivers:
             driver.close()
 
     # -- laws -------------------------------------------------------------------------------
@@ -140,12 +140,12 @@ class Trial:
         self, laws: Sequence[OutputLaw], waves: dict[int, Array] | None = None, origin: int = 0
     ) -> Playing:
         """Return the model of laws with the waveforms uploaded so far."""
-        known = waves or {}
-        each = tuple(known.get(joint, np.zeros(1)) for joint in range(self.joints))
-        return Playing(tuple(laws), each, origin)
+        uploaded = waves or {}
+        all_waves = tuple(uploaded.get(joint, np.zeros(1)) for joint in range(self.joints))
+        return Playing(tuple(laws), all_waves, origin)
 
     def wave(self, samples: int = 97, seed: int = 1) -> Array:
-        """Return a waveform [V] in which no two places are alike."""
+        """Return a waveform [V] (samples,) of random values, so that its phase is unique."""
         return np.random.default_rng(seed).uniform(-self.volts, self.volts, samples)
 
     # -- requirements -----------------------------------------------------------------------
@@ -181,11 +181,11 @@ class Trial:
 
     def zero_somehow(self, driver: Watched, when: str) -> None:
         """Require that zeroing works within two calls."""
-        for left in (1, 0):
+        for remaining in (1, 0):
             try:
                 driver.zero_outputs()
             except DeviceError as error:
-                require(left, f"{when} zero_outputs failed twice: {error}")
+                require(remaining, f"{when} zero_outputs failed twice: {error}")
             else:
                 break
         self.zero_at_device(f"{when} and after zero_outputs")
@@ -193,7 +193,7 @@ class Trial:
     def until_law(self, driver: Watched, playing: Playing, first: int, count: int) -> None:
         """Read until `count` blocks from tick `first` on follow the law; earlier ones need not."""
         before: SampleBlock | None = None
-        seen = 0
+        followed = 0
         for _ in range(count + 50):
             block = driver.read_block()
             if before is not None:
@@ -202,19 +202,19 @@ class Trial:
             skip = max(0, first - block.tick)
             if skip < len(block.data):
                 require_law(rows_of(block, skip), playing, self.rig)
-                seen += 1
-            if seen == count:
+                followed += 1
+            if followed == count:
                 return
         raise NotConforming(f"no block at or after tick {first}, from which the laws act")
 
 
 def patiently(call: Callable[[], object]) -> None:
     """Repeat a call that a device refuses until it has detected the end of the previous link."""
-    for left in reversed(range(PATIENCE)):
+    for remaining in reversed(range(PATIENCE)):
         try:
             call()
         except DeviceError:
-            if not left:
+            if not remaining:
                 raise
             time.sleep(PAUSE)
         else:

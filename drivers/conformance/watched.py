@@ -23,9 +23,9 @@ class Skipped(Exception):
     """A check that cannot be made here; the message says why."""
 
 
-def require(holds: object, message: str) -> None:
-    """Raise NotConforming with `message` unless `holds`."""
-    if not holds:
+def require(condition: object, message: str) -> None:
+    """Raise NotConforming with `message` unless `condition` is true."""
+    if not condition:
         raise NotConforming(message)
 
 
@@ -36,7 +36,7 @@ class Watched:
     """
 
     def __init__(self, driver: Driver, rig: Rig) -> None:
-        self.bare = driver
+        self.unchecked = driver
         self.rig = rig
         self.log: list[str] = []
         self.info: DeviceInfo | None = None
@@ -56,62 +56,62 @@ class Watched:
 
     def connect(self) -> DeviceInfo:
         """Connect; return the device's info."""
-        self.info = self._call("connect", self.bare.connect)
+        self.info = self._call("connect", self.unchecked.connect)
         return self.info
 
     def close(self) -> None:
         """Close; not even a DeviceError may be raised."""
         try:
-            self._call("close", self.bare.close)
+            self._call("close", self.unchecked.close)
         except DeviceError as error:
             raise NotConforming(f"close raised {type(error).__name__}: {error}") from error
 
     def zero_outputs(self) -> None:
         """Zero the outputs."""
-        self._call("zero_outputs", self.bare.zero_outputs)
+        self._call("zero_outputs", self.unchecked.zero_outputs)
 
     def upload(self, joint: int, wave: Array) -> None:
         """Upload a waveform [V]."""
-        self._call(f"upload to joint {joint + 1}", lambda: self.bare.upload(joint, wave))
+        self._call(f"upload to joint {joint + 1}", lambda: self.unchecked.upload(joint, wave))
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Apply laws; the tick returned must be an integer, 0 or more."""
         name = "apply with restart" if restart else "apply"
-        tick = self._call(name, lambda: self.bare.apply(laws, restart=restart))
-        whole = isinstance(tick, int | np.integer) and tick >= 0
-        require(whole, f"apply returned {tick!r}, not the tick at which the laws act")
+        tick = self._call(name, lambda: self.unchecked.apply(laws, restart=restart))
+        valid = isinstance(tick, int | np.integer) and tick >= 0
+        require(valid, f"apply returned {tick!r}, not the tick at which the laws act")
         return int(tick)
 
     def start(self) -> None:
         """Start the stream."""
-        self._call("start", self.bare.start)
+        self._call("start", self.unchecked.start)
 
     def stop(self) -> None:
         """Stop the stream."""
-        self._call("stop", self.bare.stop)
+        self._call("stop", self.unchecked.stop)
 
     def reset(self) -> None:
         """Clear a trip."""
-        self._call("reset", self.bare.reset)
+        self._call("reset", self.unchecked.reset)
 
     def trip_cause(self) -> str | None:
         """Return the cause of the trip; it must be a text or None."""
-        cause = self._call("trip_cause", self.bare.trip_cause)
+        cause = self._call("trip_cause", self.unchecked.trip_cause)
         fits = cause is None or (isinstance(cause, str) and cause != "")
         require(fits, f"trip_cause returned {cause!r}, neither None nor a text")
         return cause
 
     def read_block(self) -> SampleBlock:
         """Read one block; its arrays must have the rig's shapes."""
-        block = self._call("read_block", self.bare.read_block)
+        block = self._call("read_block", self.unchecked.read_block)
         channels, columns = len(self.rig.channels), len(self.rig.recorded)
         rows = len(block.data)
         require(rows > 0, "read_block returned a block without samples")
-        for name, actual, wanted in (
+        for name, actual, expected in (
             ("data", block.data.shape, (rows, columns)),
             ("saturated", block.saturated.shape, (rows, channels)),
         ):
-            require(actual == wanted, f"a block's {name} has shape {actual}, expected {wanted}")
+            require(actual == expected, f"a block's {name} has shape {actual}, expected {expected}")
         require(block.saturated.dtype == np.bool_, "a block's saturated marks are not booleans")
         require(block.sequence >= 0, f"a block has the sequence number {block.sequence}")
         require(block.tick >= 0, f"a block has the tick {block.tick}")
@@ -139,7 +139,7 @@ def follows(before: SampleBlock, after: SampleBlock) -> None:
     require(
         (missing > 0) == (after.tick > end),
         f"block {before.sequence} ends at tick {end}, block {after.sequence} begins at "
-        f"{after.tick}: ticks and numbers do not tell the same gap",
+        f"{after.tick}: ticks and numbers state different gaps",
     )
 
 

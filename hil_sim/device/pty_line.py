@@ -40,15 +40,15 @@ class PtyLine:
         """Whether a host listens and everything has been sent."""
         return self.connected and not self._unsent
 
-    def receive(self, patience: float) -> bytes | None:
-        """Return the bytes that arrive within `patience` [s]; None when the host has closed."""
+    def receive(self, timeout: float) -> bytes | None:
+        """Return the bytes that arrive within `timeout` [s]; None when the host has closed."""
         events = select.POLLOUT if self._unsent else 0
         if len(self._unsent) < _MOST_UNSENT:
             events |= select.POLLIN
         self._poll.register(self.fd, events)
         if not self.connected:
-            patience = min(patience, _UNPLUGGED_SECONDS)
-        ready = self._poll.poll(patience * 1e3 if self.connected else 0)
+            timeout = min(timeout, _UNPLUGGED_SECONDS)
+        ready = self._poll.poll(timeout * 1e3 if self.connected else 0)
         happened = ready[0][1] if ready else 0
         if happened & select.POLLIN:
             self.connected = True
@@ -58,7 +58,7 @@ class PtyLine:
             gone, self.connected = self.connected, False
             if gone:
                 return None
-            time.sleep(patience)
+            time.sleep(timeout)
             return b""
         self.connected = True
         if happened & select.POLLOUT:

@@ -30,10 +30,10 @@ class BusNode:
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise EndpointError(f"cannot be a node of {bus}: {error}") from error
 
-    def receive(self, patience: float) -> list[CanFrame]:
+    def receive(self, timeout: float) -> list[CanFrame]:
         """Return the frames of the bus; see `Adapter`."""
         frames = []
-        message = self._bus.recv(patience)
+        message = self._bus.recv(timeout)
         while message is not None:
             if not message.is_error_frame and not message.is_remote_frame:
                 data = bytes(message.data)

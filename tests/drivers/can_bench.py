@@ -82,11 +82,11 @@ class SpoiledAdapter:
         """Whether somebody listens."""
         return bool(self._end.free)
 
-    def receive(self, patience: float) -> Any:
+    def receive(self, timeout: float) -> Any:
         """Return what has come."""
         while not self._calls.empty():
             self._calls.get()()
-        return self._end.receive(min(patience, 0.003))
+        return self._end.receive(min(timeout, 0.003))
 
     def send(self, pieces: Any) -> None:
         """Send what the fault leaves of it."""
@@ -170,11 +170,11 @@ class CanDevice(SpoiledAdapter):
         self.plant.piston[0] = 1.0
         return self.rig.channels.index(f"{ch.PISTON}_1")
 
-    def receive(self, patience: float) -> Any:
+    def receive(self, timeout: float) -> Any:
         """Return what has come; time passes where nobody is there."""
         if self._alone():
             self.now += STEP
-        return super().receive(patience)
+        return super().receive(timeout)
 
     def close(self) -> None:
         """End the server and its thread."""
@@ -219,7 +219,7 @@ def _can(faults: tuple[str, ...]) -> Iterator[DeviceUnderTest]:
 
     try:
         # Let a virtual device's answers be lost as soon as a real one's.
-        with patch.object(message_stream, "VIRTUAL_PATIENCE", 1.0):
+        with patch.object(message_stream, "VIRTUAL_TIMEOUT_FACTOR", 1.0):
             yield DeviceUnderTest(
                 served.rig,
                 driver,

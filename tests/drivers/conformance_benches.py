@@ -168,7 +168,7 @@ def _bench(wire: str, names: Sequence[str]) -> Iterator[DeviceUnderTest]:
         stack.callback(held.served.close)
         # Let a virtual device's answers be lost as soon as a real one's.
         for module in (modbus_tcp, message_stream):
-            stack.enter_context(patch.object(module, "VIRTUAL_PATIENCE", 1.0))
+            stack.enter_context(patch.object(module, "VIRTUAL_TIMEOUT_FACTOR", 1.0))
         yield DeviceUnderTest(
             held.rig,
             driver,

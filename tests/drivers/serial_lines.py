@@ -181,11 +181,11 @@ class Loop:
                 self._arrived.extend(self.back.pass_on(answer))
         self._push()
 
-    def read(self, patience: float) -> bytes:
+    def read(self, timeout: float) -> bytes:
         """Return one piece; time passes only where none is waiting."""
         if not self.is_open:
             raise DeviceLost("closed")
-        end = self.now + patience
+        end = self.now + timeout
         while not self._arrived and self.now < end:
             self.now = min(end, self.now + max(self.device.idle_seconds(), 1e-3))
             self.device.poll()

@@ -97,7 +97,7 @@ class Loop:
         self.lines += [said("<-", answer) for answer in answers]
         self._waiting += answers
 
-    def receive(self, patience: float) -> list[tuple[int, bytes]]:
+    def receive(self, timeout: float) -> list[tuple[int, bytes]]:
         frames, self._waiting = self._waiting, []
         return [(frame.identifier, frame.data) for frame in frames]
 

@@ -137,7 +137,7 @@ def test_other_traffic_on_the_bus_changes_nothing(bus: str) -> None:
                 read(driver, 1)
     ticks = [driver.read_block().tick for _ in range(20)]
     assert np.diff(ticks) == pytest.approx(10)
-    assert driver._link._line._port.seen.foreign >= 100  # type: ignore[attr-defined]
+    assert driver._link._line._port.counts.foreign >= 100  # type: ignore[attr-defined]
     driver.close()
 
 

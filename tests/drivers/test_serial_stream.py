@@ -74,7 +74,7 @@ def over(line: BadLine) -> SerialStreamDriver:
         except DeviceBusy:  # the device has not noticed yet that the line of the test before ended
             assert time.monotonic() < end
             time.sleep(0.05)
-    driver._link.be_patient(1.0)
+    driver._link.extend_timeout(1.0)
     driver.reset()
     return driver
 

@@ -53,8 +53,8 @@ class Adapter(Protocol):
     def attended(self) -> bool:
         """Whether a program has the bus open."""
 
-    def receive(self, patience: float) -> list[CanFrame]:
-        """Return the frames that arrive within `patience` [s], at once if there are any."""
+    def receive(self, timeout: float) -> list[CanFrame]:
+        """Return the frames that arrive within `timeout` [s], at once if there are any."""
 
     def send(self, frames: list[CanFrame]) -> None:
         """Send frames in their order."""
@@ -119,11 +119,11 @@ class SocketcandServer:
         """Whether a program is connected."""
         return bool(self._clients)
 
-    def receive(self, patience: float) -> list[CanFrame]:
+    def receive(self, timeout: float) -> list[CanFrame]:
         """Return the frames that programs have sent; see `Adapter`."""
         full = [client.end for client in self._clients if client.unsent]
         ends = [self._listener, *(client.end for client in self._clients)]
-        ready, writable, _ = select.select(ends, full, [], patience)
+        ready, writable, _ = select.select(ends, full, [], timeout)
         if self._listener in ready:
             self._accept()
         frames = []
@@ -226,9 +226,9 @@ class SlcanLine:
         # At another rate an adapter only receives and causes errors.
         return self._opened and self._rate == self._bitrate
 
-    def receive(self, patience: float) -> list[CanFrame]:
+    def receive(self, timeout: float) -> list[CanFrame]:
         """Return the frames that the program has sent; see `Adapter`."""
-        data = self._line.receive(patience)
+        data = self._line.receive(timeout)
         if data is None:
             self._partial, self._opened = b"", False
             return []

@@ -141,9 +141,9 @@ class ValveBench:
         pairs = zip(self.valves, self._rig.joints, strict=True)
         return [valve.set_point * joint.valve.command_range for valve, joint in pairs]
 
-    def poll(self, patience: float) -> None:
-        """Receive frames for `patience` [s] at most, run the plant, supervise the heartbeat."""
-        for frame in self._adapter.receive(patience):
+    def poll(self, timeout: float) -> None:
+        """Receive frames for `timeout` [s] at most, run the plant, supervise the heartbeat."""
+        for frame in self._adapter.receive(timeout):
             self._catch_up()
             if frame.identifier == cia408.SYNC_ID:
                 self._transmit()
