@@ -50,7 +50,7 @@ class LogFormatter(logging.Formatter):
         return alarm(line) if getattr(record, "alarm", False) else line
 
 
-def _say(message: str) -> None:
+def _print_error(message: str) -> None:
     from rig.bench.outputs import UNSURE
 
     for part in message.strip().splitlines() or [""]:
@@ -67,8 +67,8 @@ def _unwritable_output() -> str:
     """Return the name of standard output if it is a full file or device, '' if it is not."""
     full = False
     try:
-        kept = stat.S_ISREG(os.fstat(_STDOUT).st_mode)
-        full = kept and not os.fstatvfs(_STDOUT).f_bavail
+        is_file = stat.S_ISREG(os.fstat(_STDOUT).st_mode)
+        full = is_file and not os.fstatvfs(_STDOUT).f_bavail
         os.write(_STDOUT, b"")  # /dev/full refuses even this
     except OSError:
         full = True
@@ -98,7 +98,7 @@ def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., 
 
 
 def code_and_message(error: BaseException) -> tuple[int, str]:
-    """Return the exit code of an exception, and what a person is told about it."""
+    """Return the exit code of an exception, and the message that the user reads."""
     for kinds, code, text in _codes():
         if isinstance(error, kinds):
             return code, _with_notes(error, text(error))
@@ -110,12 +110,12 @@ def code_and_message(error: BaseException) -> tuple[int, str]:
 
 
 def _with_notes(error: BaseException, message: str) -> str:
-    """Return the message with the bench's notes; outputs that may not be zero are stated first."""
+    """Return the message with the bench's notes, outputs that may not be at zero first."""
     from rig.bench.outputs import UNSURE
 
     notes = list(getattr(error, "__notes__", ()))
-    first = [note for note in notes if note == UNSURE]
-    return "; ".join([*first[:1], message, *(note for note in notes if note != UNSURE)])
+    unsure = [note for note in notes if note == UNSURE]
+    return "; ".join([*unsure[:1], message, *(note for note in notes if note != UNSURE)])
 
 
 def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
@@ -123,21 +123,21 @@ def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
     try:
         code = work() or OK
         if code == INTERRUPTED:
-            _say("stopped")
+            _print_error("stopped")
         return code
     except typer.Exit as error:
         return error.exit_code
     except typer.Abort:
-        _say("stopped")
+        _print_error("stopped")
         return INTERRUPTED
     except TyperException as error:
-        _say(f"{error.format_message().rstrip('.')}; see --help")
+        _print_error(f"{error.format_message().rstrip('.')}; see --help")
         return BAD_INPUT
     except SystemExit as error:
         # Typer ends the process at a closed pipe, without a message.
         if not isinstance(error.__context__, BrokenPipeError):
             raise
-        return OK if _reader_is_gone() else _failed(error.__context__, debug)
+        return OK if _reader_has_closed() else _failed(error.__context__, debug)
     except (Exception, KeyboardInterrupt) as error:
         return _failed(error, debug)
 
@@ -146,15 +146,15 @@ def _failed(error: BaseException, debug: bool) -> int:
     if debug:
         traceback.print_exception(error)
     code, message = code_and_message(error)
-    _say(message)
+    _print_error(message)
     return code
 
 
-def _reader_is_gone() -> bool:
+def _reader_has_closed() -> bool:
     """Return whether the reader of standard output has closed it (`| head`); not an error."""
     output = select.poll()
     output.register(_STDOUT, 0)  # reports errors only
-    gone = bool(output.poll(0))
-    if gone:
+    closed = bool(output.poll(0))
+    if closed:
         discard(_STDOUT)
-    return gone
+    return closed

@@ -61,8 +61,8 @@ def command_line(verbs: Sequence[str]) -> typer.Typer:
     return app
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         from importlib.metadata import version
 
         typer.echo(f"bramah {version('bramah')}")
@@ -94,7 +94,7 @@ def _summary(name: str) -> str:
     raise AssertionError(f"rig/cli/verbs/{name}.py has no verb")
 
 
-def _typed(words: Sequence[str]) -> Sequence[str]:
+def _words_of_call(words: Sequence[str]) -> Sequence[str]:
     """Return the words of a call, or those typed so far if a shell asks for a completion."""
     if COMPLETING not in os.environ:
         return words
@@ -111,7 +111,7 @@ def __getattr__(name: str) -> Any:
 
 
 class Interruption:
-    """A signal's handler that raises KeyboardInterrupt, and keeps that it was called (`heard`).
+    """A signal's handler that raises KeyboardInterrupt; `heard` states whether it was called.
 
     A library that calls Python may swallow the exception; `rig.bench.stops` then still stops.
     """
@@ -140,7 +140,7 @@ def run(arguments: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, Interruption())
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
         signal.signal(signal.SIGINT, Interruption())
-    verb = next((word for word in _typed(words) if not word.startswith("-")), "")
+    verb = next((word for word in _words_of_call(words) if not word.startswith("-")), "")
 
     def work() -> int | None:
         app = command_line([verb])

@@ -27,15 +27,15 @@ def _protocols(incomplete: str) -> list[str]:
     return [name for name in shipped_names() if name.startswith(incomplete)]
 
 
-_TAKEN: Final = "output files"  # key of a context's notes: file to option
+_OUTPUT_FILES: Final = "output files"  # key of a context's notes: file to option
 
 
 def writable_file(
     context: typer.Context, param: typer.CallbackParam, path: Path | None
 ) -> Path | None:
-    """Return the file that a verb shall write; raises InputError where it could not.
+    """Return the file that a verb is to write; raises InputError where it cannot be written.
 
-    Called while the options are read: what is refused here has cost no computation.
+    Called while the options are read, before any computation.
     """
     if path is None or str(path) == "-":
         return path
@@ -52,8 +52,8 @@ def writable_file(
         raise InputError(f"{option}: is part of the run {path.parent}; name another file")
     if reason := no_place_for(path):
         raise InputError(f"{option}: {reason}; name a file in a folder that can be written")
-    taken = context.meta.setdefault(_TAKEN, {})
-    other = taken.setdefault(path.absolute(), param.opts[0])
+    options_of_files = context.meta.setdefault(_OUTPUT_FILES, {})
+    other = options_of_files.setdefault(path.absolute(), param.opts[0])
     if other != param.opts[0]:
         raise InputError(f"{option}: {other} writes that file as well; name two files")
     return path
@@ -144,9 +144,9 @@ def overridden(
     from protocols.files import library
     from protocols.files.plan import Overrides
 
-    kept = tuple(steps) if steps else None
+    step_names = tuple(steps) if steps else None
     values = library.parsed_values(settings or ())
-    return Overrides(repeats, duration, amplitude_scale, seed, kept, values)
+    return Overrides(repeats, duration, amplitude_scale, seed, step_names, values)
 
 
 def time_since(text: str | None) -> datetime | None:

@@ -99,13 +99,13 @@ class Replayed(Loop):
         super().__init__(request, lambda line: None)
         self._others, self._takes = list(rounds), takes
 
-    def _take(self, *arguments: object) -> None:
+    def _record(self, *arguments: object) -> None:
         pass
 
     def _trace(self, number: int, experiment: object) -> None:
         self.rounds.append(self._others[min(number, len(self._others)) - 1])
 
-    def _within(self, path: Path, sizes: object) -> bool:
+    def _passes_check(self, path: Path, sizes: object) -> bool:
         return self._takes
 
 

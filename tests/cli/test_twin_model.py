@@ -18,7 +18,7 @@ from analysis.terms.base import Used
 from protocols.files.library import read_protocol
 from protocols.files.plan import Plan, resolve
 from rig.cli.proof.proofs import PlanProof, proved
-from rig.cli.proof.twin_choice import kept_model, save_identified, source_text, twin_source
+from rig.cli.proof.twin_choice import last_model_path, save_identified, source_text, twin_source
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
@@ -225,7 +225,7 @@ def test_a_model_worse_than_nominal_values_is_left_with_a_warning(  # type: igno
 ) -> None:
     bad = spoil(identified(rig, 1.2))
     assert words in unusable(bad, rig)
-    kept = kept_model(RIG)
+    kept = last_model_path(RIG)
     kept.parent.mkdir(parents=True)
     save_model(bad, kept)
     proof = proved(plan(rig), rig)
@@ -276,7 +276,7 @@ def test_the_age_of_a_model_is_stated(rig: Rig, tmp_path: Path) -> None:
 def test_a_damaged_model_is_named_and_both_options_at_once_refused(
     rig: Rig, tmp_path: Path
 ) -> None:
-    kept = kept_model(RIG)
+    kept = last_model_path(RIG)
     kept.parent.mkdir(parents=True)
     kept.write_bytes(b"\xff{")
     assert str(kept) in proved(plan(rig), rig).warning

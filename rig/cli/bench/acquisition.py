@@ -30,7 +30,7 @@ def measure_acquisition(
         raise ValueError("lateness cannot be measured on a device in virtual time; use real time")
     if seconds <= 0.0:
         raise ValueError(f"a measurement takes longer than {seconds:g} s")
-    wanted = round(seconds * info.sample_rate)
+    required_ticks = round(seconds * info.sample_rate)
     ends: list[float] = []
     arrivals: list[float] = []
     lost = disordered = samples = 0
@@ -45,7 +45,7 @@ def measure_acquisition(
             lost += max(block.tick - expected, 0)
             disordered += block.tick < expected
             expected = max(expected, block.tick + len(block.data))
-            if expected - first >= wanted:
+            if expected - first >= required_ticks:
                 break
             block = driver.read_block()
     finally:

@@ -44,8 +44,8 @@ class ProcessorTime:
 
 def processor_time(work: Callable[[], object]) -> ProcessorTime:
     """Return the processor time of `work`, done several times."""
-    (only,) = processor_times({"": work}).values()
-    return only
+    (single,) = processor_times({"": work}).values()
+    return single
 
 
 def processor_times(
@@ -58,7 +58,7 @@ def processor_times(
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
         for name, work in works.items():
-            began = time.process_time()
+            start = time.process_time()
             work()
-            times[name].append(time.process_time() - began)
+            times[name].append(time.process_time() - start)
     return {name: ProcessorTime(min(t), float(np.median(t))) for name, t in times.items()}

@@ -41,7 +41,7 @@ from rig.runs.store import load_run
 
 # Smaller seeds were used for tuning; these and larger ones serve for evaluation only.
 JUDGING_SEED = 100
-# Approximate time of a group on two cores [s]; `demo`: per seed. Other groups report their own.
+# Approximate time of a group on two cores [s]; `demo`: per seed. Other groups report progress.
 SECONDS: Final = {
     "plant": 20.0, "analysis": 60.0, "stream": 60.0, "demo": 30.0, "growth": 120.0, "run": 20.0,
     "trace": 45.0,
@@ -113,7 +113,7 @@ def demo_figures(folder: Path, say: Say, seeds: int) -> list[Figure]:
         say(f"demo: seed {seed}")
         started = time.monotonic()
         done = experiment(folder / f"seed-{seed}", seed, Overrides(), _quiet)
-        spent = time.monotonic() - started
+        seconds = time.monotonic() - started
         errors, margins = parameter_errors(done), fit_margins(done)
         bulk = abs(errors.pop("b"))
         worst = max(errors, key=lambda name: abs(errors[name]))
@@ -123,7 +123,7 @@ def demo_figures(folder: Path, say: Say, seeds: int) -> list[Figure]:
             Figure(group, f"worst error but b ({worst})", abs(errors[worst]), "%", 2.0),
             Figure(group, "error of b", bulk, "%", 5.0),
             Figure(group, f"FIT over the paper's, least ({least})", margins[least], "%", 0.0, True),
-            Figure(group, "the whole loop", spent, "s", 120.0),
+            Figure(group, "the whole loop", seconds, "s", 120.0),
         ]
     return figures
 
@@ -200,12 +200,12 @@ def measure(
         seconds = {name: expected.get(name, SECONDS.get(name, 0.0)) for name in chosen}
         figures: list[Figure] = []
         for number, name in enumerate(chosen):
-            left = sum(seconds[later] for later in chosen[number:])
-            about = f", about {clock_text(left)} left" if left else ""
-            say(f"{name}: group {number + 1} of {len(chosen)}{about}")
-            own = Path(folder) / name  # two groups may use the same names of runs
-            own.mkdir()
-            figures += groups[name](own, say)
+            remaining = sum(seconds[later] for later in chosen[number:])
+            remaining_text = f", about {clock_text(remaining)} left" if remaining else ""
+            say(f"{name}: group {number + 1} of {len(chosen)}{remaining_text}")
+            group_folder = Path(folder) / name  # two groups may use the same names of runs
+            group_folder.mkdir()
+            figures += groups[name](group_folder, say)
         return figures
 
 

@@ -73,7 +73,7 @@ class Reference:
             ]
         )
 
-    def rates(self, target: Array, warmth: float) -> Callable[[float, Array], Array]:
+    def rates(self, target: Array, bulk_ratio: float) -> Callable[[float, Array], Array]:
         """Return the right-hand side of the whole state for constant spool targets."""
         n, size, t = self.n, 5 * self.n + 3, self.tables
         work = np.zeros((n + 4, n))
@@ -84,7 +84,7 @@ class Reference:
             kernel.rates(
                 y[:size],
                 u - t.joints["null"],
-                warmth,
+                bulk_ratio,
                 t.joints,
                 self.bench,
                 t.inertia,
@@ -100,11 +100,11 @@ class Reference:
 
     def advance(self, target: Array, **options: Any) -> None:
         """Integrate one tick."""
-        heat = kernel_loop.temperature(self.tick * self.period, self.bench)
-        warmth = 1.0 + self.bench.bulk_temperature * (heat - self.bench.temperature)
+        T_oil = kernel_loop.temperature(self.tick * self.period, self.bench)
+        bulk_ratio = 1.0 + self.bench.bulk_temperature * (T_oil - self.bench.temperature)
         rtol = options.pop("rtol")
         result = solve_ivp(
-            self.rates(target, warmth), (0.0, self.period), self.y, rtol=rtol,
+            self.rates(target, bulk_ratio), (0.0, self.period), self.y, rtol=rtol,
             atol=rtol * self.scale, **options,
         )  # fmt: skip
         self.y = result.y[:, -1]

@@ -45,25 +45,25 @@ def write_rows(path: Path, rows: int) -> None:
 def streamed(path: str) -> dict[str, Any]:
     """Solve a file of rows block by block: time [s], peak memory of this process [B], solution."""
     started = time.perf_counter()
-    whole = Accumulator(COLUMNS)
+    total = Accumulator(COLUMNS)
     with Path(path).open("rb") as file:
         while True:
             block = np.fromfile(file, count=READ_ROWS * (COLUMNS + 1))
             if not len(block):
                 break
             block = block.reshape(-1, COLUMNS + 1)
-            whole.fold(block[:, :-1], block[:, -1])
-    R = whole.triangle
+            total.fold(block[:, :-1], block[:, -1])
+    R = total.triangle
     solution = np.linalg.solve(R[:-1, :-1], R[:-1, -1])
     seconds = time.perf_counter() - started
-    return {"seconds": seconds, "peak": peak_memory(), "rows": whole.rows, "solution": solution}
+    return {"seconds": seconds, "peak": peak_memory(), "rows": total.rows, "solution": solution}
 
 
 def in_memory(path: str) -> dict[str, Any]:
     """Solve a file of rows by numpy's lstsq; the time excludes loading the rows."""
-    every = np.fromfile(path).reshape(-1, COLUMNS + 1)
-    X, y = np.ascontiguousarray(every[:, :-1]), every[:, -1].copy()
-    del every
+    all_rows = np.fromfile(path).reshape(-1, COLUMNS + 1)
+    X, y = np.ascontiguousarray(all_rows[:, :-1]), all_rows[:, -1].copy()
+    del all_rows
     started = time.perf_counter()
     solution = np.linalg.lstsq(X, y)[0]
     seconds = time.perf_counter() - started
@@ -98,7 +98,7 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
             estimates.append(min(results, key=lambda result: float(result["seconds"])))
     path.unlink()
     stream, whole = estimates
-    off = np.abs(stream["solution"] / whole["solution"] - 1.0).max()
+    difference = np.abs(stream["solution"] / whole["solution"] - 1.0).max()
     return {
         "rows": float(stream["rows"]),
         "stream_seconds": stream["seconds"],
@@ -106,7 +106,7 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
         "lstsq_seconds": whole["seconds"],
         "lstsq_peak_bytes": whole["peak"],
         "ratio": stream["seconds"] / whole["seconds"],
-        "difference": float(off),
+        "difference": float(difference),
     }
 
 
@@ -141,8 +141,8 @@ def cluster_figures(folders: Sequence[str]) -> dict[str, float]:
             used = [after - before[w] for w, after in watcher.run(time.process_time).items()]
             busiest[workers] = min(busiest[workers], max(used))
             values.append([estimate.value for estimate in result.estimates.values()])
-    here = identify_folders(folders)
-    expected = np.array([estimate.value for estimate in here.estimates.values()])
+    reference = identify_folders(folders)
+    expected = np.array([estimate.value for estimate in reference.estimates.values()])
     return {
         "one_seconds": best[1],
         "two_seconds": best[2],

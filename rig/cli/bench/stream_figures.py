@@ -75,10 +75,10 @@ def _tracking(folder: Path, say: Say) -> list[Figure]:
     spent = time.process_time() - spent
     blocks = sum(record.samples for record in run.records) / BLOCK
     batch = identify([run], reject_noise=False, estimator=PLAIN).estimates
-    off = max(abs(e.value / batch[n].value - 1.0) for n, e in tracker.estimates().items())
+    difference = max(abs(e.value / batch[n].value - 1.0) for n, e in tracker.estimates().items())
     handed = _handover(rig, run.records[0], folder)
     return [
-        Figure(GROUP, "tracker against the batch, largest difference", off, "", 1e-9),
+        Figure(GROUP, "tracker against the batch, largest difference", difference, "", 1e-9),
         Figure(GROUP, "handing a 10 ms block on, mean", 1e3 * float(handed.mean()), "ms", 2.0),
         Figure(GROUP, "handing on, 99 %", 1e3 * float(np.quantile(handed, 0.99)), "ms", 2.0),
         Figure(GROUP, "handing on, worst", 1e3 * float(handed.max()), "ms"),
@@ -88,15 +88,15 @@ def _tracking(folder: Path, say: Say) -> list[Figure]:
 
 def _handover(rig: Rig, record: Record, folder: Path) -> np.ndarray:
     """Return the time [s] that handing each block of a record to the tracker takes."""
-    fill = np.zeros(record.samples)
-    data = np.column_stack([record.channels.get(name, fill) for name in rig.recorded])
-    seen = np.zeros((BLOCK, len(rig.channels)), dtype=bool)
+    zeros = np.zeros(record.samples)
+    data = np.column_stack([record.channels.get(name, zeros) for name in rig.recorded])
+    saturated = np.zeros((BLOCK, len(rig.channels)), dtype=bool)
     meta = RecordMeta(record.step, record.repeat, record.locked, record.period, record.lines)
     spent = []
     with Tracking(rig, folder / "none", lambda _: None, math.inf) as tracking:
         tracking.record_begins(meta, 0, record.samples)
         for tick in range(0, record.samples, BLOCK):
-            block = SampleBlock(0, tick, data[tick : tick + BLOCK], seen, 0, False)
+            block = SampleBlock(0, tick, data[tick : tick + BLOCK], saturated, 0, False)
             started = time.perf_counter()
             tracking.block(block)
             spent.append(time.perf_counter() - started)

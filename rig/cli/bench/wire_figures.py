@@ -75,10 +75,11 @@ def wire_figures(say: Say, minutes: float) -> list[Figure]:
         figures += acquisition_of(wire, 60.0 * minutes)
         if wire not in _BARE:
             continue
-        ours, bare = driver_and_bare(wire)
+        by_driver, by_library = driver_and_bare(wire)
+        ratio = by_driver / by_library
         figures += [
-            Figure(GROUP, f"{wire}: a block by the driver", 1e3 * ours, "ms"),
-            Figure(GROUP, f"{wire}: driver over the bare library", ours / bare, "x as long", 1.3),
+            Figure(GROUP, f"{wire}: a block by the driver", 1e3 * by_driver, "ms"),
+            Figure(GROUP, f"{wire}: driver over the bare library", ratio, "x as long", 1.3),
         ]
     return figures
 
@@ -91,14 +92,14 @@ def stream_of(wire: str, seconds: float) -> Stream:
         tempfile.TemporaryDirectory(prefix="bramah-wires-") as folder,
     ):
         # Late blocks of a stalled computer are to be measured and must not end the session.
-        patient = rig.wire.model_copy(update={"watchdog": WATCHDOG_RANGE[1]})
-        reached = reached_at(rig.model_copy(update={"wire": patient}), endpoint)
+        slow_watchdog = rig.wire.model_copy(update={"watchdog": WATCHDOG_RANGE[1]})
+        reached = reached_at(rig.model_copy(update={"wire": slow_watchdog}), endpoint)
         recorder = Recorder(Path(folder) / "run", reached)
         with Bench(reached, make_driver(reached.wire, reached), recorder, signals=False) as bench:
             bench.run_for(0.5)  # excludes imports and opening of files
-            lost, busy, began = bench.lost_samples, time.process_time(), time.perf_counter()
+            lost, busy, start = bench.lost_samples, time.process_time(), time.perf_counter()
             ends, arrivals, waits, samples, disordered = [], [], [], 0, 0
-            while time.perf_counter() - began < seconds:
+            while time.perf_counter() - start < seconds:
                 before = bench.tick
                 block = bench.exchange()
                 arrivals.append(time.perf_counter())
@@ -106,7 +107,7 @@ def stream_of(wire: str, seconds: float) -> Stream:
                 ends.append((block.tick + len(block.data)) / reached.sample_rate)
                 samples += len(block.data)
                 disordered += block.tick < before
-            share = (time.process_time() - busy) / (time.perf_counter() - began)
+            share = (time.process_time() - busy) / (time.perf_counter() - start)
             lost = bench.lost_samples - lost
     late, _ = lateness(np.array(ends), np.array(arrivals))
     worst = int(late.argmax())
@@ -137,23 +138,23 @@ def acquisition_of(wire: str, seconds: float) -> list[Figure]:
 def driver_and_bare(wire: str) -> tuple[float, float]:
     """Return the times [s] of one block by the driver and by the bare library, best of several."""
     rig = load_rig(RIG)
-    ours, bare = [], []
+    by_driver, by_library = [], []
     with simulated_bench(RIG, seed=0, wire=wire) as endpoint:
         reached = reached_at(rig, endpoint)
         for _ in range(ROUNDS):
             with _streaming(reached) as driver:
-                ours.append(_time_of(driver.read_block))
-            with _BARE[wire](reached) as ask:
-                bare.append(_time_of(ask))
-    return min(ours), min(bare)
+                by_driver.append(_time_of(driver.read_block))
+            with _BARE[wire](reached) as read_one:
+                by_library.append(_time_of(read_one))
+    return min(by_driver), min(by_library)
 
 
-def _time_of(ask: Callable[[], object]) -> float:
-    ask()
-    began = time.perf_counter()
+def _time_of(read_one: Callable[[], object]) -> float:
+    read_one()
+    start = time.perf_counter()
     for _ in range(BLOCKS):
-        ask()
-    return (time.perf_counter() - began) / BLOCKS
+        read_one()
+    return (time.perf_counter() - start) / BLOCKS
 
 
 @contextmanager
@@ -174,7 +175,7 @@ def bare_modbus(rig: Rig) -> Iterator[Callable[[], object]]:
     client.connect()
     words = [0xFFFF, 0]
 
-    def ask() -> None:
+    def read_one() -> None:
         words[1] = (words[1] + 1) & 0xFFFF
         answer = client.readwrite_registers(
             read_address=reg.BLOCK.address,
@@ -187,25 +188,25 @@ def bare_modbus(rig: Rig) -> Iterator[Callable[[], object]]:
 
     try:
         client.write_register(reg.CONTROL_STREAM.address, reg.STREAM_START, device_id=1)
-        yield ask
+        yield read_one
         client.write_register(reg.CONTROL_STREAM.address, reg.STREAM_STOP, device_id=1)
     finally:
         client.close()
 
 
 def _client(wire: Wire) -> Any:
-    at = wire.settings
+    settings = wire.settings
     if wire.kind == RTU:
-        return ModbusSerialClient(at["device"], baudrate=921_600, timeout=2.0)
-    return ModbusTcpClient(at["host"], port=at["port"], timeout=2.0)
+        return ModbusSerialClient(settings["device"], baudrate=921_600, timeout=2.0)
+    return ModbusTcpClient(settings["host"], port=settings["port"], timeout=2.0)
 
 
 @contextmanager
 def _bare_serial(rig: Rig) -> Iterator[Callable[[], object]]:
     """Send messages and receive blocks with pyserial and the frames' encoding alone."""
-    at, heart = SerialSettings.of(rig.wire), 0
+    settings, heartbeat = SerialSettings.of(rig.wire), 0
     decoder = FrameDecoder()
-    with serial.Serial(at.device, at.baud, timeout=2.0) as port:
+    with serial.Serial(settings.device, settings.baud, timeout=2.0) as port:
 
         def send(kind: Message, number: int, payload: bytes = b"") -> None:
             port.write(encode_frame(WireFrame(kind, number, _SESSION, payload)))
@@ -224,13 +225,13 @@ def _bare_serial(rig: Rig) -> Iterator[Callable[[], object]]:
         request(Message.START, 2)
         last = msg.NOTHING_YET
 
-        def ask() -> None:
-            nonlocal heart, last
-            heart = (heart + 1) & 0xFFFF
-            send(Message.ALIVE_NOTE, 2, msg.pack_alive(msg.Alive(last, heart)))
+        def read_one() -> None:
+            nonlocal heartbeat, last
+            heartbeat = (heartbeat + 1) & 0xFFFF
+            send(Message.ALIVE_NOTE, 2, msg.pack_alive(msg.Alive(last, heartbeat)))
             last = struct.unpack_from(">H", receive()[-1].payload, 2)[0]
 
-        yield ask
+        yield read_one
         request(Message.CLOSE, 3)
 
 

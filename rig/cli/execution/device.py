@@ -1,4 +1,4 @@
-"""The device of a verb, and the list of places under pressure."""
+"""Find the rig and the driver of a verb; print the places under pressure."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
     """Return a rig, with the wire of `endpoint` if given, and its unconnected driver."""
     from drivers import make_driver
 
-    described = bench_at(rig, endpoint)
-    return described, make_driver(described.wire, described)
+    bench = bench_at(rig, endpoint)
+    return bench, make_driver(bench.wire, bench)
 
 
 def refuse_endpoint_alone(rig: str | None, endpoint: str | None) -> None:
-    """Raise InputError for an endpoint without a rig, which says what is at it."""
+    """Raise InputError for `--endpoint` without `--rig`, which describes the device there."""
     from rig.model.parse import InputError
 
     if rig is None and endpoint is not None:
-        raise InputError("--endpoint does not say what is there; name the bench: --rig RIG")
+        raise InputError("--endpoint does not describe the bench there; name it: --rig RIG")
 
 
 def only_bench(rigs: list[Path], none: str, state: str) -> Path:
-    """Return the description of the only bench of this computer in a state (`tripped`, `in use`).
+    """Return the rig file of the only bench of this computer in a state (`tripped`, `in use`).
 
     Raises InputError that asks for `--rig`, with the reason `none` where there is none.
     """
@@ -64,8 +64,8 @@ def only_bench(rigs: list[Path], none: str, state: str) -> Path:
         return rigs[0]
     if not rigs:
         raise InputError(f"{none}; name the bench: --rig RIG")
-    known = (load_rig(path) for path in rigs)
-    places = ", ".join(f"{rig.name} at {rig.wire.endpoint}" for rig in known)
+    benches = (load_rig(path) for path in rigs)
+    places = ", ".join(f"{rig.name} at {rig.wire.endpoint}" for rig in benches)
     raise InputError(f"{len(rigs)} benches are {state}: {places}; name one: --rig RIG")
 
 
@@ -84,7 +84,7 @@ def _require_wire(name: str, rig: Rig) -> None:
         raise InputError(f"{source}:{line}: {error}") from error
 
 
-def print_pressure(places: list[str], *, aside: bool = False) -> None:
-    """Print the places still under pressure, if any; `aside`: to standard error."""
+def print_pressure(places: list[str], *, to_stderr: bool = False) -> None:
+    """Print the places still under pressure, if any; `to_stderr`: to standard error."""
     if places:
-        typer.echo(f"still under pressure: {', '.join(places)}", err=aside)
+        typer.echo(f"still under pressure: {', '.join(places)}", err=to_stderr)

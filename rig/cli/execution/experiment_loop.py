@@ -36,8 +36,8 @@ log = logging.getLogger(__name__)
 
 PROTOCOL: Final = "lock-and-excite-multisine"
 HELD_OUT: Final = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
-SMALLER = 0.8  # scale of each further attempt after the bench or its twin refused
-TRIES = 4
+SMALLER = 0.8  # factor on the amplitude after each refusal by the bench or its twin
+TRIES = 4  # amplitudes of one experiment
 
 FLOOR: Final = "the remaining residual is within the noise"
 NOTHING: Final = "no experiment within the limits predicts a separation above the noise"
@@ -65,18 +65,18 @@ class LoopRequest:
     ask: Callable[[Mapping[str, Any]], bool] = lambda experiment: True
 
 
-def refuse_taken(out: Path) -> None:
+def refuse_used_folder(out: Path) -> None:
     """Raise InputError if the folder holds the runs of an earlier loop."""
-    taken = out / "run-1"
-    if taken.exists():
-        raise InputError(f"--out {out}: {taken} exists already; expected a folder without runs")
+    first_run = out / "run-1"
+    if first_run.exists():
+        raise InputError(f"--out {out}: {first_run} exists already; expected a folder without runs")
 
 
 class Loop:
     """A running loop: finished `rounds`; `stopped`, the reason of its end ('' while it runs)."""
 
     def __init__(self, request: LoopRequest, say: Callable[[str], None]) -> None:
-        refuse_taken(request.out)
+        refuse_used_folder(request.out)
         self.request, self.say = request, say
         self.rig: Rig = load_bench(request.rig)
         self.rounds: list[Round] = []
@@ -86,7 +86,7 @@ class Loop:
 
     def run(self) -> None:
         """Run rounds until an ending condition holds; raises the error that ends a run."""
-        self._take(1, self.request.protocol, self.request.overrides, HELD_OUT)
+        self._record(1, self.request.protocol, self.request.overrides, HELD_OUT)
         self._trace(1, None)
         while not self.stopped:
             number = len(self.rounds) + 1
@@ -118,11 +118,11 @@ class Loop:
             self.train, self.judge, seed=self.request.seed,
             progress=Countdown(f"round {number}: tracing", self.say),
         )  # fmt: skip
-        worth = None
+        gain = None
         if experiment is not None:
-            worth = achieved(self.rig, self.train[:-1], self.train[-1], experiment)
+            gain = achieved(self.rig, self.train[:-1], self.train[-1], experiment)
         names = tuple(f"{kind}-{number}" for kind in ("run", "holdout"))
-        self.rounds.append(Round(number, names, experiment, result, worth))
+        self.rounds.append(Round(number, names, experiment, result, gain))
         self.say(f"round {number}: {result.verdict}: {result.sentence}")
 
     def _perform(self, number: int, experiment: Mapping[str, Any]) -> bool:
@@ -131,13 +131,13 @@ class Loop:
         for path, key in ((files["next"], "protocol"), (files["judge"], "holdout")):
             text = yaml.safe_dump(dict(experiment[key]), sort_keys=False, allow_unicode=True)
             replace_text(path, text)
-        # The twin of an incomplete model predicts the range of motion badly: leave a margin.
+        # An incomplete model predicts the range of motion badly: leave a margin.
         scale = SMALLER if self.rounds[-1].result.verdict == UNEXPLAINED else 1.0
         for _ in range(TRIES):
             sizes = Overrides(amplitude_scale=scale)
-            if all(self._within(path, sizes) for path in files.values()):
+            if all(self._passes_check(path, sizes) for path in files.values()):
                 try:
-                    self._take(number, str(files["next"]), sizes, sizes, str(files["judge"]))
+                    self._record(number, str(files["next"]), sizes, sizes, str(files["judge"]))
                     return True
                 except ProtocolAborted as error:
                     self.say(f"round {number}: {error}")
@@ -146,33 +146,31 @@ class Loop:
             self.say(f"round {number}: trying again at {scale:.2f} times the amplitude")
         return False
 
-    def _within(self, path: Path, sizes: Overrides) -> bool:
+    def _passes_check(self, path: Path, sizes: Overrides) -> bool:
         try:
-            known = load_twin(twin_source(self.rig), self.rig)
-            plan = resolve(library.load(path), known.rig, sizes)
-            return check(plan, known.rig, known.twin, draws=known.draws).ok
+            parameters = load_twin(twin_source(self.rig), self.rig)
+            plan = resolve(library.load(path), parameters.rig, sizes)
+            return check(plan, parameters.rig, parameters.twin, draws=parameters.draws).ok
         except InputError as error:
             log.info("%s at %.2f: %s", path, sizes.amplitude_scale, error)
             return False
 
-    def _take(
+    def _record(
         self, number: int, protocol: str, sizes: Overrides, held_out: Overrides,
-        other: str | None = None,
+        held_out_protocol: str | None = None,
     ) -> None:  # fmt: skip
         """Run the training records of a round, then its hold-out records."""
-        first = self._run(f"run-{number}", protocol, sizes)
-        second = self._run(f"holdout-{number}", other or protocol, held_out)
-        self.train.append(first)
-        self.judge.append(second)
+        training = self._run(f"run-{number}", protocol, sizes)
+        held_out_run = self._run(f"holdout-{number}", held_out_protocol or protocol, held_out)
+        self.train.append(training)
+        self.judge.append(held_out_run)
 
     def _run(self, name: str, protocol: str, sizes: Overrides) -> Run:
-        w = self.request
+        loop = self.request
         self.say(f"{name}: {protocol}")
-        return load_run(
-            run_protocol(
-                ProtocolJob(protocol, w.rig, w.out / name, w.endpoint, sizes, w.operator), self.say
-            )
-        )
+        out = loop.out / name
+        job = ProtocolJob(protocol, loop.rig, out, loop.endpoint, sizes, loop.operator)
+        return load_run(run_protocol(job, self.say))
 
     def _set_aside(self, number: int) -> None:
         """Rename an aborted run, so that the next attempt can use the name."""

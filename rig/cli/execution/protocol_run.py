@@ -1,4 +1,4 @@
-"""The work of the verbs `run` and `reset`: protocol, check on the twin, bench, run folder."""
+"""Run a protocol: check it on the twin, drive the bench, record. Clear a trip."""
 
 from __future__ import annotations
 
@@ -44,14 +44,15 @@ if TYPE_CHECKING:
 # A sample takes 8 bytes per channel in the journal, the same in records.h5, which is written before
 # the journal is removed, and some more in the journal's write-ahead log.
 COPIES = 2.5
-SPARE = 200e6  # [bytes] to leave free on the disk
+SPARE = 200e6  # [bytes] that must stay free on the disk
 
 
 @dataclass(frozen=True)
 class ProtocolJob:
     """One unattended run: protocol, bench and run folder.
 
-    It is proved on the twin with the parameters of `model`, of the last identified one, or nominal.
+    It is proved on the twin with the parameters of `model`, by default of the last identified one,
+    or with `nominal` the rig file's. `memory` [s] is the tracker's forgetting time constant.
     """
 
     protocol: str
@@ -78,9 +79,9 @@ class _PhaseReport:
         recorder = self._bench.recorder
         at = 0.0 if recorder is None else recorder.elapsed
         left = self._bench.expected - at
-        # The estimate counts the whole phase, which may have ended early.
-        more = f"  ({clock_text(left)} left)" if left > 0.0 and phase != "done" else ""
-        self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{more}")
+        # The expected duration counts whole phases, one of which may have ended early.
+        suffix = f"  ({clock_text(left)} left)" if left > 0.0 and phase != "done" else ""
+        self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{suffix}")
         self._message = message
         self._bench.event("phase", self._bench.tick, step=step, phase=phase, message=message)
         self._bench.status(
@@ -107,7 +108,7 @@ def _publisher(rig: Rig, say: Say) -> Publisher | None:
     try:
         return Publisher(rig.name)
     except AttachError as error:
-        # A run must not fail for want of a screen.
+        # A run must not fail because no screen can attach.
         say(f"no screen can attach to this run: {error}")
         return None
 
@@ -141,22 +142,22 @@ def _read_answer() -> str | None:
 
 
 class TrackedEstimates:
-    """The tracker's estimates for a protocol's conditions (see `run_inputs.Estimates`)."""
+    """The tracker's estimates, for a protocol's conditions (see `run_inputs.Estimates`)."""
 
     def __init__(self, tracking: Tracking) -> None:
         self._tracking = tracking
 
     def values(self) -> Mapping[str, float]:
         """Return each finite estimate [SI] and its relative standard deviation, as NAME.rsd."""
-        entered: dict[str, float] = {}
+        values: dict[str, float] = {}
         for name, estimate in self._tracking.parameters.items():
             value, std = estimate["value"], estimate["std"]
             if value is None:
                 continue
-            entered[name] = float(value)
+            values[name] = float(value)
             if std is not None and value:
-                entered[f"{name}.rsd"] = abs(float(std) / float(value))
-        return {name: value for name, value in entered.items() if math.isfinite(value)}
+                values[f"{name}.rsd"] = abs(float(std) / float(value))
+        return {name: value for name, value in values.items() if math.isfinite(value)}
 
     def complete(self, record: str) -> bool:
         """Return whether the estimates include a record; True if the tracker has ended."""
@@ -164,7 +165,7 @@ class TrackedEstimates:
 
 
 def needed_bytes(plan: Plan, rig: Rig) -> float:
-    """Return the largest size [bytes] of a run, if every condition reaches its time-out."""
+    """Return the size [bytes] of a run in which every condition reaches its time-out."""
     return COPIES * 8.0 * len(rig.recorded) * rig.sample_rate * plan.longest
 
 
@@ -208,8 +209,8 @@ def _seeds(plan: Plan) -> dict[str, int]:
 def _provenance(job: ProtocolJob, plan: Plan) -> dict[str, Any]:
     """Return the provenance of a run for its run.yaml: what is needed to repeat it."""
     text, source = rig_text(job.rig)
-    usual = asdict(Overrides())
-    changed = {k: v for k, v in asdict(job.overrides).items() if v != usual[k]}
+    defaults = asdict(Overrides())
+    changed = {k: v for k, v in asdict(job.overrides).items() if v != defaults[k]}
     return {
         "command": shlex.join(["bramah", *sys.argv[1:]]),
         "files": {"protocol": _file(*_protocol_text(job.protocol)), "rig": _file(text, source)},
@@ -220,8 +221,8 @@ def _provenance(job: ProtocolJob, plan: Plan) -> dict[str, Any]:
 
 def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol and return its run folder; raises the error that ended it, outputs at zero."""
-    rig, how = bench_at(job.rig, job.endpoint), job.overrides
-    plan = resolve(library.load(job.protocol, how.parameters), rig, how)
+    rig, overrides = bench_at(job.rig, job.endpoint), job.overrides
+    plan = resolve(library.load(job.protocol, overrides.parameters), rig, overrides)
     refuse_occupied(job.out)
     run_machine = StateMachine()
     run_machine.to(EngineState.CHECKING, plan.protocol.name)
@@ -234,9 +235,10 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     proof.report.require()
     for note in proof.report.notes:
         say(f"note: {note}")
-    many = "" if len(plan.records) == 1 else "s"
+    plural = "" if len(plan.records) == 1 else "s"
     say(
-        f"running {len(plan.records)} record{many}, about {plan.seconds:.0f} s of the device's time"
+        f"running {len(plan.records)} record{plural}, about {plan.seconds:.0f} s of the device's "
+        "time"
     )
     recorder = Recorder(
         job.out,
@@ -255,8 +257,8 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         bench.describe([PlanLine(part.name, part.title, part.seconds) for part in plan.sequence])
         inputs = RunInputs(machine=run_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
-            followed = tracking  # for mypy: not None in the closure
-            tracking.subscribe(report.note, lambda text: report.tracked(text, followed))
+            tracker = tracking  # for mypy: not None in the closure
+            tracking.subscribe(report.note, lambda text: report.tracked(text, tracker))
             bench.observers.add(tracking)
             inputs = replace(inputs, estimates=TrackedEstimates(tracking))
         engine.run(plan, rig, bench, report.phase, inputs)
@@ -266,25 +268,25 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
 def reset_device(rig: str | None, endpoint: str | None, reason: str) -> str:
     """Clear a bench's latched trip for a person's `reason`; return the cause of the trip.
 
-    `rig` may be the name in a rig file too, as messages on a trip state it: the rig is then that
-    which was driven last under this name. Without one it is the only bench with a stored trip.
+    `rig` may also be the name in a rig file, as in messages on a trip: this is the rig driven last
+    under that name. The default is the only bench with a stored trip.
     """
     refuse_endpoint_alone(rig, endpoint)
     if rig is None:
         rig = str(only_bench(tripped_rigs(), "no trip is stored on this computer", "tripped"))
     try:
-        described, driver = device_of(rig, endpoint)
+        bench, driver = device_of(rig, endpoint)
     except InputError:
-        known = [path for path in known_rigs() if _is_named(path, rig)]
-        if not known:
+        candidates = [path for path in known_rigs() if _is_named(path, rig)]
+        if not candidates:
             raise
-        latest = max(known, key=lambda path: path.stat().st_mtime)
-        described, driver = device_of(str(latest), endpoint)
-    return reset_bench(described, driver, reason)
+        latest = max(candidates, key=lambda path: path.stat().st_mtime)
+        bench, driver = device_of(str(latest), endpoint)
+    return reset_bench(bench, driver, reason)
 
 
 def _is_named(path: Path, name: str) -> bool:
-    """Return whether a rig that can be read has a name."""
+    """Return whether a rig file can be read and its rig has this name."""
     try:
         return load_rig(path).name == name
     except InputError:

@@ -42,12 +42,12 @@ from rig.runs.runstate import EventLog
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-KEPT = 5.0  # [s] of samples kept from before a record is announced
+RECENT_SECONDS = 5.0  # [s] of samples kept from before a record is announced
 NAME = "tracked.json"
-WAITING = 30_000  # length of the tracker's queue in messages: five minutes of blocks, about 40 MB
-SAY_EVERY = 2.0  # [s] of wall time
-FINISH = 20.0  # [s] allowed for the tracker to finish after the run
-NICE = 5
+QUEUE_LENGTH = 30_000  # messages in the tracker's queue: five minutes of blocks, 40 MB
+REPORT_EVERY = 2.0  # [s] of wall time between two reports of the estimates
+FINISH_SECONDS = 20.0  # [s] allowed for the tracker to finish after the run
+NICE = 5  # priority of the tracker's process below that of the acquisition
 
 
 class Follower:
@@ -56,18 +56,18 @@ class Follower:
     def __init__(self, rig: Rig, tracker: Tracker) -> None:
         self._tracker = tracker
         self._names = rig.recorded
-        self._kept = round(KEPT * rig.sample_rate)
+        self._recent_samples = round(RECENT_SECONDS * rig.sample_rate)
         self._recent: deque[tuple[int, Array]] = deque()
-        self._next: int | None = None  # first tick of the current record not yet fed
-        self._last: int | None = None  # end of the current record, exclusive, if known
+        self._next_tick: int | None = None  # first tick of the current record not yet fed
+        self._record_end: int | None = None  # end of the current record, exclusive, if known
 
     def block(self, tick: int, data: Array) -> bool:
-        """Take a block (n, channels) from `tick` on; return whether the estimates have changed."""
+        """Add a block (n, channels) that begins at `tick`; return whether the estimates changed."""
         self._recent.append((tick, data))
         newest = tick + len(data)
-        while self._recent[0][0] + len(self._recent[0][1]) < newest - self._kept:
+        while self._recent[0][0] + len(self._recent[0][1]) < newest - self._recent_samples:
             self._recent.popleft()
-        return self._next is not None and self._feed(newest)
+        return self._next_tick is not None and self._feed(newest)
 
     def begins(self, head: RecordHead, start: int, ticks: int | None = None) -> None:
         """Begin a record at tick `start`; feed its samples that have arrived already.
@@ -75,27 +75,27 @@ class Follower:
         Give the length `ticks` if it is fixed in advance, because blocks may reach beyond the end.
         """
         self._tracker.begin(head)
-        self._next, self._last = start, None if ticks is None else start + ticks
+        self._next_tick, self._record_end = start, None if ticks is None else start + ticks
         if self._recent:
             tick, data = self._recent[-1]
             self._feed(tick + len(data))
 
     def ends(self, start: int, ticks: int, complete: bool) -> None:
         """End the current record after `ticks` samples; discard it if it is not complete."""
-        if self._next is None:
+        if self._next_tick is None:
             return
-        self._last = start + ticks
-        if complete and self._next <= self._last:
-            self._feed(self._last)
+        self._record_end = start + ticks
+        if complete and self._next_tick <= self._record_end:
+            self._feed(self._record_end)
             self._tracker.end()
         else:
             self._tracker.discard()
-        self._next = None
+        self._next_tick = None
 
     def _feed(self, last: int) -> bool:
-        """Feed the samples from the next tick up to `last`; NaN for missing samples."""
-        first = self._next
-        last = last if self._last is None else min(last, self._last)
+        """Feed the samples from the next tick up to `last` (exclusive); NaN for missing ones."""
+        first = self._next_tick
+        last = last if self._record_end is None else min(last, self._record_end)
         if first is None or last <= first:
             return False
         part = np.full((last - first, len(self._names)), np.nan)
@@ -103,7 +103,7 @@ class Follower:
             low, high = max(first, tick), min(last, tick + len(data))
             if low < high:
                 part[low - first : high - first] = data[low - tick : high - tick]
-        self._next = last
+        self._next_tick = last
         return self._tracker.feed({name: part[:, k] for k, name in enumerate(self._names)})
 
 
@@ -140,7 +140,7 @@ class Tracking:
         if not memory > 0.0:
             raise InputError(f"--memory {memory:g}: expected more than 0 s")
         self.parameters: dict[str, Any] = {}
-        # By family: rms of the residual of new rows, and of their right side.
+        # By family: rms of the prediction error of new rows, and of their right side.
         self.residuals: dict[str, list[float]] = {}
         self.worst_handover = 0.0
         self._rig, self._out, self._say, self._memory = rig, out, say, memory
@@ -148,7 +148,7 @@ class Tracking:
         self._notes: list[Callable[[dict[str, Any]], None]] = []
         self._shows: list[Callable[[str], None]] = []
         self._dropped = 0
-        self._next_say = -math.inf
+        self._next_report = -math.inf
 
     def subscribe(
         self, note: Callable[[dict[str, Any]], None], show: Callable[[str], None]
@@ -162,12 +162,13 @@ class Tracking:
         endpoint = f"ipc://{self._scratch.enter_context(scratch_folder())}/track"
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
-        self._socket.set(zmq.SNDHWM, WAITING)
+        self._socket.set(zmq.SNDHWM, QUEUE_LENGTH)
         self._socket.set(zmq.LINGER, 0)
         # This end connects, so that it queues messages sent before the tracker is ready.
         self._socket.connect(endpoint)
         settings = TrackingSettings(self._rig, self._memory, endpoint)
-        self._process = get_context("spawn").Process(target=work, args=(settings,), daemon=True)
+        spawn = get_context("spawn")
+        self._process = spawn.Process(target=track_run, args=(settings,), daemon=True)
         with environment():
             self._process.start()
         return self
@@ -203,14 +204,14 @@ class Tracking:
 
     def _finish(self) -> None:
         """Wait for the last estimates and write all estimates into the run folder."""
-        noted = len(self._history)
+        written = len(self._history)
         self._notes, self._shows = [], []  # the bench is closed, so waiting is safe
         self._send([b"stop"])
-        deadline = time.monotonic() + FINISH
+        deadline = time.monotonic() + FINISH_SECONDS
         ended = False
         while not ended and self._process.is_alive() and time.monotonic() < deadline:
             if self._socket.poll(100):
-                ended = self._hear()
+                ended = self._receive()
         if not self.parameters:
             return
         self._say(f"tracked: {summary(self.parameters)}")
@@ -221,7 +222,7 @@ class Tracking:
         if self._out.is_dir():
             write_json(self._out / NAME, data)
             events = EventLog(self._out)
-            for entry in self._history[noted:]:  # the delayed messages of a slow tracker
+            for entry in self._history[written:]:  # the delayed messages of a slow tracker
                 events.append("tracked", None, entry)
             events.close()
 
@@ -232,7 +233,7 @@ class Tracking:
         started = time.perf_counter()
         tick = str(block.tick).encode()
         self._send([b"block", tick, np.ascontiguousarray(block.data, dtype="<f8").tobytes()])
-        self._hear()
+        self._receive()
         self.worst_handover = max(self.worst_handover, time.perf_counter() - started)
 
     def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
@@ -241,13 +242,13 @@ class Tracking:
             meta.name, meta.step, meta.locked, meta.repeat, self._rig.sample_rate, 0,
             tuple(self._rig.recorded), start / self._rig.sample_rate, meta.period, meta.lines,
         )  # fmt: skip
-        place = json.dumps([start, ticks]).encode()
-        self._send([b"begin", place, json.dumps(asdict(head)).encode()])
+        span = json.dumps([start, ticks]).encode()
+        self._send([b"begin", span, json.dumps(asdict(head)).encode()])
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
         """Announce the end of a record."""
-        words = [str(start), str(ticks), state, meta.name]
-        self._send([b"end", *(word.encode() for word in words)])
+        fields = [str(start), str(ticks), state, meta.name]
+        self._send([b"end", *(field.encode() for field in fields)])
 
     def _send(self, parts: list[bytes]) -> None:
         try:
@@ -259,8 +260,8 @@ class Tracking:
                     "the tracker is too slow and loses samples; the run's record is complete"
                 )
 
-    def _hear(self) -> bool:
-        """Read the tracker's messages; return whether the last one has come."""
+    def _receive(self) -> bool:
+        """Read the tracker's messages; return whether the last one is among them."""
         while True:
             try:
                 reply = json.loads(self._socket.recv(zmq.NOBLOCK))
@@ -283,8 +284,8 @@ class Tracking:
                     )
                 for note in self._notes:
                     note(entry)
-            elif time.monotonic() >= self._next_say:
-                self._next_say = time.monotonic() + SAY_EVERY
+            elif time.monotonic() >= self._next_report:
+                self._next_report = time.monotonic() + REPORT_EVERY
                 line = summary(self.parameters)
                 self._say(f"           {line}")
                 for show in self._shows:
@@ -294,13 +295,13 @@ class Tracking:
 # In the tracker's process
 
 
-def work(settings: TrackingSettings) -> None:
-    """Process messages until told to stop or until the run's process has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run sends the message to stop
+def track_run(settings: TrackingSettings) -> None:
+    """Process messages until one ends it, or until the run's process has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run sends a message instead
     os.nice(NICE)  # the acquisition has priority
     context = zmq.Context()
     socket = context.socket(zmq.PAIR)
-    socket.set(zmq.RCVHWM, WAITING)
+    socket.set(zmq.RCVHWM, QUEUE_LENGTH)
     socket.set(zmq.LINGER, 2000)
     socket.bind(settings.endpoint)
     try:
@@ -322,15 +323,15 @@ def _serve(settings: TrackingSettings, socket: zmq.Socket[bytes]) -> None:
             if parent is not None and not parent.is_alive():
                 return
             continue
-        kind, *words = socket.recv_multipart()
+        kind, *fields = socket.recv_multipart()
         if kind == b"block":
-            data = np.frombuffer(words[1], dtype="<f8").reshape(-1, width)
-            if follower.block(int(words[0]), data):
+            data = np.frombuffer(fields[1], dtype="<f8").reshape(-1, width)
+            if follower.block(int(fields[0]), data):
                 _reply(socket, "now", tracker)
         elif kind == b"begin":
-            follower.begins(_head(json.loads(words[1])), *json.loads(words[0]))
+            follower.begins(_head(json.loads(fields[1])), *json.loads(fields[0]))
         elif kind == b"end":
-            start, ticks, state, name = (word.decode() for word in words)
+            start, ticks, state, name = (field.decode() for field in fields)
             follower.ends(int(start), int(ticks), state == "complete")
             if state == "complete":
                 _reply(socket, "record", tracker, record=name, rows=tracker.record_rows)
@@ -345,16 +346,16 @@ def _head(data: dict[str, Any]) -> RecordHead:
     return RecordHead(**fields)
 
 
-def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str | int) -> None:
+def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **fields: str | int) -> None:
     estimates: dict[str, Estimate] = tracker.estimates()
-    known = {name: estimate_json(e) for name, e in estimates.items()}
-    if all(e["value"] is None for e in known.values()):
-        known = {}
-    left = {
+    parameters = {name: estimate_json(e) for name, e in estimates.items()}
+    if all(e["value"] is None for e in parameters.values()):
+        parameters = {}
+    residuals = {
         family: [residual.rms, residual.size] for family, residual in tracker.residuals().items()
     }
-    said = {"kind": kind, "parameters": known, "residuals": left, **more}
+    message = {"kind": kind, "parameters": parameters, "residuals": residuals, **fields}
     try:
-        socket.send_string(json.dumps(said), zmq.NOBLOCK)
+        socket.send_string(json.dumps(message), zmq.NOBLOCK)
     except zmq.Again:
         log.debug("the run does not read the estimates; they are dropped")

@@ -63,7 +63,7 @@ def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
 
 
 def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
-    """Return the detection lines of each step and joint, at the step's common period."""
+    """Return the numbers of the detection lines (not excited) by step and joint."""
     return {
         (step.name, e.joint): tuple(
             k * (step.period // e.wave.period) for k in e.wave.detection_lines
@@ -78,11 +78,11 @@ def designed_step(plan: Plan, planned: TwinStep, tones: Mapping[int, Tone]) -> S
     step = next(s for s in plan.steps if s.name == planned.name)
     source = next(s for s in plan.protocol.excitations if s.name == planned.name)
     excite = []
-    for part in source.excite:
-        tone = tones[part.joint - 1]
-        wave = Waveform(planned.waves[part.joint - 1], tone.chosen, tone.empty)
+    for stage in source.excite:
+        tone = tones[stage.joint - 1]
+        wave = Waveform(planned.waves[stage.joint - 1], tone.chosen, tone.empty)
         signal = chosen_lines(wave, plan.sample_rate / step.period)
-        excite.append(part.model_copy(update={"signal": signal}))
+        excite.append(stage.model_copy(update={"signal": signal}))
     # A record of one or several common periods keeps that length.
     seconds = step.record / plan.sample_rate
     return source.model_copy(update={"excite": tuple(excite), "duration": seconds})
@@ -90,11 +90,11 @@ def designed_step(plan: Plan, planned: TwinStep, tones: Mapping[int, Tone]) -> S
 
 def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
     """Return the plan's protocol with all its steps as designed."""
-    better = {
+    designed = {
         planned.name: designed_step(plan, planned, tones)
         for planned, tones in zip(design.steps, design.tones, strict=True)
     }
-    steps = mapped(plan.protocol.steps, lambda step: better.get(step.name or "", step))
+    steps = mapped(plan.protocol.steps, lambda step: designed.get(step.name or "", step))
     update = {
         "name": f"{plan.protocol.name}-{criterion.lower().replace('_', '-')}",
         "description": f"{plan.protocol.description}; designed for {criterion}",
@@ -105,11 +105,11 @@ def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
 
 @dataclass(frozen=True)
 class CheckedForecast:
-    """Limits of a protocol on the twin, and its predicted errors; None for the reason `why`."""
+    """Limits of a protocol on the twin, and its predicted errors; None for a `reason`."""
 
     limits: CheckReport
     prediction: Prediction | None
-    why: str = ""
+    reason: str = ""
     stated: Wire | None = None
 
 
@@ -152,17 +152,17 @@ def of_plan(
     Errors are predicted with the rig's nominal values, for the terms common to all models.
     """
 
-    def part(begin: float, end: float) -> Callable[[float], None] | None:
+    def stage(begin: float, end: float) -> Callable[[float], None] | None:
         return None if report is None else lambda share: report(begin + (end - begin) * share)
 
     rig = parameters.rig
-    limits = check(plan, rig, parameters.twin, part(0.0, CHECKED), parameters.draws)
+    limits = check(plan, rig, parameters.twin, stage(0.0, CHECKED), parameters.draws)
     biases = {step.step: step.biases for step in limits.steps}
     if not plan.steps:
         return CheckedForecast(limits, None, "it takes no records of excited joints")
     try:
         steps = planned_steps(plan, biases)
-        predicted = predict(rig, steps, jitter=jitter_of(rig), progress=part(CHECKED, 1.0))
+        predicted = predict(rig, steps, jitter=jitter_of(rig), progress=stage(CHECKED, 1.0))
         return CheckedForecast(limits, predicted, stated=rig.wire)
     except InputError as error:
         return CheckedForecast(limits, None, str(error))
@@ -171,7 +171,7 @@ def of_plan(
 def prediction_json(forecast: CheckedForecast) -> dict[str, Any]:
     """Return the prediction, or the reason for its absence, as plain data."""
     if forecast.prediction is None:
-        return {"impossible": forecast.why}
+        return {"impossible": forecast.reason}
     return to_json(forecast.prediction)
 
 
@@ -185,7 +185,7 @@ def prediction_text(forecast: CheckedForecast) -> str:
     """Return predicted errors, conditioning and undetermined parameters as text."""
     p = forecast.prediction
     if p is None:
-        return f"standard errors cannot be predicted: {forecast.why}"
+        return f"standard errors cannot be predicted: {forecast.reason}"
     rows = [
         [name, f"{e.nominal:.4g}", percent(e.std), percent(e.half), percent(e.oil)]
         for name, e in p.parameters.items()
@@ -267,8 +267,8 @@ def design_text(designed: DesignedProtocol, out: Path | None) -> str:
         rows.append([name, percent(e.std), percent(later.std), ratio])
     lines = [table(["parameter", "before %", "after %", "ratio"], rows), ""]
     for step, (share, limit) in designed.design.shares_after.items():
-        was, which = designed.design.shares_before[step]
-        lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
+        old_share, old = designed.design.shares_before[step]
+        lines.append(f"{limit} at {share:.0%} of its limit (before: {old} at {old_share:.0%})")
     written = "--out FILE writes it" if out is None else f"written to {out}"
     lines.append(
         f"trials: {designed.design.evaluated}, kept: {designed.design.accepted}; {written}"

@@ -28,7 +28,7 @@ from rig.runs.files import cache_folder
 
 Progress = Callable[[float], None]
 NAME = "proof.json"
-KEPT = 200  # largest number of proofs in the cache; the oldest are removed
+CACHE_SIZE = 200  # largest number of proofs; the oldest are removed
 _ROOT = Path(__file__).parents[3]
 _SOURCES = (
     "analysis/signals", "analysis/simulation", "analysis/terms", "analysis/regression",
@@ -56,7 +56,7 @@ class PlanProof:
     reused: bool = False
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
+        """Return the proof as JSON data."""
         return {
             "key": self.key,
             "report": self.report.as_dict(),
@@ -92,9 +92,9 @@ def proved(
     """
     source = twin_source(rig) if source is None else source
     key = proof_key(plan, rig, source)
-    kept = _from_cache(key)
-    if kept is not None and (kept.text or not predict):
-        return replace(kept, source=source, report=replace(kept.report, places=plan.places))
+    cached = _from_cache(key)
+    if cached is not None and (cached.text or not predict):
+        return replace(cached, source=source, report=replace(cached.report, places=plan.places))
     parameters = load_twin(source, rig)
     from protocols.design.check import NotCentred
     from protocols.design.check_report import remedy_text
@@ -106,11 +106,11 @@ def proved(
         remedy = remedy_text(scale)
         raise InputError(f"{refused}; {remedy}; the twin uses {parameters.text}") from refused
     if not report.ok:
-        bad = {check.step for check in report.steps if not check.ok}
+        refused_steps = {check.step for check in report.steps if not check.ok}
         scales = {
             step.name: _passing_scale(step, parameters)
             for step in plan.excitations
-            if step.name in bad
+            if step.name in refused_steps
         }
         report = report.with_remedies(scales)
     report = replace(report, twin=parameters.text)
@@ -140,7 +140,7 @@ def _passing_scale(step: StepPlan, parameters: TwinParameters) -> float | None:
 
 
 def proof_key(plan: Plan, rig: Rig, source: TwinSource) -> str:
-    """Return the hash of what a proof depends on."""
+    """Return the SHA-256 hash of everything that a proof depends on."""
     parts = (
         plan.protocol.model_dump_json(),
         rig.model_dump_json(exclude={"wire"}),
@@ -180,6 +180,6 @@ def _to_cache(proof: PlanProof) -> None:
     folder = cache_folder() / "proofs"
     with suppress(OSError):  # without the cache the plan is proved again next time
         write_json(folder / f"{proof.key}.json", proof.as_dict())
-        kept = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
-        for old in kept[:-KEPT]:
+        proofs = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
+        for old in proofs[:-CACHE_SIZE]:
             old.unlink(missing_ok=True)

@@ -46,10 +46,10 @@ def plan_steps(
         proof = prove(library.load(protocol), rig, tools)
     else:
         progress(f"trying every lock-and-excite step of {rig.name} on its twin")
-        made = generate(rig, tools, f"lock-and-excite-{rig.name}")
-        proof = made.proof
+        generated = generate(rig, tools, f"lock-and-excite-{rig.name}")
+        proof = generated.proof
         if out is not None:
-            _write(out, made.protocol, name)
+            _write(out, generated.protocol, name)
     if validation_out is not None:
         _write(validation_out, validation(rig, tools.twin, f"validate-{rig.name}"), name)
     return proof

@@ -1,4 +1,4 @@
-"""Source of the twin's parameters: the last identified model, a given model file, or nominal.
+"""Choose the twin's parameters: the last identified model, a given model file, or nominal.
 
 `identify --model`, `trace --model` and `loop` keep a copy of their model, one per rig, in the
 persistent folder `rig.bench.latch.state_folder`. A proof uses this model if it fits the rig and
@@ -38,12 +38,13 @@ _HASH_SHOWN = 12  # digits of a checksum shown to people
 class TwinSource:
     """Source of the twin's parameters: a model file, or none (nominal values).
 
-    `shown`: the name of the file in messages; for a kept copy, that of the original.
-    `simulated`: one of the model's runs was in virtual time, so on a simulated bench.
+    `from_user`: the file was given as an option, not kept by `save_identified`. `shown`: its name
+    in messages; for a kept copy, that of the original. `simulated`: one of the model's runs was in
+    virtual time, so on a simulated bench.
     """
 
     path: Path | None = None
-    asked: bool = False
+    from_user: bool = False
     sha256: str = ""
     shown: str = ""
     saved: str = ""
@@ -52,7 +53,7 @@ class TwinSource:
     @property
     def key(self) -> str:
         """The text of the source in the key of a proof."""
-        return f"{self.sha256} {self.shown} {self.asked}" if self.path else "nominal"
+        return f"{self.sha256} {self.shown} {self.from_user}" if self.path else "nominal"
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the source as plain data for JSON, None for nominal values."""
@@ -78,7 +79,7 @@ class TwinParameters:
     warning: str = ""
 
 
-def kept_model(rig: str) -> Path:
+def last_model_path(rig: str) -> Path:
     """Return the path of a rig's last identified model, which may not exist."""
     readable = re.sub(r"[^A-Za-z0-9.-]", "_", rig)
     code = hashlib.sha256(rig.encode()).hexdigest()[:8]
@@ -92,7 +93,7 @@ def twin_source(rig: Rig, model: Path | None = None, nominal: bool = False) -> T
     """
     if model is not None and nominal:
         raise InputError("--model and --nominal exclude each other: expected one of them")
-    path = kept_model(rig.name) if model is None else model
+    path = last_model_path(rig.name) if model is None else model
     if nominal or (model is None and not path.exists()):
         return TwinSource()
     try:
@@ -100,14 +101,14 @@ def twin_source(rig: Rig, model: Path | None = None, nominal: bool = False) -> T
         changed = path.stat().st_mtime
     except OSError as error:
         raise InputError(f"cannot read the model file {path}: {error}") from error
-    origin = _provenance(raw)
-    saved = str(origin.get(_SAVED) or datetime.fromtimestamp(changed, UTC).isoformat())
-    shown = str(model if model is not None else origin.get(_FILE) or path)
-    code, simulated = hashlib.sha256(raw).hexdigest(), origin.get(_SIMULATED) is True
+    provenance = _provenance_of(raw)
+    saved = str(provenance.get(_SAVED) or datetime.fromtimestamp(changed, UTC).isoformat())
+    shown = str(model if model is not None else provenance.get(_FILE) or path)
+    code, simulated = hashlib.sha256(raw).hexdigest(), provenance.get(_SIMULATED) is True
     return TwinSource(path, model is not None, code, shown, saved, simulated)
 
 
-def _provenance(raw: bytes) -> Mapping[str, Any]:
+def _provenance_of(raw: bytes) -> Mapping[str, Any]:
     try:
         provenance = json.loads(raw)["provenance"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -119,10 +120,10 @@ def source_text(source: TwinSource, now: datetime | None = None) -> str:
     """Return the source and the age of its model in words."""
     if source.path is None:
         return "the nominal values of the rig file"
-    which = "model" if source.asked else "last identified model"
-    of = "of a SIMULATED bench, " if source.simulated else ""
+    what = "model" if source.from_user else "last identified model"
+    kind = "of a SIMULATED bench, " if source.simulated else ""
     return (
-        f"the {which} {source.shown} ({of}{_age_text(source.saved, now)} old, SHA-256 "
+        f"the {what} {source.shown} ({kind}{_age_text(source.saved, now)} old, SHA-256 "
         f"{source.sha256[:_HASH_SHOWN]})"
     )
 
@@ -131,8 +132,8 @@ def twin_text(source: TwinSource, warning: str = "") -> str:
     """Return the source of the twin's parameters, or why it uses nominal values instead."""
     if warning:
         return f"WARNING: {warning}"
-    drawn = "" if source.path is None else "; limits hold at the edge of its 95 % intervals"
-    return f"the twin uses {source_text(source)}{drawn}"
+    note = "" if source.path is None else "; limits hold at the edge of its 95 % intervals"
+    return f"the twin uses {source_text(source)}{note}"
 
 
 def _age_text(saved: str, now: datetime | None = None) -> str:
@@ -166,7 +167,7 @@ def load_twin(source: TwinSource, rig: Rig) -> TwinParameters:
         reason = unusable(model, rig)
     except InputError as error:
         reason = str(error)
-    if reason and source.asked:
+    if reason and source.from_user:
         raise InputError(f"{source.shown} cannot be the twin of rig {rig.name!r}: {reason}")
     if reason:
         warning = (
@@ -185,12 +186,12 @@ def _twin_of(model: Model, rig: Rig, source: TwinSource) -> TwinParameters:
     from analysis.simulation.twin import simulate_commands
 
     # The physics is that of the model's rig; limits, wire and rate are those of the rig file.
-    here = replace(model, rig=rig)
+    of_rig = replace(model, rig=rig)
     rng = np.random.default_rng(SIMULATION.twin_seed)
-    draws = model_draws(here, SIMULATION.twin_draws, rng)
+    draws = model_draws(of_rig, SIMULATION.twin_draws, rng)
     return TwinParameters(
         rig.model_copy(update={"nominal": {**rig.nominal, **model.values}}),
-        partial(simulate_commands, model=here),
+        partial(simulate_commands, model=of_rig),
         tuple(partial(simulate_commands, model=draw) for draw in draws),
         f"model {source.shown}",
     )
@@ -228,11 +229,11 @@ def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> Non
     if reason:
         say(f"note: {path} is not used by check and run: {reason}")
         return
-    kept = kept_model(model.rig.name)
+    copy_path = last_model_path(model.rig.name)
     try:
-        kept.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        save_model(dated, kept)
+        copy_path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        save_model(dated, copy_path)
     except OSError as error:
-        say(f"note: {path} could not be stored for check and run ({kept}: {error.strerror})")
+        say(f"note: {path} could not be stored for check and run ({copy_path}: {error.strerror})")
         return
     say(f"check and run of rig {model.rig.name} now use {path} for the twin (unless --nominal)")

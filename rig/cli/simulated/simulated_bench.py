@@ -24,20 +24,20 @@ SCENARIO: Final = "scenario"  # key beside the parameters' names
 
 
 @contextmanager
-def _state_of_its_own() -> Iterator[None]:
+def _temporary_state_folder() -> Iterator[None]:
     """Keep a bench's stored state (`rig.bench.latch`) in a temporary folder.
 
     A trip latched by an earlier simulated bench on the same port must not block a new one.
     """
-    before = os.environ.get(STATE_VARIABLE)
+    previous = os.environ.get(STATE_VARIABLE)
     with scratch_folder() as folder:
         os.environ[STATE_VARIABLE] = str(folder)
         try:
             yield
         finally:
             os.environ.pop(STATE_VARIABLE)
-            if before is not None:
-                os.environ[STATE_VARIABLE] = before
+            if previous is not None:
+                os.environ[STATE_VARIABLE] = previous
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def simulated_bench(
     words += ["--real-time"] if real_time else []
     words += [] if scenario is None else ["--scenario", str(scenario)]
     with (
-        _state_of_its_own(),
+        _temporary_state_folder(),
         subprocess.Popen(
             [sys.executable, "-c", _START, *words],
             stdout=subprocess.PIPE,

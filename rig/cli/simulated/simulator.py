@@ -1,4 +1,4 @@
-"""The `sim` verb's work: build the plant, compile it, serve it until a signal."""
+"""Build a simulated bench's plant, compile it, serve it until a signal (`sim`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.rigs import load_bench
 
-USUAL_SHARE: Final = 0.01  # share of the frames that a fault given by its name affects
+NAMED_FAULT_SHARE: Final = 0.01  # share of the frames that a fault given by its name affects
 # Rate of the plant behind valves that the host samples at any time [Hz].
 VALVES_RATE: Final = 1000.0
 
@@ -50,15 +50,15 @@ class BenchRequest:
     wire_faults: str | None = None
 
 
-def hidden(what: BenchRequest, rig: Rig) -> Scenario:
+def scenario_of(request: BenchRequest, rig: Rig) -> Scenario:
     """Return the scenario of a bench's hidden effects; raises InputError for a bad file."""
-    if what.scenario is None:
+    if request.scenario is None:
         return Scenario()
-    if what.scenario == RANDOM:
-        return draw(rig, what.seed)
-    if what.scenario in shipped_scenarios():
-        return load_shipped(what.scenario)
-    return _scenario_file("--scenario", what.scenario, (RANDOM, *shipped_scenarios()))
+    if request.scenario == RANDOM:
+        return draw(rig, request.seed)
+    if request.scenario in shipped_scenarios():
+        return load_shipped(request.scenario)
+    return _scenario_file("--scenario", request.scenario, (RANDOM, *shipped_scenarios()))
 
 
 def _scenario_file(option: str, name: str, known: Iterable[str]) -> Scenario:
@@ -75,7 +75,7 @@ def wire_faults(name: str | None) -> tuple[WireFault, ...]:
         return ()
     known = {kind.fault_name(): kind for kind in CLASSES if issubclass(kind, WireFault)}
     if name in known:
-        return (known[name].model_validate({"name": name, "probability": USUAL_SHARE}),)
+        return (known[name].model_validate({"name": name, "probability": NAMED_FAULT_SHARE}),)
     scenario = _scenario_file("--wire-faults", name, known)
     if scenario != Scenario(description=scenario.description, faults=scenario.wire_faults):
         raise InputError(
@@ -85,21 +85,21 @@ def wire_faults(name: str | None) -> tuple[WireFault, ...]:
     return scenario.wire_faults
 
 
-def serve_bench(what: BenchRequest) -> None:
+def serve_bench(request: BenchRequest) -> None:
     """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
-    if what.wire not in WIRES:
-        raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
-    rig = load_bench(what.rig)
-    if what.wire == VALVES:
+    if request.wire not in WIRES:
+        raise InputError(f"--wire {request.wire}: expected one of: {' '.join(WIRES)}")
+    rig = load_bench(request.rig)
+    if request.wire == VALVES:
         # The rig's rate is the host's; the valves sample when SYNC arrives, not at fixed ticks.
         rig = rig.model_copy(update={"sample_rate": max(VALVES_RATE, rig.sample_rate)})
-    scenario = hidden(what, rig)
-    faults = (*scenario.wire_faults, *wire_faults(what.wire_faults))
-    plant = FaultyPlant(rig, scenario, what.seed)
+    scenario = scenario_of(request, rig)
+    faults = (*scenario.wire_faults, *wire_faults(request.wire_faults))
+    plant = FaultyPlant(rig, scenario, request.seed)
     # Compiles before the first request, on a second plant so that the served one starts at rest.
-    warm_up(rig, Plant(rig, scenario, what.seed))
-    write_truth(what.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
-    place = _place(what, rig)
+    warm_up(rig, Plant(rig, scenario, request.seed))
+    write_truth(request.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
+    address = _address(request, rig)
     links: list[FaultyLink] = []
 
     def ready(endpoint: str) -> None:
@@ -108,9 +108,9 @@ def serve_bench(what: BenchRequest) -> None:
                 faulty_link(
                     endpoint,
                     faults,
-                    seed=what.seed,
+                    seed=request.seed,
                     seconds=lambda: plant.tick / rig.sample_rate,
-                    port=place.get("port", 0),
+                    port=address.get("port", 0),
                 )
             )
             endpoint = links[0].endpoint
@@ -120,11 +120,11 @@ def serve_bench(what: BenchRequest) -> None:
         serve(
             rig,
             plant,
-            **(place | {"port": 0} if faults else place),
-            wire=what.wire,
-            realtime=what.real_time,
+            **(address | {"port": 0} if faults else address),
+            wire=request.wire,
+            realtime=request.real_time,
             on_ready=ready,
-            parent=what.parent,
+            parent=request.parent,
             faults=scenario.device_faults,
         )
     except EndpointError as error:
@@ -134,25 +134,25 @@ def serve_bench(what: BenchRequest) -> None:
             link.close()
 
 
-def _place(what: BenchRequest, rig: Rig) -> dict[str, Any]:
+def _address(request: BenchRequest, rig: Rig) -> dict[str, Any]:
     """Return the wire's keywords for `serve`; raises InputError for options it does not have."""
-    if what.wire == VALVES:
-        return {"port": what.port or 0}
-    if what.wire in (CAN, SLCAN):
-        return _bus(what, rig)
+    if request.wire == VALVES:
+        return {"port": request.port or 0}
+    if request.wire in (CAN, SLCAN):
+        return _bus(request, rig)
     tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
-    return {"host": tcp.host, "port": tcp.port if what.port is None else what.port}
+    return {"host": tcp.host, "port": tcp.port if request.port is None else request.port}
 
 
-def _bus(what: BenchRequest, rig: Rig) -> dict[str, Any]:
+def _bus(request: BenchRequest, rig: Rig) -> dict[str, Any]:
     from drivers.can_port import SOCKETCAND, BusPlace
     from drivers.can_stream import CanSettings, can_layout
 
     if rig.wire.kind != CAN:
-        return {"port": what.port or 0}
-    at = CanSettings.of(rig.wire)
-    place = BusPlace.of(at.bus)
-    here = {"host": place.host, "port": place.port} if place.interface == SOCKETCAND else {}
-    if what.port is not None:
-        here["port"] = what.port
-    return {**here, "layout": can_layout(at, rig), "bitrate": at.bitrate}
+        return {"port": request.port or 0}
+    settings = CanSettings.of(rig.wire)
+    bus = BusPlace.of(settings.bus)
+    address = {"host": bus.host, "port": bus.port} if bus.interface == SOCKETCAND else {}
+    if request.port is not None:
+        address["port"] = request.port
+    return {**address, "layout": can_layout(settings, rig), "bitrate": settings.bitrate}

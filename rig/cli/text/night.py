@@ -1,4 +1,4 @@
-"""The page of the night: results of a queue's items and their run folders."""
+"""Make the page of the night: results of a queue's items and their run folders."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def night_of(store: QueueStore, since: datetime | None) -> Night:
         queue=str(store.path),
         host=computer_name(),
         made=datetime.now(UTC),
-        items=tuple(map(_shown, order)),
+        items=tuple(map(_night_item, order)),
         notes=tuple(note for note in notes if since is None or note[0] >= since),
         paused=store.paused,
     )
@@ -44,7 +44,7 @@ def _time(text: str) -> datetime | None:
     return datetime.fromisoformat(text) if text else None
 
 
-def _shown(item: Item) -> NightItem:
+def _night_item(item: Item) -> NightItem:
     folder = Path(item.run) if item.run else None
     summary = summarise(folder) if folder is not None and is_run(folder) else None
     parameters = item.results.get("parameters") or {}

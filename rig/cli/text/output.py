@@ -1,4 +1,4 @@
-"""Output of the program: results to standard output, progress to standard error."""
+"""Write results to standard output or files, progress to standard error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import typer
 
 from rig.model.units import clock
 
-Say = Callable[[str], None]  # tells a person how far the work is
+Say = Callable[[str], None]  # shows the user a line of progress
 LINE_SECONDS: Final = 3.0  # [s] between the lines of a countdown, and before the first
 
 
@@ -39,7 +39,7 @@ def is_terminal(stream: TextIO | None) -> bool:
 
 
 def discard(descriptor: int) -> None:
-    """Discard what is still to be written to an open file and all that is written later."""
+    """Discard everything unwritten of an open file and all that is written to it later."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, descriptor)
     os.close(null)
@@ -68,7 +68,7 @@ class Countdown:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._what, self._say, self._clock = what, say, clock
-        self._began = self._last_line = clock()
+        self._start = self._last_line = clock()
 
     def __call__(self, share: float) -> None:
         """Report the share done so far, at most once every LINE_SECONDS."""
@@ -76,8 +76,8 @@ class Countdown:
         if now - self._last_line < LINE_SECONDS or not 0.0 < share < 1.0:
             return
         self._last_line = now
-        left = (now - self._began) * (1.0 - share) / share
-        self._say(f"{self._what}: {100 * share:.0f} %, about {clock_text(left)} left")
+        remaining = (now - self._start) * (1.0 - share) / share
+        self._say(f"{self._what}: {100 * share:.0f} %, about {clock_text(remaining)} left")
 
 
 def _plain(value: Any) -> Any:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from analysis.identify.physical import Physical
 
 
-def _shown(estimate: Estimate) -> tuple[float, str]:
+def _display_unit(estimate: Estimate) -> tuple[float, str]:
     unit = DisplayUnit(1.0, estimate.unit)
     if estimate.unit == "Pa":
         unit = RESULTS[estimate.unit]
@@ -40,7 +40,7 @@ def parameter_table(
     header = ["parameter", "value", "± 95 %", "unit"]
     rows = []
     for name, estimate in estimates.items():
-        scale, unit = _shown(estimate)
+        scale, unit = _display_unit(estimate)
         if not estimate.identified:
             row = [name, "—", "—", unit]
         else:
@@ -48,10 +48,10 @@ def parameter_table(
             half = 50.0 * (high - low) / abs(estimate.value)
             row = [name, f"{scale * estimate.value:#.4g}", _share(half), unit]
         if truth is not None:
-            known = truth.get(name, math.nan)
+            true_value = truth.get(name, math.nan)
             row += [
-                f"{scale * known:#.4g}" if math.isfinite(known) else "—",
-                _share(100.0 * (estimate.value / known - 1.0)) if known else "—",
+                f"{scale * true_value:#.4g}" if math.isfinite(true_value) else "—",
+                _share(100.0 * (estimate.value / true_value - 1.0)) if true_value else "—",
             ]
         rows.append(row)
     return table(header + ([] if truth is None else ["truth", "error"]), rows)
@@ -96,8 +96,8 @@ def physical_text(physical: Physical) -> str:
             cells.append(f"{value:.5g} ({100 * (value / free.value - 1):+.2f} %)")
         rows.append(cells)
     level = physical.levels[physical.returned]
-    more = physical.levels[physical.returned + 1 :]
-    why = f"; '{more[0].name}' is rejected by the data" if more else ""
+    rejected = physical.levels[physical.returned + 1 :]
+    why = f"; '{rejected[0].name}' is rejected by the data" if rejected else ""
     return f"{table(header, rows)}\nresult: '{level.name}'{why}"
 
 
@@ -146,12 +146,12 @@ def _sequential(data: Mapping[str, Any]) -> str:
     steps = data["steps"]
     rows = []
     for name, estimates in data["per_step"].items():
-        own = {e["step"]: e for e in estimates}
+        by_step = {e["step"]: e for e in estimates}
         apart = data["disagreement"].get(name)
         rows.append(
             [
                 name,
-                *(_number(own.get(step)) for step in steps),
+                *(_number(by_step.get(step)) for step in steps),
                 _number(data["E1"][name]),
                 _number(data["E2"][name]),
                 "" if apart is None else f"{apart:.1f}",

@@ -15,8 +15,8 @@ _PICTURE = 30  # width between the two limits [characters]
 
 
 def _cells(step: str, line: MotionPrediction) -> list[str]:
-    shown = display_unit(line.unit, LIMITS)
-    scale, unit = shown.scale, shown.text
+    display = display_unit(line.unit, LIMITS)
+    scale, unit = display.scale, display.text
     low, high, least, most, margin = (
         f"{scale * value:.3g}"
         for value in (line.low, line.high, line.allowed_low, line.allowed_high, line.margin)
@@ -75,8 +75,8 @@ def envelope_text(report: CheckReport) -> str:
     The part of a range due to the uncertainty of the twin's parameters is drawn lighter.
     """
     drawn = any(any(line.spread) for step in report.steps for line in step.predictions)
-    of = f", on {report.twin}; within its intervals ---" if drawn else ""
-    lines = [f"limits  [  predicted range ==={of}  ]"]
+    of_twin = f", on {report.twin}; within its intervals ---" if drawn else ""
+    lines = [f"limits  [  predicted range ==={of_twin}  ]"]
     for step in report.steps:
         lines.append(f"{step.step}:")
         lines += [
@@ -88,8 +88,8 @@ def envelope_text(report: CheckReport) -> str:
 
 def margin_text(line: MotionPrediction) -> str:
     """Return the distance of a prediction from its nearer limit, and the side."""
-    shown = display_unit(line.unit, LIMITS)
-    scale, unit = shown.scale, shown.text
+    display = display_unit(line.unit, LIMITS)
+    scale, unit = display.scale, display.text
     below, above = line.low - line.allowed_low, line.allowed_high - line.high
     upper = line.joint is None or above <= below
     room = above if upper else below

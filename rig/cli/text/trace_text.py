@@ -34,8 +34,8 @@ def trace_text(result: Trace) -> str:
         for lines_of_equation in largest_residual_lines(result.lines)
     ]
     if result.depends_on:
-        moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
-        lines.append(f"the remaining residual depends on: {moves} (a clue, not a named effect)")
+        causes = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
+        lines.append(f"the remaining residual depends on: {causes} (a clue, not a named effect)")
     lines += [
         f"a sparse fit of the remaining residual of {f.equation}: {f.text} "
         f"({100 * f.share:.0f} % of its energy on held-out records; a clue, not a named effect)"

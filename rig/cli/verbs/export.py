@@ -51,9 +51,9 @@ def export(
     from rig.runs.stream import read_run_head
 
     folder = run if run.name not in ("", "..") else run.resolve()
-    wanted = folder.with_name(f"{folder.name}-{kind}") if out is None else out
+    target = folder.with_name(f"{folder.name}-{kind}") if out is None else out
     if kind == UNITS:
-        typer.echo(str(_write_units(run, wanted, model)))
+        typer.echo(str(_write_units(run, target, model)))
         return
     if kind not in (*WRITERS, CRATE):
         raise InputError(f"--format {kind}: expected one of: {' '.join((*WRITERS, UNITS, CRATE))}")
@@ -70,13 +70,13 @@ def export(
             )
         from rig.runs.exchange.ro_crate import export_crate
 
-        progress(f"{len(export_crate(run, wanted, licence))} files")
-        typer.echo(str(wanted))
+        progress(f"{len(export_crate(run, target, licence))} files")
+        typer.echo(str(target))
         return
-    more = None if model is None else channel_simulator(model, read_run_head(run).rig, str(run))
-    files = export_run(run, wanted, kind, more)
+    extra = None if model is None else channel_simulator(model, read_run_head(run).rig, str(run))
+    files = export_run(run, target, kind, extra)
     progress(f"{len(files)} files")
-    typer.echo(str(wanted))
+    typer.echo(str(target))
 
 
 def _write_units(run: Path, out: Path, path: Path | None) -> Path:
@@ -98,11 +98,11 @@ def _write_units(run: Path, out: Path, path: Path | None) -> Path:
     refuse_occupied(out)
     model = _model_of(run, path)
     source = run.name if path is None else path.name
-    about = f"{model.rig.name}, identified: {source}"
+    description = f"{model.rig.name}, identified: {source}"
     progress("Linux and Windows, FMI 2 and 3: about a minute the first time")
     try:
         with new_folder(out) as folder:
-            files = write_fmus(model, folder, model.rig.name, about, TARGETS, progress)
+            files = write_fmus(model, folder, model.rig.name, description, TARGETS, progress)
     except CompilationError as error:
         raise WorkError(str(error)) from error
     progress(" ".join(file.name for file in files))

@@ -38,15 +38,15 @@ def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstra
     """Raise InputError for settings that need the rows of all records in memory."""
     from rig.model.parse import InputError
 
-    for name, asked, wanted in (
+    for name, given, expected in (
         ("--method", method, "coupled"),
         ("--estimator", estimator or "plain", "plain"),
         ("--bootstrap", str(bootstrap), "0"),
     ):
-        if asked != wanted:
+        if given != expected:
             raise InputError(
-                f"{name} {asked} needs all rows in memory and cannot be used with {option}: "
-                f"expected {name} {wanted}, or no {option}"
+                f"{name} {given} needs all rows in memory and cannot be used with {option}: "
+                f"expected {name} {expected}, or no {option}"
             )
 
 
@@ -88,8 +88,8 @@ def _terms(
     from analysis.trace.search.refinement import fit_shapes  # loads scipy.optimize, slowly
 
     terms = [Used(term) for term in with_effects(runs[0].rig, effects)]
-    found = fit_shapes(runs, terms)
-    return (terms if found is None else found.terms), found
+    shape_fit = fit_shapes(runs, terms)
+    return (terms if shape_fit is None else shape_fit.terms), shape_fit
 
 
 def _shapes_in(result: Identification) -> dict[str, Estimate]:
@@ -105,17 +105,17 @@ def _shape_json(shape: Estimate) -> dict[str, Any]:
     """Return a shape as JSON data, with its error where it was found in the records."""
     from analysis.simulation.model import estimate_json
 
-    found = math.isfinite(shape.std)
-    return estimate_json(shape) if found else {"value": shape.value, "unit": shape.unit}
+    shape_fit = math.isfinite(shape.std)
+    return estimate_json(shape) if shape_fit else {"value": shape.value, "unit": shape.unit}
 
 
 def _with_shape_errors(
-    result: Identification, found: ShapeFit
+    result: Identification, shape_fit: ShapeFit
 ) -> tuple[Identification, dict[str, Estimate]]:
     """Return the result with the errors of shapes that were fitted, and these shapes."""
     from analysis.trace.judge.inference import with_shape_errors
 
-    model, shapes = with_shape_errors(found, result.model)
+    model, shapes = with_shape_errors(shape_fit, result.model)
     return replace(result, model=model), shapes
 
 
@@ -202,15 +202,15 @@ def identify(
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
     filters = FILTERINGS[filtering]
-    known = None if truth is None else read_truth(truth)
+    true_values = None if truth is None else read_truth(truth)
     if like is not None and effects:
         raise InputError("--like uses the terms of a model unchanged: expected no --with beside it")
     if stream or cluster is not None:
         _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
-        result, found = _streamed(runs, filters, effects or (), like, cluster), None
+        result, shape_fit = _streamed(runs, filters, effects or (), like, cluster), None
     else:
         loaded = load_runs(runs)
-        terms, found = _terms(loaded, effects or (), like)
+        terms, shape_fit = _terms(loaded, effects or (), like)
         result = identify_runs(
             loaded,
             method,
@@ -223,11 +223,11 @@ def identify(
             progress=Countdown("identifying"),
         )
     shapes = _shapes_in(result)
-    if found is not None:
-        result, fitted = _with_shape_errors(result, found)
+    if shape_fit is not None:
+        result, fitted = _with_shape_errors(result, shape_fit)
         shapes |= fitted
     document: dict[str, Any] = {}
-    more = shapes_text(shapes) + method_text(result)
+    appendix = shapes_text(shapes) + method_text(result)
     if shapes:
         document["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
     if physical:
@@ -238,8 +238,8 @@ def identify(
         projection = projected(result)
         result = with_physics(result, projection)
         document["physical"] = physical_json(projection)
-        more += f"\n\n{physical_text(projection)}"
-    with printed_at_end(json, lambda: identification_text(result, known) + more):
+        appendix += f"\n\n{physical_text(projection)}"
+    with printed_at_end(json, lambda: identification_text(result, true_values) + appendix):
         if model is not None:
             save_identified(result.model, model, progress)
         write_json(json, {**to_json(result), **document})

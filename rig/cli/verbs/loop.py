@@ -81,10 +81,10 @@ def loop(
         )
     # The analysis loads slowly: options are checked before it is imported.
     from protocols.files.plan import Overrides
-    from rig.cli.execution.experiment_loop import Loop, LoopRequest, refuse_taken
+    from rig.cli.execution.experiment_loop import Loop, LoopRequest, refuse_used_folder
     from rig.cli.simulated.simulated_bench import simulated_bench
 
-    refuse_taken(out)
+    refuse_used_folder(out)
     with ExitStack() as stack:
         if simulate:
             # The loop must not read the truth, so none is written.

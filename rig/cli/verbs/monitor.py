@@ -90,7 +90,7 @@ def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:
     from rig.tui.web.server import listen, serve
 
     options = {"--rig": rig, "--runs": str(runs), "--endpoint": endpoint}
-    given = [word for name, value in options.items() if value is not None for word in (name, value)]
+    words = [word for name, value in options.items() if value is not None for word in (name, value)]
     try:
         listening = listen(port)
     except OSError as error:
@@ -105,4 +105,4 @@ def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:
             "of runs. Ctrl-C closes the pages and ends no run"
         )
 
-    return serve([*BRAMAH, "monitor", *given], listening, ready)
+    return serve([*BRAMAH, "monitor", *words], listening, ready)

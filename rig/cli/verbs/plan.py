@@ -39,5 +39,5 @@ def plan(
     proof = plan_steps(rig, out, validation, prove)
     print_result(json, proof.as_dict(), proof_text(proof))
     if not proof.complete:
-        lost = [n for v in proof.verdicts.values() for n in v.undetermined]
-        raise WorkError(f"{proof.protocol}: does not determine {' '.join(lost)}")
+        undetermined = [n for v in proof.verdicts.values() for n in v.undetermined]
+        raise WorkError(f"{proof.protocol}: does not determine {' '.join(undetermined)}")

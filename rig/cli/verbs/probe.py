@@ -40,25 +40,25 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
     header = ("channel", "mean", "least", "most", "unit", "codes", "")
     rows = [_row(reading) for reading in readings]
     print_result(json, [asdict(reading) for reading in readings], table(header, rows))
-    aside = json == Path("-")
+    to_stderr = json == Path("-")
     if timing is not None:
         typer.echo(
             f"host-timed: {timing.samples} samples taken {1e3 * timing.mean:.3g} ms late, standard "
             f"deviation {1e3 * timing.jitter:.3g} ms; in the rig file: wire: jitter: "
             f"{1e3 * timing.jitter:.3g} ms",
-            err=aside,
+            err=to_stderr,
         )
     latched = state.read_trip()
     trips = [text for text in (latched and latched.trip, cause) if text]
     if trips:
         typer.echo(
             f"tripped: {'; '.join(trips)}; clear it with `{reset_command(described)}`",
-            err=aside,
+            err=to_stderr,
         )
-    print_pressure(bench.pressurised(readings), aside=aside)
-    odd = [reading.channel for reading in readings if reading.mark != bench.GOOD]
-    if odd:
-        raise WorkError(f"not plausible: {', '.join(odd)}; the last column says why")
+    print_pressure(bench.pressurised(readings), to_stderr=to_stderr)
+    implausible = [reading.channel for reading in readings if reading.mark != bench.GOOD]
+    if implausible:
+        raise WorkError(f"not plausible: {', '.join(implausible)}; the last column says why")
 
 
 def _row(reading: Reading) -> tuple[str, ...]:

@@ -36,12 +36,12 @@ QueueOption = Annotated[
     Path | None,
     typer.Option("--queue", help="The queue's file.  [default: queue.sqlite in BRAMAH_STATE]"),
 ]
-KEPT = ("protocol", "rig", "seconds", "ok", "twin", "model", "warning")  # keys of a proof
+PROOF_KEYS = ("protocol", "rig", "seconds", "ok", "twin", "model", "warning")  # kept of a proof
 WAIT_HOURS = 12  # longest wait [h] for --when without --not-after
 ItemArgument = Annotated[int, typer.Argument(help="The item's number.")]
 
 
-def _who() -> str:
+def _user() -> str:
     from rig.runs.runstate import user_name
 
     return user_name()
@@ -54,15 +54,15 @@ def _path(queue: Path | None) -> Path:
 
 
 @contextmanager
-def _opened(queue: Path | None, *, create: bool = False) -> Iterator[QueueStore]:
+def _open_queue(queue: Path | None, *, create: bool = False) -> Iterator[QueueStore]:
     from rig.queue.store import QueueStore
 
     with QueueStore(_path(queue), create=create) as store:
         yield store
 
 
-def _show(item: Item, json: Path | None, said: str) -> None:
-    print_result(json, item.as_dict(), f"item {item.id} {item.job.name}: {said}")
+def _print_item(item: Item, json: Path | None, outcome: str) -> None:
+    print_result(json, item.as_dict(), f"item {item.id} {item.job.name}: {outcome}")
 
 
 def _absolute(name: str, shipped: tuple[str, ...]) -> str:
@@ -159,7 +159,7 @@ def add(
     if when is not None:
         channel_condition(when)
     times = _times(not_before, not_after, when, datetime.now(UTC))
-    with _opened(queue, create=True) as store:
+    with _open_queue(queue, create=True) as store:
         title = name or Path(protocol).stem
         folder = (out or Path("runs", f"{store.next_number():03d}-{title}")).absolute()
         refuse_occupied(folder)
@@ -170,7 +170,7 @@ def add(
             name=title,
             endpoint=endpoint or "",
             options=(*changed, *context.args),
-            run_options=("--operator", operator or _who()),
+            run_options=("--operator", operator or _user()),
             after=after,
             wanted=wanted or DONE,
             when=when or "",
@@ -178,7 +178,7 @@ def add(
             **times,
         )
         if after is not None:
-            _refuse_wanted(store.item(after), wanted or DONE)
+            _refuse_condition(store.item(after), wanted or DONE)
         progress(f"checking {title} on the twin")
         item = store.add(job, priority, _proof(job))
     seconds = item.proof.get("seconds")
@@ -187,11 +187,11 @@ def add(
         progress(f"WARNING: {item.proof['warning']}")
     elif "twin" in item.proof:
         progress(f"the twin uses {item.proof['twin']}")
-    _show(item, json, f"queued{length}; it will run into {item.job.out}")
+    _print_item(item, json, f"queued{length}; it will run into {item.job.out}")
 
 
 def _proof(job: QueueJob) -> dict[str, Any]:
-    """Return what the queue keeps of `bramah check` on an item; raises InputError, WorkError."""
+    """Return what the queue keeps of a `bramah check`; raises InputError or WorkError."""
     from rig.cli.errors import BAD_INPUT, WorkError
     from rig.model.parse import InputError
     from rig.queue.processes import BRAMAH, call
@@ -203,7 +203,7 @@ def _proof(job: QueueJob) -> dict[str, Any]:
     if answer.code != 0:
         raise WorkError(f"not queued: {answer.reason}")
     proof = answer.as_json()
-    return {key: proof[key] for key in KEPT if isinstance(proof, dict) and key in proof}
+    return {key: proof[key] for key in PROOF_KEYS if isinstance(proof, dict) and key in proof}
 
 
 def _times(
@@ -229,8 +229,8 @@ def _times(
     }
 
 
-def _refuse_wanted(earlier: Item, wanted: str) -> None:
-    """Raise InputError where what is wanted of an earlier item can never be."""
+def _refuse_condition(earlier: Item, wanted: str) -> None:
+    """Raise InputError for a condition `wanted` that an earlier item can never meet."""
     from rig.model.parameters import parameter_names
     from rig.model.parse import InputError
     from rig.queue.items import ENDED, OVER, check_wanted
@@ -251,11 +251,11 @@ def _line(item: Item) -> tuple[str, ...]:
     waits += [f"after {item.job.after} if {item.job.wanted}"] if item.job.after else []
     waits += [f"when {item.job.when}"] if item.job.when else []
     waits += [f"not after {_local(item.job.not_after)}"] if item.job.not_after else []
-    about = item.reason if item.over or not waits else "; ".join(waits)
+    reason = item.reason if item.over or not waits else "; ".join(waits)
     seconds = item.proof.get("seconds")
     length = "" if seconds is None else f"{seconds / 60.0:.1f}"
     state = f"{item.state} (ending)" if item.cancel and not item.over else item.state
-    return str(item.id), str(item.priority), state, item.job.name, length, about
+    return str(item.id), str(item.priority), state, item.job.name, length, reason
 
 
 def _local(time: str) -> str:
@@ -280,7 +280,7 @@ def list_items(
     unknown = [word for word in state or () if word not in STATES]
     if unknown:
         raise InputError(f"--state {unknown[0]}: expected one of: {', '.join(STATES)}")
-    with _opened(queue) as store:
+    with _open_queue(queue) as store:
         paused, items = store.paused, store.items()
     shown = [item for item in items if not state or item.state in state]
     pid = runner_of(_path(queue))
@@ -315,7 +315,7 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
 
     from rig.queue.runner import log_of
 
-    with _opened(queue) as store:
+    with _open_queue(queue) as store:
         entry, lines = store.item(item), store.history(item)
     log = log_of(_path(queue), entry)
     document: dict[str, Any] = entry.as_dict()
@@ -325,12 +325,12 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
         return
     job = entry.job
     typer.echo(f"item {entry.id} {job.name}: {entry.state}")
-    facts = {
+    fields = {
         "reason": entry.reason, "protocol": job.protocol, "rig": job.rig,
         "endpoint": job.endpoint, "options": " ".join(job.options), "run": entry.run or job.out,
         "log": str(log) if log.exists() else "",
     }  # fmt: skip
-    for key, value in facts.items():
+    for key, value in fields.items():
         if value:
             typer.echo(f"  {key:9s} {value}")
     for line in lines:
@@ -374,7 +374,7 @@ def run(
     from rig.queue.runner import Runner, folder_of
 
     command = parse_command(notify) if notify is not None else ()
-    with _opened(queue, create=serve) as store:
+    with _open_queue(queue, create=serve) as store:
         if store.paused and not serve:
             raise InputError(
                 f"the queue is {store.paused}; continue it with `bramah queue pause --off`"
@@ -388,7 +388,7 @@ def run(
 
             try:
                 write_page(page, store, began)
-            except InputError as error:  # the exit code reports the queue, not its page
+            except InputError as error:  # the exit code is the queue's, not that of its page
                 progress(f"bramah: {error}")
     document = {
         "code": report.code,
@@ -418,7 +418,7 @@ def write_night_page(
     from rig.cli.text.night import write_page
 
     begin = time_since(since)
-    with _opened(queue) as store:
+    with _open_queue(queue) as store:
         write_page(out, store, begin)
     typer.echo(str(out))
 
@@ -432,14 +432,14 @@ def pause(
 
     Example: bramah queue pause
     """
-    with _opened(queue) as store:
+    with _open_queue(queue) as store:
         if off:
-            store.resume(_who())
+            store.resume(_user())
         else:
-            store.pause(_who())
+            store.pause(_user())
         active = [item.id for item in store.items() if item.state in ("checking", "running")]
-    still = f"; item {active[0]} runs to its end" if active and not off else ""
-    text = "the queue continues" if off else f"paused{still}"
+    ending = f"; item {active[0]} runs to its end" if active and not off else ""
+    text = "the queue continues" if off else f"paused{ending}"
     print_result(json, {"paused": not off, "active": active}, text)
 
 
@@ -450,12 +450,12 @@ def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = Non
     """
     from rig.queue.runner import end_orphan, runner_of
 
-    with _opened(queue) as store:
-        cancelled = store.cancel(item, _who())
+    with _open_queue(queue) as store:
+        cancelled = store.cancel(item, _user())
         if not cancelled.over and runner_of(store.path) is None:
             end_orphan(store.path, cancelled)
     result = "cancelled" if cancelled.over else "asked to end; `bramah queue show` says how it ends"
-    _show(cancelled, json, result)
+    _print_item(cancelled, json, result)
 
 
 def move(
@@ -478,9 +478,9 @@ def move(
         raise InputError(
             "--before sets the priority too: expected no --last or --priority beside it"
         )
-    with _opened(queue) as store:
+    with _open_queue(queue) as store:
         moved = store.move(item, before=before, last=last, priority=priority)
-    _show(moved, json, f"priority {moved.priority}, place {moved.place:g}")
+    _print_item(moved, json, f"priority {moved.priority}, place {moved.place:g}")
 
 
 def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
@@ -488,9 +488,9 @@ def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None
 
     Example: bramah queue retry 3
     """
-    with _opened(queue) as store:
-        retried = store.retry(item, _who())
-    _show(retried, json, f"queued again; it will run into {retried.next_folder()}")
+    with _open_queue(queue) as store:
+        retried = store.retry(item, _user())
+    _print_item(retried, json, f"queued again; it will run into {retried.next_folder()}")
 
 
 queue = typer.Typer(no_args_is_help=True, rich_markup_mode=None, callback=queue_group)

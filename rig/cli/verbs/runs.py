@@ -49,11 +49,9 @@ def runs(
     from rig.runs.listing.summary import UNREADABLE, crates
     from rig.runs.runstate import STATES
 
-    for wanted in state or ():
-        if wanted not in (*STATES, UNREADABLE):
-            raise InputError(
-                f"--state {wanted}: expected one of: {', '.join((*STATES, UNREADABLE))}"
-            )
+    for name in state or ():
+        if name not in (*STATES, UNREADABLE):
+            raise InputError(f"--state {name}: expected one of: {', '.join((*STATES, UNREADABLE))}")
     begun = time_since(since)
     if rebuild:
         progress(f"{rebuild_index(folder)} runs in the index of {folder}")
@@ -63,8 +61,8 @@ def runs(
         for entry in listed
         if (not state or entry.state in state)
         and (begun is None or (entry.created and datetime.fromisoformat(entry.created) >= begun))
-        and _named(entry.rig, rig)
-        and _named(entry.protocol, protocol)
+        and _matches(entry.rig, rig)
+        and _matches(entry.protocol, protocol)
     ]
     if copies := crates(folder):
         names = " ".join(copy.name for copy in copies)
@@ -84,8 +82,8 @@ def runs(
             typer.echo(f"{summary.path.name}: {summary.message}")
 
 
-def _named(name: str, wanted: Names) -> bool:
-    return not wanted or any(fnmatchcase(name, pattern) for pattern in wanted)
+def _matches(name: str, patterns: Names) -> bool:
+    return not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def _row(summary: RunSummary) -> tuple[str, ...]:

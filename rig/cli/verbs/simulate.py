@@ -58,8 +58,8 @@ def channel_simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], M
         result = validate_record(model, rig, record)
         if result.failure:
             raise WorkError(f"record {record.name!r}: {path} cannot be simulated: {result.failure}")
-        every = result.simulation.channels()
-        simulated = {name: every[name] for name in result.measured}
+        all_channels = result.simulation.channels()
+        simulated = {name: all_channels[name] for name in result.measured}
         return sampled_channels(rig, record.sample_rate, simulated)
 
     return channels

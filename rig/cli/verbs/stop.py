@@ -43,9 +43,9 @@ def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     if not rigs:
         raise InputError(f"{NOT_IN_USE}; name the bench: --rig RIG")
     errors: list[Exception] = []
-    for known in rigs:  # an error of one bench must not keep another from being stopped
+    for name in rigs:  # an error of one bench must not keep another from being stopped
         try:
-            stop_bench(known, endpoint)
+            stop_bench(name, endpoint)
         except (InputError, DeviceError) as error:
             errors.append(error)
     for further in errors[1:]:
@@ -63,21 +63,21 @@ def stop_bench(rig: str, endpoint: str | None) -> None:
     from rig.bench import probe as bench
     from rig.bench.outputs import UNSURE
 
-    described, driver = device_of(rig, endpoint)
+    bench_rig, driver = device_of(rig, endpoint)
     try:
-        _zero(driver, described.wire)
+        _zero(driver, bench_rig.wire)
     except DeviceError as error:
-        watchdog = described.wire.watchdog
+        watchdog = bench_rig.wire.watchdog
         raise type(error)(
             f"{UNSURE}: {error}; use the emergency stop (the device's watchdog "
             f"zeroes the outputs {watchdog:g} s after the host's last message)"
         ) from error
     finally:
         driver.close()
-    _end_run(described.wire)
+    _end_run(bench_rig.wire)
     typer.echo("outputs at zero, confirmed by the device")
     try:
-        print_pressure(bench.pressurised(bench.probe(device_of(rig, endpoint)[1], described)))
+        print_pressure(bench.pressurised(bench.probe(device_of(rig, endpoint)[1], bench_rig)))
     except DeviceError as error:
         progress(f"pressures not read: {error}")
 

@@ -66,10 +66,10 @@ def trace(
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
     families = FAMILIES_OF[equations]
-    every = load_runs([*runs, *holdout, *(judge or ())])
-    loaded, unseen = every[: len(runs)], every[len(runs) :]
+    all_runs = load_runs([*runs, *holdout, *(judge or ())])
+    training, unseen = all_runs[: len(runs)], all_runs[len(runs) :]
     chosen_by, judged_by = unseen[: len(holdout)], unseen[len(holdout) :]
-    rigs = {run.source: run.rig for run in every}
+    rigs = {run.source: run.rig for run in all_runs}
     electric = [name for name, rig in rigs.items() if rig.electric]
     if electric and "mechanical" not in families:
         raise InputError(
@@ -77,9 +77,9 @@ def trace(
             "equations; leave the option out"
         )
     known = None if like is None else terms_like(like, rigs)
-    progress(f"tracing {sum(len(r.records) for r in loaded)} records")
+    progress(f"tracing {sum(len(r.records) for r in training)} records")
     result = trace_runs(
-        loaded, chosen_by, seed=seed, families=families, terms=known,
+        training, chosen_by, seed=seed, families=families, terms=known,
         progress=Countdown("tracing"), judge=judged_by,
     )  # fmt: skip
     with printed_at_end(json, lambda: trace_text(result)):

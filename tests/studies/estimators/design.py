@@ -64,7 +64,7 @@ def study(protocols: Sequence[str], rig: str, first: int, seeds: int, say: Say) 
     for name in protocols:
         forecast = of_plan(resolve(library.load(name), bench), load_twin(TwinSource(), bench))
         if forecast.prediction is None:
-            raise InputError(f"{name}: {forecast.why}")
+            raise InputError(f"{name}: {forecast.reason}")
         benches = range(first, first + seeds)
         found = [
             _found(name, still, benches, PLAIN, say),

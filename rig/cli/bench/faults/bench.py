@@ -19,7 +19,7 @@ from hil_sim.scenario.file import Scenario
 from rig.model.rig import Rig
 
 SILENCE: Final = 2.0  # [s] without a host, after which a device in virtual time zeroes its outputs
-_PATIENCE: Final = 300.0  # [s] for the process to start, on a busy computer
+_START_SECONDS: Final = 300.0  # [s] for the process to start, on a busy computer
 
 
 @dataclass(frozen=True)
@@ -40,33 +40,33 @@ class FaultBench:
         self, rig: Rig, wire: str, faults: Sequence[Fault], seed: int, *, realtime: bool
     ) -> str:
         """Serve a new bench with faults of machine and device; return its endpoint."""
-        return str(self._ask("begin", rig, wire, tuple(faults), seed, realtime))
+        return str(self._request("begin", rig, wire, tuple(faults), seed, realtime))
 
     def strike(self, faults: Sequence[WireFault]) -> None:
         """Start faults of the wire; their `at` and `until` [s] count from now."""
-        self._ask("strike", tuple(faults))
+        self._request("strike", tuple(faults))
 
     def state(self) -> FaultBenchState:
         """Return the state of the device."""
-        answer: FaultBenchState = self._ask("state")
+        answer: FaultBenchState = self._request("state")
         return answer
 
     def end(self) -> None:
         """End the bench; another one can then be started."""
-        self._ask("end")
+        self._request("end")
 
-    def _ask(self, *words: Any) -> Any:
+    def _request(self, *words: Any) -> Any:
         self._pipe.send(words)
-        if not self._pipe.poll(_PATIENCE):
+        if not self._pipe.poll(_START_SECONDS):
             raise TimeoutError(f"the simulated bench does not answer {words[0]!r}")
         answer = self._pipe.recv()
         if isinstance(answer, Exception):
             raise answer
         return answer
 
-    def at_zero(self, patience: float) -> bool:
-        """Return whether the device's outputs are at zero within `patience` [s]."""
-        deadline = time.monotonic() + patience
+    def at_zero(self, timeout: float) -> bool:
+        """Return whether the device's outputs are at zero within `timeout` [s]."""
+        deadline = time.monotonic() + timeout
         while self.state().driven:
             if time.monotonic() > deadline:
                 return False
@@ -121,7 +121,7 @@ class _Child:
     def strike(self, faults: tuple[WireFault, ...]) -> None:
         assert self._served is not None
         now = self._seconds()
-        moved = [
+        shifted = [
             fault.model_copy(
                 update={
                     "at": now + fault.at,
@@ -130,7 +130,7 @@ class _Child:
             )
             for fault in faults
         ]
-        self._served.link.use(moved)
+        self._served.link.use(shifted)
 
     def state(self) -> FaultBenchState:
         served = self._served

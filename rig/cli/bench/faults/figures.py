@@ -47,8 +47,8 @@ def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[TrialOutcome
     chosen = list(jobs(wire, least))
     with fault_bench() as bench:
         for seed, name in chosen:
-            place = folder / f"fault-{seed}"
-            trials.append(try_fault(bench, rig, wire, name, place, seed, realtime=False))
+            trial_folder = folder / f"fault-{seed}"
+            trials.append(try_fault(bench, rig, wire, name, trial_folder, seed, realtime=False))
             if len(trials) % 24 == 0:
                 say(f"faults: {len(trials)} of {len(chosen)} on {wire}")
     return trials
@@ -62,9 +62,9 @@ def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:
 
 def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
     """Return the counts of trials as figures."""
-    of = Counter(outcome.diagnosis for outcome in outcomes)
-    known = kinds()
-    machine = [o for o in outcomes if not issubclass(known[o.fault], WireFault)]
+    counts = Counter(outcome.diagnosis for outcome in outcomes)
+    classes = kinds()
+    machine = [o for o in outcomes if not issubclass(classes[o.fault], WireFault)]
     frozen = [o for o in outcomes if o.fault in _FROZEN]
     late = [o for o in frozen if o.seconds is None or o.seconds > _WITHIN]
     return [
@@ -74,12 +74,12 @@ def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
         Figure(GROUP, "outputs left on", sum(not o.zeroed for o in outcomes), "", 0.0),
         Figure(GROUP, "blocks taken", sum(o.blocks for o in outcomes)),
         Figure(GROUP, "of them not in records.h5", sum(o.lost_blocks for o in outcomes), "", 0.0),
-        Figure(GROUP, "harmless: every sample came", of[Diagnosis.HARMLESS]),
-        Figure(GROUP, "samples missing and counted", of[Diagnosis.COUNTED]),
-        Figure(GROUP, "ended, named rightly", of[Diagnosis.NAMED]),
-        Figure(GROUP, "ended, cause left open", of[Diagnosis.UNKNOWN]),
-        Figure(GROUP, "ended, named wrongly", of[Diagnosis.WRONG], "", 0.0),
-        Figure(GROUP, "not noticed", of[Diagnosis.UNNOTICED], "", 0.0),
+        Figure(GROUP, "harmless: every sample came", counts[Diagnosis.HARMLESS]),
+        Figure(GROUP, "samples missing and counted", counts[Diagnosis.COUNTED]),
+        Figure(GROUP, "ended, named rightly", counts[Diagnosis.NAMED]),
+        Figure(GROUP, "ended, cause left open", counts[Diagnosis.UNKNOWN]),
+        Figure(GROUP, "ended, named wrongly", counts[Diagnosis.WRONG], "", 0.0),
+        Figure(GROUP, "not noticed", counts[Diagnosis.UNNOTICED], "", 0.0),
         Figure(GROUP, "frozen or stuck, not within 2 s", len(late), "", 0.0),
     ]
 

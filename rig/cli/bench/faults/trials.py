@@ -39,14 +39,14 @@ from rig.runs.store import ARCHIVE
 
 BEGIN: Final = 1.0  # [s] of device time before a fault begins
 REAL_BEGIN: Final = 3.0  # [s], in real time: the clock runs while the session starts
-WATCHED: Final = 3.0  # [s] of device time that a fault is watched for
-SHARE: Final = 0.1  # of the frames are affected, for `STRIKING` [s]
-BUS_SHARE: Final = 0.01  # the same on a CAN bus, where a block has about thirty frames
+WATCHED: Final = 3.0  # [s] of device time observed after a fault began
+FRAME_SHARE: Final = 0.1  # share of the frames affected, for `STRIKING` [s]
+BUS_SHARE: Final = 0.01  # on a CAN bus, where a block has about thirty frames
 STRIKING: Final = 1.0
 STALE: Final = "stale data"  # the guard's only limit on wall-clock time
 LATE: Final = ("sample gap", STALE)  # limits that a busy computer can exceed without a fault
 _TRIES: Final = 5  # attempts to connect, on a busy computer
-_AMPLITUDE, _PULL = 0.8, 20.0  # [V], [V/m]
+_AMPLITUDE, _POSITION_GAIN = 0.8, 20.0  # [V], [V/m]
 _LOCK: Final = 2e-3  # [m]
 
 # Settings of faults without a default for them.
@@ -84,7 +84,7 @@ class TrialOutcome:
 
     fault: str
     wire: str
-    struck: int = 0
+    struck: int = 0  # number of affected frames, 1 for another fault
     error: Exception | None = None
     seconds: float | None = None
     blocks: int = 0
@@ -117,7 +117,7 @@ def example(name: str, at: float = BEGIN, wire: str = TCP) -> Fault:
     if not issubclass(kind, WireFault):
         return kind.model_validate({"name": name, "at": at, **keys})
     if name not in _ONCE:
-        keys.update(probability=BUS_SHARE if wire in (CAN, SLCAN) else SHARE, until=STRIKING)
+        keys.update(probability=BUS_SHARE if wire in (CAN, SLCAN) else FRAME_SHARE, until=STRIKING)
     return kind.model_validate({"name": name, **keys})
 
 
@@ -156,8 +156,8 @@ def try_fault(
     Raises DeviceError if no session could start before the fault.
     """
     fault = example(name, REAL_BEGIN if realtime else BEGIN, wire)
-    early = () if isinstance(fault, WireFault) else (fault,)
-    endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
+    plant_faults = () if isinstance(fault, WireFault) else (fault,)
+    endpoint = bench.begin(rig, wire, plant_faults, seed, realtime=realtime)
     reached = reached_at(rig, endpoint)
     outcome, warnings = TrialOutcome(name, wire), _Warnings()
     logging.getLogger().addHandler(warnings)
@@ -170,13 +170,13 @@ def try_fault(
                 if not tries_left:
                     raise
                 rig = with_timeout(rig, 2.0 * rig.wire.timeout)
-                endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
+                endpoint = bench.begin(rig, wire, plant_faults, seed, realtime=realtime)
                 reached = reached_at(rig, endpoint)
     finally:
         logging.getLogger().removeHandler(warnings)
         outcome.warnings = warnings.lines
-        patience = 2.0 + (rig.wire.watchdog if realtime else SILENCE)
-        outcome.zeroed = bench.at_zero(patience)
+        timeout = 2.0 + (rig.wire.watchdog if realtime else SILENCE)
+        outcome.zeroed = bench.at_zero(timeout)
         if isinstance(fault, WireFault):
             outcome.struck = bench.state().struck
         bench.end()
@@ -199,7 +199,7 @@ def _session(
     wave = _AMPLITUDE * np.sin(2.0 * np.pi * np.arange(period) / period)
     off = [OutputLaw()] * (len(rig.joints) - 1)
     rng = np.random.default_rng(seed)
-    began: tuple[float, float] | None = None  # [s] of wall-clock time and of device time
+    fault_start: tuple[float, float] | None = None  # [s] of wall-clock time and of device time
     recorder = Recorder(folder / "run", rig)
     driver = make_driver(rig.wire, rig)
     state = BenchState(rig.wire, folder / "state")
@@ -208,31 +208,31 @@ def _session(
             session.observers.add(collector)
             session.upload(0, wave)
             limit = rig.joints[0].limits.command
-            law = OutputLaw(gain=1.0, position_gain=_PULL, limit=limit)
+            law = OutputLaw(gain=1.0, position_gain=_POSITION_GAIN, limit=limit)
             session.apply([law, *off], restart=True)
             session.run_for(0.3)
             session.guard([EXCITED, *_locked(rig, collector.blocks[-1])])
             session.run_for(0.3 + float(rng.uniform(0.0, 0.3)))
             try:
                 if isinstance(fault, WireFault):
-                    began = time.monotonic(), session.tick / rig.sample_rate
+                    fault_start = time.monotonic(), session.tick / rig.sample_rate
                     bench.strike([fault])
                     session.run_for(STRIKING + 0.5)
                 else:
                     seconds_left = max(fault.at - session.tick / rig.sample_rate, 0.01)
-                    began = time.monotonic() + seconds_left * realtime, fault.at
+                    fault_start = time.monotonic() + seconds_left * realtime, fault.at
                     session.run_for(seconds_left)
                     session.run_for(WATCHED)
             finally:
-                ended = time.monotonic()
+                session_end = time.monotonic()
     except (DeviceError, SafetyTrip) as error:
-        if began is None:
+        if fault_start is None:
             raise
         outcome.error = error
         if isinstance(error, SafetyTrip) and error.limit != STALE:
-            outcome.seconds = error.device_time - began[1]
+            outcome.seconds = error.device_time - fault_start[1]
         else:
-            outcome.seconds = max(0.0, ended - began[0])
+            outcome.seconds = max(0.0, session_end - fault_start[0])
     if outcome.error is None and not isinstance(fault, WireFault):
         alarms = session.alarms.alarms
         raised = [a for a in alarms if a.time >= fault.at and a.check not in LATE]
@@ -240,7 +240,7 @@ def _session(
         outcome.seconds = outcome.alarm.time - fault.at if outcome.alarm else None
     outcome.blocks = len(collector.blocks)
     outcome.missing = session.lost_samples
-    outcome.lost_blocks = _not_in(folder / "run" / ARCHIVE, rig, collector.blocks)
+    outcome.lost_blocks = _missing_blocks(folder / "run" / ARCHIVE, rig, collector.blocks)
 
 
 def with_timeout(rig: Rig, seconds: float) -> Rig:
@@ -257,17 +257,17 @@ def _locked(rig: Rig, block: SampleBlock) -> list[JointRole]:
     return roles
 
 
-def _not_in(archive: Path, rig: Rig, blocks: Sequence[SampleBlock]) -> int:
+def _missing_blocks(archive: Path, rig: Rig, blocks: Sequence[SampleBlock]) -> int:
     """Return how many blocks are missing or altered in an archive."""
-    kept: dict[int, np.ndarray] = {}
+    archived: dict[int, np.ndarray] = {}
     with h5py.File(archive, "r") as file:
         for group in file[BETWEEN].values():
             rows = np.column_stack([group[name][:] for name in rig.recorded])
             first = int(group.attrs["start_tick"])
-            kept.update((first + row, values) for row, values in enumerate(rows))
+            archived.update((first + row, values) for row, values in enumerate(rows))
     return sum(
         any(
-            (tick := block.tick + row) not in kept or not np.array_equal(kept[tick], values)
+            (tick := block.tick + row) not in archived or not np.array_equal(archived[tick], values)
             for row, values in enumerate(block.data)
         )
         for block in blocks

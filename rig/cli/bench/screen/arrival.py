@@ -57,7 +57,7 @@ def ages_on_screen(
 
     A value ages on the screen until the next one is drawn.
     """
-    seen: list[tuple[float, float]] = []
+    samples: list[tuple[float, float]] = []
     newest, before = -1, ""
     for at, piece in drawn:
         text = before + piece  # a line may arrive in two pieces
@@ -66,8 +66,8 @@ def ages_on_screen(
             tick = int(match[1])
             if tick > newest:
                 newest = tick
-                seen.append((at, at - (origin + tick / rate)))
-    moments, ages = np.array(seen).reshape(-1, 2).T
+                samples.append((at, at - (origin + tick / rate)))
+    moments, ages = np.array(samples).reshape(-1, 2).T
     return ages[:-1], np.diff(moments)
 
 
@@ -132,12 +132,12 @@ def _lateness_figures(times: RunTimes, phases: list[Phase]) -> list[Figure]:
             figures.append(Figure("screen", name, float(np.quantile(part, share)), "ms"))
         medians[phase.screen].append(phase_medians(phase, times.arrivals, late))
     with_it, without = np.concatenate(medians[True]), np.concatenate(medians[False])
-    more = float(with_it.mean() - without.mean())
+    added = float(with_it.mean() - without.mean())
     noise = float(without.std(ddof=1)) if len(without) > 1 else math.nan
     return [
         *figures,
-        Figure("screen", "lateness, median, that a screen adds", 1e3 * more, "ms"),
-        Figure("screen", "the same over its deviation without", more / noise, "", NOISE),
+        Figure("screen", "lateness, median, that a screen adds", 1e3 * added, "ms"),
+        Figure("screen", "the same over its deviation without", added / noise, "", NOISE),
     ]
 
 
