@@ -35,10 +35,10 @@ from rig.tui.words import LINGER, Stop
 
 SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
 LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
-CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
+LEAST_CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
 SLOW: Final = 0.2  # interval of redrawing ages while nothing arrives [s]
 BLINK: Final = 0.5  # half a period of an unacknowledged alarm [s]
-TWICE: Final = 0.7  # two presses of Escape within this time stop [s]
+DOUBLE_PRESS: Final = 0.7  # two presses of Escape within this time stop [s]
 ALARM_WINDOW: Final = 60.0  # of samples held while alarms are on the screen [s]
 
 HELP: Final = (
@@ -77,7 +77,7 @@ def with_early_keys(kind: type[Driver], early: Callable[[events.Key], None]) -> 
 def automatic_span(speed: float) -> float:
     """Return the shortest span in which a curve moves slowly enough to be read."""
     # A run in real time has a speed around 1, which must not alternate between two spans.
-    return next((s for s in LONG_SPANS[2:] if s / speed > CROSSING), LONG_SPANS[-1])
+    return next((s for s in LONG_SPANS[2:] if s / speed > LEAST_CROSSING), LONG_SPANS[-1])
 
 
 class Monitor(Starts, App[int]):
@@ -116,11 +116,11 @@ class Monitor(Starts, App[int]):
         self._span: float | None = None  # None: automatic
         self._held_frame: Frame | None = None  # frame of a held picture
         self._drawn_frame: object = None
-        self._listed: object = None  # state of the link when the folder was read
-        self._slow = -float("inf")
+        self._listed_state: object = None  # state of the link when the folder was read
+        self._last_drawn = -float("inf")
         self._last_escape = -float("inf")
         self._stopped_by: events.Key | None = None  # the newest key that has already stopped
-        self._ticking: asyncio.Task[None] | None = None
+        self._tick_task: asyncio.Task[None] | None = None
         self._wake: Callable[[], None] = lambda: None  # ends the wait for the next picture
         self.canvas = Canvas()
         self.pictures = 0  # drawn since the start; none while nothing changes
@@ -133,7 +133,7 @@ class Monitor(Starts, App[int]):
         """Start the link and the clock of the screen."""
         if self._threaded:
             self.link.start()
-            self._ticking = asyncio.create_task(self._tick())
+            self._tick_task = asyncio.create_task(self._tick())
         self.draw()
 
     async def _tick(self) -> None:
@@ -155,18 +155,18 @@ class Monitor(Starts, App[int]):
 
     def on_unmount(self) -> None:
         """Detach from the run."""
-        if self._ticking is not None:
-            self._ticking.cancel()
+        if self._tick_task is not None:
+            self._tick_task.cancel()
         self.link.close()
 
     def on_resize(self) -> None:
-        """Draw for the new size."""
+        """Draw in the new size."""
         self.call_after_refresh(self.draw, force=True)
 
     # The picture
 
     def view(self) -> PlotView:
-        """Return everything the picture is drawn from."""
+        """Return all data of the picture."""
         newest = self.link.frame
         if newest.stage is LinkStage.CHOOSING and self.marked_session not in newest.sessions:
             self.marked_session = newest.sessions[0] if newest.sessions else None
@@ -197,12 +197,12 @@ class Monitor(Starts, App[int]):
         if blink != self.look.blink:
             self.look = replace(self.look, blink=blink)
             force = True
-        same = self._drawn_frame is frame and not force
-        waits = self.stop_asked is not None and now - self.stop_asked.at < LINGER
-        idle = not frame.live and not waits
-        if same and (idle or now - self._slow < SLOW):
+        unchanged = self._drawn_frame is frame and not force
+        stop_shown = self.stop_asked is not None and now - self.stop_asked.at < LINGER
+        idle = not frame.live and not stop_shown
+        if unchanged and (idle or now - self._last_drawn < SLOW):
             return
-        self._drawn_frame, self._slow = frame, now
+        self._drawn_frame, self._last_drawn = frame, now
         size = self.size
         self.canvas.show(compose(self.view(), size.width, size.height))
         self.pictures += 1
@@ -224,7 +224,7 @@ class Monitor(Starts, App[int]):
     # Keys
 
     def get_driver_class(self) -> type[Driver]:
-        """Return the terminal's driver, which passes a stop on before everything that waits."""
+        """Return the terminal's driver, which passes keys to `early_key` before any queue."""
         return with_early_keys(super().get_driver_class(), self.early_key)
 
     def early_key(self, event: events.Key) -> None:
@@ -257,7 +257,7 @@ class Monitor(Starts, App[int]):
 
     def _escape(self) -> None:
         now = self.clock()
-        if now - self._last_escape <= TWICE:
+        if now - self._last_escape <= DOUBLE_PRESS:
             self._last_escape = -float("inf")
             self.act_stop()
         else:
@@ -310,9 +310,9 @@ class Monitor(Starts, App[int]):
     def _list_again(self, frame: Frame, *, force: bool = False) -> None:
         """Read the folder of an open page of runs if a run has begun or ended since it was read."""
         state = (frame.stage, frame.snapshot is None)
-        changed = self.look.page == "runs" and state != self._listed and not self.browsed.reading
-        if changed or force:
-            self._listed = state
+        is_open = self.look.page == "runs" and not self.browsed.reading
+        if force or (is_open and state != self._listed_state):
+            self._listed_state = state
             self.read_folder()
 
     def _choose(self, key: str) -> None:
@@ -320,13 +320,13 @@ class Monitor(Starts, App[int]):
         if key == "enter":
             self.link.choose(self.marked_session)
         elif sessions:
-            at = sessions.index(self.marked_session) if self.marked_session in sessions else 0
-            self.marked_session = sessions[(at + (1 if key == "down" else -1)) % len(sessions)]
+            index = sessions.index(self.marked_session) if self.marked_session in sessions else 0
+            self.marked_session = sessions[(index + (1 if key == "down" else -1)) % len(sessions)]
 
     def _move(self, key: str) -> None:
         look, snapshot = self.look, self.link.frame.snapshot
-        down = {"up": -1, "down": 1, "pageup": -10, "pagedown": 10, "home": -9999, "end": 9999}
-        step = down.get(key, 0)
+        steps = {"up": -1, "down": 1, "pageup": -10, "pagedown": 10, "home": -9999, "end": 9999}
+        step = steps.get(key, 0)
         joints = len(joints_in(snapshot.channels)) if snapshot else 0
         if look.page == "run trace" and key in ("left", "right"):
             self.look = replace(look, channel=max(look.channel + (1 if key == "right" else -1), 0))
@@ -373,8 +373,8 @@ class Monitor(Starts, App[int]):
 
     def _step_span(self, step: int) -> None:
         spans = LONG_SPANS
-        at = spans.index(self.look.seconds) + step
-        self._span = spans[min(max(at, 0), len(spans) - 1)]
+        index = spans.index(self.look.seconds) + step
+        self._span = spans[min(max(index, 0), len(spans) - 1)]
 
     def act_longer(self) -> None:
         """Show more of the past."""
@@ -390,8 +390,8 @@ class Monitor(Starts, App[int]):
 
     def act_filter(self) -> None:
         """Show one kind of line in the log, or all."""
-        at = (KINDS.index(self.look.only) + 1) % len(KINDS)
-        self.look = replace(self.look, only=KINDS[at], offset=0)
+        index = (KINDS.index(self.look.only) + 1) % len(KINDS)
+        self.look = replace(self.look, only=KINDS[index], offset=0)
 
     def act_search(self) -> None:
         """Ask for a text to search in the log."""

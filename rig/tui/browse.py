@@ -26,7 +26,7 @@ READ_AT_MOST: Final = 1_000_000  # [bytes] of a file that are read to recognise 
 
 @dataclass(frozen=True)
 class BrowserState:
-    """Contents of the folder; `trouble` is one line about what cannot be read.
+    """Contents of the folder; `trouble` states in one line what cannot be read.
 
     `log` and `trace` are those of the run opened last; `job` is the newest verb started here, for
     `rig` and `endpoint`.
@@ -57,14 +57,14 @@ class BrowserState:
         return len((self.protocols, self.runs, self.queue)[self.tab])
 
 
-def read_disk(before: BrowserState) -> BrowserState:
+def read_disk(previous: BrowserState) -> BrowserState:
     """Read everything again; never raises: `trouble` states what cannot be read."""
     troubles: list[str] = []
     runs: tuple[RunSummary, ...] = ()
     queue: tuple[Item, ...] = ()
     paused = ""
     try:
-        runs = tuple(reversed(indexed_runs(before.folder)))  # the newest on top
+        runs = tuple(reversed(indexed_runs(previous.folder)))  # the newest on top
     except (InputError, OSError) as error:
         troubles.append(str(error))
     path = state_folder() / "queue.sqlite"
@@ -75,8 +75,8 @@ def read_disk(before: BrowserState) -> BrowserState:
         except (InputError, OSError, sqlite3.Error) as error:
             troubles.append(str(error))
     return replace(
-        before,
-        protocols=(*own_protocols(before.folder), *shipped_names()),
+        previous,
+        protocols=(*protocol_files(previous.folder), *shipped_names()),
         runs=runs,
         queue=queue,
         paused=paused,
@@ -85,7 +85,7 @@ def read_disk(before: BrowserState) -> BrowserState:
     )
 
 
-def own_protocols(folder: Path) -> tuple[str, ...]:
+def protocol_files(folder: Path) -> tuple[str, ...]:
     """Return the protocol files of a folder: YAML with `steps:` on a line that is not indented."""
     protocols = []
     for path in sorted(folder.glob("*.yaml")):

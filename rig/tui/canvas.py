@@ -22,15 +22,15 @@ class Canvas(Widget):
     def __init__(self) -> None:
         super().__init__()
         self.rows: tuple[Row, ...] = ()
-        self._ground = Style.null()
+        self._background = Style.null()
 
     def show(self, rows: Sequence[Row]) -> int:
         """Show these rows; return how many have changed."""
-        before, self.rows = self.rows, tuple(rows)
-        self._ground = self.rich_style
-        padded = [*before, *[BLANK] * (len(rows) - len(before))]
+        previous, self.rows = self.rows, tuple(rows)
+        self._background = self.rich_style
+        padded = [*previous, *[BLANK] * (len(rows) - len(previous))]
         changed = [y for y, line in enumerate(self.rows) if line != padded[y]]
-        if len(before) != len(rows):
+        if len(previous) != len(rows):
             self.refresh()
         elif changed:
             # Neighbouring rows make one region: each has its cost in the compositor.
@@ -45,4 +45,4 @@ class Canvas(Widget):
     def render_line(self, y: int) -> Strip:
         """Return one line of the terminal."""
         line = self.rows[y] if y < len(self.rows) else BLANK
-        return to_strip(line, self.size.width, self._ground)
+        return to_strip(line, self.size.width, self._background)

@@ -47,7 +47,7 @@ class VerbJob:
 
     @property
     def ended(self) -> str:
-        """Its end, in words; empty while it runs."""
+        """The meaning of its exit code, with the reason; empty while it runs."""
         if self.code is None:
             return ""
         meaning = MEANINGS.get(self.code, f"ended with code {self.code}")
@@ -93,13 +93,13 @@ def _watch(
                 code = process.wait(POLL)
             except subprocess.TimeoutExpired:
                 code = None
-            said = _text(errors)
-            lines = tuple(said.splitlines()[-TAIL:])
+            text = _text(errors)
+            lines = tuple(text.splitlines()[-TAIL:])
             if code is None and lines == job.lines:
                 continue
             job = replace(job, lines=lines)
             if code is not None:
-                reason = reason_in(said) if code else ""
+                reason = reason_in(text) if code else ""
                 job = replace(job, code=code, reason=reason, output=_text(output))
             changed(job)
 

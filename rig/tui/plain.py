@@ -24,7 +24,7 @@ def status_line(frame: Frame, now: float) -> str:
     head = headline(frame, now)
     snapshot = frame.snapshot
     if snapshot is None:
-        return f"{head.word}: {_without(frame)}"
+        return f"{head.word}: {_no_data_text(frame)}"
     parts = [f"{head.word}: {run_time(frame):.1f} s", f"{snapshot.step} {snapshot.phase}".strip()]
     if snapshot.repeats > 0:
         parts.append(f"repeat {snapshot.repeat} of {snapshot.repeats}")
@@ -37,16 +37,16 @@ def status_line(frame: Frame, now: float) -> str:
             f"nearest limit {margin.channel} {how.number(margin.value)} of "
             f"{how.short(margin.limit)} {how.unit} ({margin.share:.0%})"
         )
-    fresh = sum(not alarm.acknowledged for alarm in snapshot.alarms)
+    unacknowledged = sum(not alarm.acknowledged for alarm in snapshot.alarms)
     if snapshot.alarms:
-        parts.append(f"{len(snapshot.alarms)} alarms, {fresh} unacknowledged")
+        parts.append(f"{len(snapshot.alarms)} alarms, {unacknowledged} unacknowledged")
     parts.append(f"{snapshot.lost_samples} lost")
     if not frame.over:
         parts.append(f"age {age_text(frame.age(now))}")
     return ", ".join(part for part in parts if part)
 
 
-def _without(frame: Frame) -> str:
+def _no_data_text(frame: Frame) -> str:
     if frame.trouble:
         return f"cannot reach runs: {frame.trouble}"
     if frame.stage is LinkStage.CHOOSING:
@@ -66,10 +66,10 @@ class Reader:
 
     def read(self, frame: Frame, now: float) -> None:
         """Print what is new in a frame."""
-        known = set(map(id, self._printed))
-        for what in frame.event_lines:
-            if id(what) not in known:
-                self._say(f"  at {what.time:.2f} s: {what.text}")
+        printed = set(map(id, self._printed))
+        for event_line in frame.event_lines:
+            if id(event_line) not in printed:
+                self._say(f"  at {event_line.time:.2f} s: {event_line.text}")
         self._printed = frame.event_lines
         quiet = frame.over or frame.snapshot is None
         line = status_line(frame, now)

@@ -19,8 +19,8 @@ STORED: Final = "trace.json"  # the output of `bramah trace --json`, in the run'
 
 Numbers = Mapping[str, float | None]
 
-MOST: Final = 20_000  # newest lines that are kept
-LONGEST: Final = 400  # characters of a line
+MOST_LINES: Final = 20_000  # newest lines that are kept
+LONGEST_LINE: Final = 400  # characters of a line
 
 
 class _Stored(BaseModel):
@@ -132,27 +132,27 @@ class RunTrace:
 
 def read_trace(folder: Path) -> RunTrace:
     """Read the trace stored in a run's folder, else next to it; never raises."""
-    places = (folder / STORED, folder.parent / STORED)
-    path = next((place for place in places if place.is_file()), None)
+    candidates = (folder / STORED, folder.parent / STORED)
+    path = next((place for place in candidates if place.is_file()), None)
     if path is None:
         hint = "`trace what its model lacks` on the page of runs writes it"
-        return RunTrace(folder, trouble=f"{places[0]}: there is no such file; {hint}")
+        return RunTrace(folder, trouble=f"{candidates[0]}: there is no such file; {hint}")
     try:
         return RunTrace(folder, path, StoredTrace.model_validate_json(path.read_bytes()))
     except OSError as error:
         return RunTrace(folder, path, trouble=f"{path}: cannot be read: {error.strerror}")
     except ValidationError as error:
-        return RunTrace(folder, path, trouble=f"{path}: {_first(error)}")
+        return RunTrace(folder, path, trouble=f"{path}: {_first_error_text(error)}")
 
 
-def _first(error: ValidationError) -> str:
+def _first_error_text(error: ValidationError) -> str:
     """Return the first error with its key; `bramah trace --json` is expected."""
-    first = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "json_invalid":
-        return f"is not JSON ({first['msg']}); expected the output of `bramah trace --json`"
-    name = str(first["input"])[:40]
-    return f"{key}: {first['msg']}, found {name}; expected the output of `bramah trace --json`"
+    problem = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "json_invalid":
+        return f"is not JSON ({problem['msg']}); expected the output of `bramah trace --json`"
+    name = str(problem["input"])[:40]
+    return f"{key}: {problem['msg']}, found {name}; expected the output of `bramah trace --json`"
 
 
 @dataclass(frozen=True)
@@ -175,19 +175,20 @@ def read_log(folder: Path) -> RunLog:
     except OSError as error:
         return RunLog(folder, trouble=f"{path}: cannot be read: {error.strerror}")
     entries: list[EventLine] = []
-    bad: list[int] = []
+    damaged: list[int] = []
     newest = 0.0
     lines = raw.splitlines()
     for number, line in enumerate(lines, 1):
         event = _event(line)
         if event is None:
-            bad.append(number)
+            damaged.append(number)
             continue
         newest = _time(event, newest)
         text, style, kind = event_text(event)
         entries.append(EventLine(newest, _printable(text), style, kind))
-    torn = bad == [len(lines)] and not raw.endswith(b"\n")
-    return RunLog(folder, tuple(entries[-MOST:]), _trouble(path, bad, len(lines), torn=torn))
+    cut_off = damaged == [len(lines)] and not raw.endswith(b"\n")
+    trouble = _trouble(path, damaged, len(lines), cut_off=cut_off)
+    return RunLog(folder, tuple(entries[-MOST_LINES:]), trouble)
 
 
 def _event(line: bytes) -> dict[str, Any] | None:
@@ -208,15 +209,15 @@ def _time(event: dict[str, Any], before: float) -> float:
 def _printable(text: str) -> str:
     """Return a text without control characters, which a damaged file may hold."""
     flat = " ".join(text.split())
-    return "".join(c if c.isprintable() else "·" for c in flat[:LONGEST])
+    return "".join(c if c.isprintable() else "·" for c in flat[:LONGEST_LINE])
 
 
-def _trouble(path: Path, bad: list[int], count: int, *, torn: bool) -> str:
-    if torn:
+def _trouble(path: Path, damaged: list[int], count: int, *, cut_off: bool) -> str:
+    if cut_off:
         return f"{path}: the last line was cut off, as by a kill; the lines before it are shown"
-    if bad:
+    if damaged:
         return (
-            f"{path}: {len(bad)} of {count} lines cannot be read, the first is line {bad[0]}; "
-            "expected one JSON object with 'event' a line"
+            f"{path}: {len(damaged)} of {count} lines cannot be read, the first is line "
+            f"{damaged[0]}; expected one JSON object with 'event' a line"
         )
     return "" if count else f"{path}: is empty"

@@ -136,11 +136,11 @@ def nearest_margin(frame: Frame) -> Margin | None:
         free = snapshot is not None and joint is not None and role_of(snapshot, joint) == "free"
         if low is None or high is None or not high > low or (kind == ch.PISTON and free):
             continue
-        seen = frame.window.span(name, frame.device_time - RECENT) or (view.last, view.last)
-        if math.isnan(seen[0]):
+        extremes = frame.window.span(name, frame.device_time - RECENT) or (view.last, view.last)
+        if math.isnan(extremes[0]):
             continue
-        below, above = seen[0] - low, high - seen[1]
-        value, edge = (seen[0], low) if below < above else (seen[1], high)
+        below, above = extremes[0] - low, high - extremes[1]
+        value, edge = (extremes[0], low) if below < above else (extremes[1], high)
         margin = Margin(name, min(below, above) / (high - low), min(below, above), value, edge,
                         view.unit)  # fmt: skip
         if best is None or margin.share < best.share:
@@ -166,8 +166,8 @@ def run_time(frame: Frame, device_time: float | None = None) -> float:
     snapshot = frame.snapshot
     if snapshot is None:
         return 0.0
-    began = snapshot.device_time - snapshot.done_s
-    return (snapshot.device_time if device_time is None else device_time) - began
+    start = snapshot.device_time - snapshot.done_s
+    return (snapshot.device_time if device_time is None else device_time) - start
 
 
 def time_left(snapshot: Snapshot) -> str:
@@ -177,38 +177,36 @@ def time_left(snapshot: Snapshot) -> str:
 
 def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> list[Notice]:
     """Return the notices, the worst first."""
-    standing: list[Notice] = []
+    listed: list[Notice] = []
     snapshot = frame.snapshot
     if snapshot is not None and UNSURE in snapshot.message:
-        standing.append(
-            Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}")
-        )
+        listed.append(Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}"))
     if snapshot is not None and snapshot.device == LOST:
         result = (
             snapshot.message if frame.over else "looking for it; outputs zeroed by its watchdog"
         )
-        standing.append(Notice("alarm", f"DEVICE LOST: {result}"))
+        listed.append(Notice("alarm", f"DEVICE LOST: {result}"))
     if snapshot is not None and snapshot.trip is not None:
-        standing.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
+        listed.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
     if frame.trouble:
-        standing.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
+        listed.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
     if stop is not None and (stop.endpoint == frame.endpoint or now - stop.at < LINGER):
-        standing.append(stop_notice(frame, stop, now))
+        listed.append(stop_notice(frame, stop, now))
     if frame.over:
-        standing.append(_ended(frame))
+        listed.append(_ended(frame))
     elif frame.stage is LinkStage.ATTACHED and (age := frame.age(now)) > QUIET:
         level = "alarm" if age > VERY_OLD else "warn"
         what = "what is shown is old" if snapshot else "nothing received yet"
-        standing.append(Notice(level, f"NO DATA for {age_text(age)}: {what}"))
+        listed.append(Notice(level, f"NO DATA for {age_text(age)}: {what}"))
     if snapshot is not None and not frame.over and snapshot.prompt:
-        standing.append(Notice("ask", f"ANSWER: {snapshot.prompt}  (a answers)"))
+        listed.append(Notice("ask", f"ANSWER: {snapshot.prompt}  (a answers)"))
     elif snapshot is not None and not frame.over and snapshot.engine == "paused":
-        standing.append(Notice("ask", "PAUSED: outputs at zero until someone resumes (p)"))
+        listed.append(Notice("ask", "PAUSED: outputs at zero until someone resumes (p)"))
     if snapshot is not None and not frame.over:
-        standing += alarm_notices(snapshot)
+        listed += alarm_notices(snapshot)
     if paused:
-        standing.append(Notice("warn", "DISPLAY HELD, the run goes on: h shows it live again"))
-    return standing
+        listed.append(Notice("warn", "DISPLAY HELD, the run goes on: h shows it live again"))
+    return listed
 
 
 def alarm_notices(snapshot: Snapshot) -> list[Notice]:
@@ -217,8 +215,8 @@ def alarm_notices(snapshot: Snapshot) -> list[Notice]:
     if not groups:
         return []
     first, rest = groups[0]
-    more = sum(1 + len(others) for _, others in groups[1:]) + len(rest)
-    tail = f" (and {more} more)" if more else ""
+    others_count = sum(1 + len(others) for _, others in groups[1:]) + len(rest)
+    tail = f" (and {others_count} more)" if others_count else ""
     back = ", back within its band" if first.state is AlarmState.RETURNED else ""
     return [Notice("warn", f"WARNING  {first.sentence}{back}{tail}")]
 
@@ -232,9 +230,9 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
             return Notice("warn", f"STOP: no answer, the run had ended ({frame.snapshot.state})")
         return Notice("alarm", f"STOP: NO ANSWER from the run. {EMERGENCY}")
     if stop.endpoint is not None and stop.endpoint != frame.endpoint:
-        whom = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
+        session = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
         result = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
-        return Notice("warn", f"STOP to {whom}, which is not the run shown: {result}")
+        return Notice("warn", f"STOP to {session}, which is not the run shown: {result}")
     return _stop_of_shown_run(frame, stop, now)
 
 
@@ -245,8 +243,8 @@ def _stop_of_shown_run(frame: Frame, stop: Stop, now: float) -> Notice:
         return Notice("warn", "STOP: sending ...")
     if frame.over:
         why = frame.snapshot.message if frame.snapshot is not None else ""
-        said = f" ({why})" if why else ""
-        return Notice("alarm", f"STOP TAKEN, NOT CONFIRMED: the run ended{said}. {EMERGENCY}")
+        reason = f" ({why})" if why else ""
+        return Notice("alarm", f"STOP TAKEN, NOT CONFIRMED: the run ended{reason}. {EMERGENCY}")
     late = now - stop.at
     if late > CONFIRM:
         return Notice("alarm", f"STOP TAKEN, NOT CONFIRMED for {age_text(late)}. {EMERGENCY}")
@@ -258,9 +256,9 @@ def _zeroed(snapshot: Snapshot) -> bool:
 
     A run aborted for another reason, such as a lost device, may not have zeroed them.
     """
-    said = snapshot.message.lower()
-    stopped = snapshot.state == "aborted" and "stopped" in said
-    return (stopped or snapshot.state == "tripped") and UNSURE not in said
+    text = snapshot.message.lower()
+    stopped = snapshot.state == "aborted" and "stopped" in text
+    return (stopped or snapshot.state == "tripped") and UNSURE not in text
 
 
 def _ended(frame: Frame) -> Notice:

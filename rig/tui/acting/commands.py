@@ -55,8 +55,8 @@ class Commands:
         def answered(where: Endpoint | None, taken: bool) -> None:
             # Called by the sending thread: replacing one attribute needs no lock.
             if self.stop_asked is stop:
-                missed = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
-                answer = KeyAnswer.TAKEN if taken else missed
+                not_taken = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
+                answer = KeyAnswer.TAKEN if taken else not_taken
                 self.stop_asked = replace(stop, endpoint=where, answer=answer)
                 self.redraw()
 
@@ -69,11 +69,11 @@ class Commands:
     def command(self, word: str, value: str = "", done: str = "") -> None:
         """Send a command to the run, or show why none can be sent."""
         endpoint = self.link.frame.endpoint
-        if endpoint is not None and self._open_to(word):
+        if endpoint is not None and self._may_command(word):
             self.remark = f"{word}: asking ..."
             self.link.ask(endpoint, word, value, lambda no: self._show_answer(word, done, no))
 
-    def _open_to(self, word: str) -> bool:
+    def _may_command(self, word: str) -> bool:
         """Return whether a run is attached that this screen may command; else show why not."""
         frame = self.link.frame
         if frame.endpoint is None or frame.snapshot is None:
@@ -87,13 +87,13 @@ class Commands:
         return False
 
     def _show_answer(self, word: str, done: str, refusal: str | None) -> None:
-        said = done or "taken" if refusal is None else refusal.removeprefix(f"{word}: ")
-        self.remark = f"{word}: {said}"
+        answer = done or "taken" if refusal is None else refusal.removeprefix(f"{word}: ")
+        self.remark = f"{word}: {answer}"
         self.redraw()
 
     def commanded(self, word: str, text: str) -> None:
         """Send a command after confirmation; show why if it cannot be sent."""
-        if self._open_to(word):
+        if self._may_command(word):
             self.confirmed(word, text, lambda: self.command(word))
 
     def confirmed(self, title: str, text: str, act: Callable[[], None]) -> None:
@@ -204,7 +204,7 @@ class Commands:
             # Of the run that is shown now: another may be attached before the reason is given.
             self.ask_reason(alarm.sentence, lambda why: self._reset(snapshot, alarm, why))
 
-    def ask_reason(self, about: str, reset: Callable[[str], None]) -> None:
+    def ask_reason(self, question: str, reset: Callable[[str], None]) -> None:
         """Ask what was found and done at a trip, then reset with that reason."""
 
         def answered(reason: str) -> None:
@@ -213,7 +213,7 @@ class Commands:
             else:
                 self.remark = "reset: a reset needs a reason; nothing was reset."
 
-        body = (about, "", "What was found and done? It is kept with the trip.")
+        body = (question, "", "What was found and done? It is kept with the trip.")
         keys = "Enter resets device and bench, Esc closes"
         self.ask(Dialog("reset", body, text="", keys=keys), answered)
 

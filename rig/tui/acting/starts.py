@@ -21,7 +21,7 @@ from rig.tui.pages.levels import MANUAL
 from rig.tui.recorded_run import STORED, RunLog, RunTrace, read_log, read_trace
 
 REPORT: Final = "trace.html"
-AGAIN: Final = 0.08  # shortest time between two jogs of a held key [s]
+JOG_INTERVAL: Final = 0.08  # shortest time between two jogs of a held key [s]
 
 
 def display_here() -> bool:
@@ -79,9 +79,9 @@ class Starts(Commands):
             self._with_rig(self._start_manual)
         if self.look.page != "runs" or not browsed.lines:
             return
-        at = min(self.look.marked, browsed.lines - 1)
+        index = min(self.look.marked, browsed.lines - 1)
         if browsed.name == "protocols":
-            name = browsed.protocols[at]
+            name = browsed.protocols[index]
             self._offer(name, {
                 "check on the twin": lambda: self._with_rig(
                     lambda rig: self._job(("check", name, "--rig", rig))
@@ -89,9 +89,9 @@ class Starts(Commands):
                 "start on the bench": lambda: self._start_run(name),
             })  # fmt: skip
         elif browsed.name == "runs":
-            self._offer_run(browsed.runs[at])
+            self._offer_run(browsed.runs[index])
         else:
-            item = browsed.queue[at]
+            item = browsed.queue[index]
             page = browsed.folder / "night.html"
             words = ("queue", "page", "--out", str(page))
             self._offer(f"item {item.id} {item.job.name}: {item.state} {item.reason}", {
@@ -111,7 +111,7 @@ class Starts(Commands):
         report, stored = run.path / REPORT, run.path / STORED
         shared_report = run.path.parent / REPORT  # of a set of runs, as the demo writes it
 
-        def against() -> None:
+        def choose_held_out() -> None:
             acts: dict[str, Callable[[], None]] = {}
             for other in others:
                 words = ("trace", path, "--holdout", str(other.path), "--report", str(report),
@@ -124,7 +124,7 @@ class Starts(Commands):
 
         acts: dict[str, Callable[[], None]] = {
             "identify its parameters": lambda: self._job(("identify", path, "--json", "-")),
-            "trace what its model lacks": against,
+            "trace what its model lacks": choose_held_out,
             "open its report": lambda: self._open(
                 report if report.is_file() or not shared_report.is_file() else shared_report
             ),
@@ -188,13 +188,13 @@ class Starts(Commands):
             act(self.browsed.rig)
             return
 
-        def named(text: str) -> None:
+        def use_rig(text: str) -> None:
             self.browsed = replace(self.browsed, rig=text.strip())
             if text.strip():
                 act(text.strip())
 
         body = ("The rig's shipped name, or the path of its file.",)
-        self.ask(Dialog("rig", body, text="", keys="Enter takes it, Esc closes"), named)
+        self.ask(Dialog("rig", body, text="", keys="Enter takes it, Esc closes"), use_rig)
 
     def _start_run(self, protocol: str) -> None:
         frame = self.link.frame
@@ -210,12 +210,12 @@ class Starts(Commands):
         if self.browsed.endpoint is not None:
             words += ["--endpoint", self.browsed.endpoint]
 
-        def go() -> None:
+        def start_run() -> None:
             self._job(tuple(words))
             self.remark = "start: proved on the twin first; this screen attaches as soon as it runs"
 
         text = f"THE BENCH MOVES, once {protocol} is proved on the twin of {rig}. Start?"
-        self.confirmed("start", text, go)
+        self.confirmed("start", text, start_run)
 
     def _job(self, words: tuple[str, ...]) -> None:
         job = self.browsed.job
@@ -251,7 +251,7 @@ class Starts(Commands):
     def act_jog(self, key: str) -> None:
         """Move the chosen joint for a short time; a held key repeats this."""
         now = self.clock()
-        if key not in ("up", "down") or now - self.jogged < AGAIN or not self._manual("jog"):
+        if key not in ("up", "down") or now - self.jogged < JOG_INTERVAL or not self._manual("jog"):
             return
         self.jogged = now
         self.command("jog", f"{self.look.joint} {'+' if key == 'up' else '-'}")

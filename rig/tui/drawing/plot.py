@@ -59,8 +59,8 @@ class PlotTrace:
         # Noise alone must not fill the plot and look like a motion.
         bottom, top = self.limits
         least = self.shown.least if bottom is None or top is None else LEAST_ZOOM * (top - bottom)
-        spare = max(least - (high - low), 0.0) / 2
-        return braille.scale_around([low - spare, high + spare])
+        padding = max(least - (high - low), 0.0) / 2
+        return braille.scale_around([low - padding, high + padding])
 
 
 def draw(trace: PlotTrace, width: int, height: int) -> list[Row]:
@@ -78,8 +78,8 @@ def draw(trace: PlotTrace, width: int, height: int) -> list[Row]:
     kinds = kinds.copy()
     kinds[cells] = (3 + np.broadcast_to(_beyond(low, high, trace.limits), cells.shape))[cells]
     if columns:  # a blank takes the preceding style, so that fewer parts are sent to the terminal
-        known = np.maximum.accumulate(np.where(kinds > 0, np.arange(columns), 0), axis=1)
-        spread = np.take_along_axis(kinds, known, axis=1)
+        last_drawn = np.maximum.accumulate(np.where(kinds > 0, np.arange(columns), 0), axis=1)
+        spread = np.take_along_axis(kinds, last_drawn, axis=1)
         kinds = np.where((kinds == 0) & (spread < _BEYOND), spread, kinds)
     # Values beyond a limit are marked even when old: they explain a trip.
     styles = (DIM, WARN_LINE, TRIP_LINE, PLAIN if trace.live else DIM, ALARM)
@@ -123,9 +123,9 @@ def _lines(
     warn[:, np.arange(2 * columns) % (2 * _WIDE) != 0] = False
     kinds = braille.to_cells(warn).astype(np.int64)
     kinds[braille.to_cells(trip)] = 2
-    both = warn | trip
-    both.flags.writeable = kinds.flags.writeable = False  # cached for the next pictures
-    return both, kinds
+    all_dots = warn | trip
+    all_dots.flags.writeable = kinds.flags.writeable = False  # cached for the next pictures
+    return all_dots, kinds
 
 
 def _beyond(low: Array, high: Array, limits: Band) -> NDArray[np.int_]:
@@ -141,7 +141,7 @@ def _axis(
     limits: Band,
     warnings: Band,
     zoomed: bool,
-    how: Format,
+    display: Format,
     scale: braille.Scale,
     height: int,
 ) -> tuple[tuple[Part, ...], ...]:
@@ -149,13 +149,13 @@ def _axis(
     labels: dict[int, Part] = {}
     marks = (*limits, *warnings)
     if zoomed or not any(m is not None and scale.low <= m <= scale.high for m in marks):
-        labels[height - 1] = (how.short(scale.low, GUTTER - 1), DIM)
-        labels[0] = (how.short(scale.high, GUTTER - 1), DIM)
+        labels[height - 1] = (display.short(scale.low, GUTTER - 1), DIM)
+        labels[0] = (display.short(scale.high, GUTTER - 1), DIM)
     for levels, style in ((warnings, WARN_LINE), (limits, TRIP_LINE)):
         for level in levels:
             if level is not None and scale.low <= level <= scale.high:
                 at = int(scale.row(level, 4 * height)) // 4
-                labels[at] = (how.short(level, GUTTER - 1), style)
+                labels[at] = (display.short(level, GUTTER - 1), style)
     lines: list[tuple[Part, ...]] = []
     for k in range(height):
         text, style = labels.get(k, ("", DIM))

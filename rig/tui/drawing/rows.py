@@ -24,7 +24,7 @@ Row = tuple[Part, ...]
 BLANK: Row = ()
 
 # Characters of two cells, and of none. Only text with one is measured by characters.
-_ODD = re.compile(
+_NOT_ONE_CELL = re.compile(
     "[\u0300-\u036f\u1100-\u115f\u200b-\u200f\u2e80-\ua4cf\uac00-\ud7a3\uf900-\ufaff"
     "\ufe00-\ufe6f\uff00-\uff60\uffe0-\uffe6\U0001f000-\U0003fffd]"
 )
@@ -32,7 +32,7 @@ _ODD = re.compile(
 
 def cell_len(text: str) -> int:
     """Return the width of a text [cells]."""
-    if text.isascii() or _ODD.search(text) is None:
+    if text.isascii() or _NOT_ONE_CELL.search(text) is None:
         return len(text)
     return slow_cell_len(text)
 
@@ -50,9 +50,9 @@ class Fitted(tuple[Part, ...]):
 
 def fitted(parts: Iterable[Part], cells: int) -> Row:
     """Return parts of a total width of `cells` cells as a row of known width."""
-    made = Fitted(parts)
-    made.cells = cells
-    return made
+    sized = Fitted(parts)
+    sized.cells = cells
+    return sized
 
 
 def width_of(line: Row) -> int:
@@ -69,19 +69,19 @@ def fit(line: Row, width: int, style: str = PLAIN) -> Row:
     """Return a row of exactly `width` cells: cut with an ellipsis, or filled up in a style."""
     if width <= 0:
         return BLANK
-    have = width_of(line)
-    if have <= width:
-        rest = ((" " * (width - have), style),) if have < width else ()
-        return line if isinstance(line, Fitted) and not rest else fitted((*line, *rest), width)
+    used = width_of(line)
+    if used <= width:
+        filler = ((" " * (width - used), style),) if used < width else ()
+        return line if isinstance(line, Fitted) and not filler else fitted((*line, *filler), width)
     fitting: list[Part] = []
-    left = width - 1
+    remaining = width - 1
     for text, part_style in line:
         size = cell_len(text)
-        if size > left:
-            fitting.append((set_cell_size(text, left) + "…", part_style))
+        if size > remaining:
+            fitting.append((set_cell_size(text, remaining) + "…", part_style))
             break
         fitting.append((text, part_style))
-        left -= size
+        remaining -= size
     return fit(tuple(fitting), width, style)
 
 
@@ -94,7 +94,7 @@ def ends(left: Row, right: Row, width: int) -> Row:
 
 
 def window(rows: list[Row], at: int, height: int) -> list[Row]:
-    """Return `height` of the rows with the marked one among them; the ends count what is left."""
+    """Return `height` of the rows with row `at` among them; the end rows count the hidden ones."""
     first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
     shown, below = rows[first : first + height], len(rows) - first - height
     if height < 3:  # the marked row has no neighbours on both sides
@@ -115,10 +115,10 @@ def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> l
     """Return exactly `height` rows of `width` cells; the last one counts what does not fit."""
     if len(rows) > height > 0:
         rows = [*rows[: height - 1], _more("↓", len(rows) - height)]
-    kept = [fit(line, width, style) for line in rows[: max(height, 0)]]
-    if len(kept) < height:
-        kept += [fit(BLANK, width, style)] * (height - len(kept))
-    return kept
+    filled = [fit(line, width, style) for line in rows[: max(height, 0)]]
+    if len(filled) < height:
+        filled += [fit(BLANK, width, style)] * (height - len(filled))
+    return filled
 
 
 def hstack(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
@@ -177,11 +177,11 @@ def columns(rows: Iterable[Sequence[str | Part]], gap: int = 2) -> list[Row]:
 
 
 @lru_cache(maxsize=256)
-def _style(text: str, ground: Style) -> Style:
-    return ground + Style.parse(text) if text else ground
+def _style(text: str, background: Style) -> Style:
+    return background + Style.parse(text) if text else background
 
 
-def to_strip(line: Row, width: int, ground: Style) -> Strip:
+def to_strip(line: Row, width: int, background: Style) -> Strip:
     """Return a row in the form of the terminal's driver."""
-    segments = [Segment(text, _style(style, ground)) for text, style in fit(line, width)]
+    segments = [Segment(text, _style(style, background)) for text, style in fit(line, width)]
     return Strip(segments, width)

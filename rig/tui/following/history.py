@@ -37,8 +37,8 @@ class HistoryWindow:
         """Return (low, high), each (n,), of a channel; NaN throughout for an unknown one."""
         at = self.columns.get(channel)
         if at is None:
-            nothing = np.full(len(self.time), np.nan)
-            return nothing, nothing
+            no_values = np.full(len(self.time), np.nan)
+            return no_values, no_values
         return self.low[:, at], self.high[:, at]
 
     def span(self, channel: str, since: float) -> tuple[float, float] | None:
@@ -100,12 +100,12 @@ class History:
         if snapshot.device_time <= self._last or not names:
             return
         self._reach = _widened(self._reach, snapshot)
-        fresh = self._count == 0 or after_gap
-        buckets = 1 if fresh else BUCKETS
+        without_start = self._count == 0 or after_gap
+        buckets = 1 if without_start else BUCKETS
         if after_gap and self._count:
-            nothing = np.full((2, 1, len(names)), np.nan)
-            self._write(np.array([np.nextafter(snapshot.device_time, -np.inf)]), nothing)
-        start = snapshot.device_time if fresh else self._last
+            no_values = np.full((2, 1, len(names)), np.nan)
+            self._write(np.array([np.nextafter(snapshot.device_time, -np.inf)]), no_values)
+        start = snapshot.device_time if without_start else self._last
         ends = start + (snapshot.device_time - start) * np.arange(1, buckets + 1) / buckets
         self._write(ends, _stack([snapshot.channels[name] for name in names], buckets))
         self._last = snapshot.device_time
@@ -129,8 +129,8 @@ class History:
 
     def window(self, seconds: float) -> HistoryWindow:
         """Return a copy of the newest `seconds` of device time (and the bucket before them)."""
-        held = min(self._count, self._capacity)
-        order = (self._count - held + np.arange(held)) % self._capacity
+        count = min(self._count, self._capacity)
+        order = (self._count - count + np.arange(count)) % self._capacity
         time = self._time[order]
         first = max(int(np.searchsorted(time, self._last - seconds)) - 1, 0)
         order = order[first:]
@@ -164,6 +164,6 @@ def _widened(
     for name, view in snapshot.channels.items():
         low, high = limit(view.low), limit(view.high)
         if low is not None and high is not None:
-            known = wider.get(name, (low, high))
-            wider[name] = (min(low, known[0]), max(high, known[1]))
+            widest = wider.get(name, (low, high))
+            wider[name] = (min(low, widest[0]), max(high, widest[1]))
     return wider

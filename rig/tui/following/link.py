@@ -29,10 +29,10 @@ log = logging.getLogger(__name__)
 
 FRAME: Final = 1 / 10  # shortest time between two frames [s]
 POLL: Final = 0.1  # longest wait for a snapshot [s]
-LOOK: Final = 0.5  # between searches for a session while none is attached [s]
+SEARCH_INTERVAL: Final = 0.5  # between two searches for a session while none is attached [s]
 QUIET: Final = 0.5  # a run silent for this long is stale, and its process is checked [s]
 KEPT_LINES: Final = 2000  # of the event log, and of estimates
-ANSWERED: Final = 1.0  # time for a run to send its recent history [s]
+ANSWER_TIME: Final = 1.0  # time limit of a run's answer with its recent history [s]
 ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
 
 
@@ -118,8 +118,8 @@ class Frame:
     @property
     def over(self) -> bool:
         """Whether the run has ended: by its own message, or because its process has ended."""
-        said = self.snapshot is not None and self.snapshot.state in ENDED_STATES
-        return self.stage is LinkStage.ENDED or said
+        reported = self.snapshot is not None and self.snapshot.state in ENDED_STATES
+        return self.stage is LinkStage.ENDED or reported
 
 
 class Link:
@@ -137,7 +137,7 @@ class Link:
         self._last_search = -float("inf")
         self._last_window = -float("inf")
         self._dirty = False
-        self._asked_past = -float("inf")
+        self._past_requested = -float("inf")
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self.on_window: Callable[[], None] = lambda: None  # called by the thread of the link
@@ -232,7 +232,7 @@ class Link:
         snapshot = self._source.receive(timeout)
         now = self._clock()
         if snapshot is not None:
-            self._take(snapshot, now)
+            self._update(snapshot, now)
             self._fetch_past(now)
         if self._dirty and (snapshot is None or snapshot.trip or now - self._last_window >= FRAME):
             window = self._history.window(self.window_seconds)
@@ -240,7 +240,7 @@ class Link:
             self._last_window, self._dirty = now, False
             self.on_window()
 
-    def _take(self, snapshot: Snapshot, now: float) -> None:
+    def _update(self, snapshot: Snapshot, now: float) -> None:
         before = self._frame
         quiet = before.snapshot is not None and now - before.received > QUIET
         snapshot = _with_newest_values(before.snapshot, snapshot)
@@ -270,12 +270,12 @@ class Link:
         frame = self._frame
         if frame.snapshot is None or self._source is None or frame.over:
             return
-        known = len(frame.plan) == frame.snapshot.parts
-        first = self._asked_past == -float("inf")
-        if now - self._asked_past < ANSWERED or (known and not first):
+        plan_complete = len(frame.plan) == frame.snapshot.parts
+        first = self._past_requested == -float("inf")
+        if now - self._past_requested < ANSWER_TIME or (plan_complete and not first):
             return
-        self._asked_past = now
-        past = self._source.past(ANSWERED)
+        self._past_requested = now
+        past = self._source.past(ANSWER_TIME)
         if past is None:
             return
         event_lines = frame.event_lines
@@ -286,7 +286,7 @@ class Link:
 
     def _follow_sessions(self) -> None:
         now = self._clock()
-        due = 2 * LOOK if self._source is not None else LOOK
+        due = 2 * SEARCH_INTERVAL if self._source is not None else SEARCH_INTERVAL
         if now - self._last_search < due and self._chosen is None and not self._choosing:
             return
         self._last_search = now
@@ -314,19 +314,19 @@ class Link:
 
     def _blank(self, stage: LinkStage, endpoint: Endpoint | None = None) -> Frame:
         """Return a frame without a run's data; the log stays."""
-        kept = self._frame
+        current = self._frame
         return Frame(
             stage,
-            kept.sessions,
+            current.sessions,
             endpoint,
             received=self._clock(),
-            event_lines=kept.event_lines,
+            event_lines=current.event_lines,
         )
 
     def _drain(self) -> None:
         """Receive the last messages of a run that has ended."""
         while self._source is not None and (last := self._source.receive(0.0)) is not None:
-            self._take(last, self._clock())
+            self._update(last, self._clock())
         self._frame = replace(self._frame, window=self._history.window(self.window_seconds))
 
     def _attach(self, endpoint: Endpoint) -> None:
@@ -334,7 +334,7 @@ class Link:
         self._detach()
         self._source = source
         self._history = History()
-        self._asked_past = -float("inf")
+        self._past_requested = -float("inf")
         self._frame = self._blank(LinkStage.ATTACHED, endpoint)
 
     def _detach(self) -> None:

@@ -32,10 +32,10 @@ class OnlineSettings:
     the flow.
     """
 
-    updates: int = 8  # that changed an interval, before it is judged: some 16 s
+    updates: int = 8  # changes of an interval before it is judged: some 16 s
     wide: float = 0.02  # half an interval over its value, below which it need not shrink
     shrunk: float = 0.95  # of the interval at half the updates; 0.71 where each brings as much
-    few: int = 5  # newest residuals whose median counts
+    few: int = 5  # newest residuals whose median is judged
     grown: float = 2.0  # times the least median before
     small: float = 0.02  # of the equations' size, below which a residual is no reason for a warning
     large: float = 0.5  # of the equations' size: the model explains less than half of it
@@ -50,12 +50,12 @@ def half_widths(series: Sequence[TrackedPoint], name: str) -> list[tuple[float, 
     A parameter that the present step does not excite does not change.
     """
     widths: list[tuple[float, float]] = []
-    before: Sequence[float | None] = ()
+    previous: Sequence[float | None] = ()
     for point in series:
         newest = point.values.get(name, ())
-        if newest == before or len(newest) != 3:
+        if newest == previous or len(newest) != 3:
             continue
-        before = newest
+        previous = newest
         value, low, high = newest
         if value and low is not None and high is not None:
             widths.append((point.time, abs(0.5 * (high - low) / value)))
@@ -81,23 +81,23 @@ def warnings_of(series: Sequence[TrackedPoint]) -> list[str]:
         widths = half_widths(series, name)
         if len(widths) < ONLINE.updates:
             continue
-        then, before = widths[(len(widths) - 1) // 2]
+        when, earlier = widths[(len(widths) - 1) // 2]
         now = widths[-1][1]
-        if now > max(ONLINE.wide, ONLINE.shrunk * before):
+        if now > max(ONLINE.wide, ONLINE.shrunk * earlier):
             warnings.append(
-                f"{name}: its interval does not shrink, ±{before:.0%} at {clock_text(then)} and "
+                f"{name}: its interval does not shrink, ±{earlier:.0%} at {clock_text(when)} and "
                 f"±{now:.0%} now: more amplitude, other lines, or air and play in the way?"
             )
     return warnings
 
 
-def _about_residual(name: str, left: Sequence[tuple[float, float]]) -> list[str]:
+def _about_residual(name: str, residuals: Sequence[tuple[float, float]]) -> list[str]:
     few = ONLINE.few
-    if len(left) < few:
+    if len(residuals) < few:
         return []
     medians = [
-        statistics.median(share for _, share in left[k : k + few])
-        for k in range(len(left) - few + 1)
+        statistics.median(share for _, share in residuals[k : k + few])
+        for k in range(len(residuals) - few + 1)
     ]
     now = medians[-1]
     least = min(range(len(medians)), key=lambda k: medians[k])
@@ -107,7 +107,7 @@ def _about_residual(name: str, left: Sequence[tuple[float, float]]) -> list[str]
             "Check signs, units and sensors before continuing."
         ]
     if now > max(ONLINE.small, ONLINE.grown * medians[least]):
-        when = clock_text(left[least + few - 1][0])
+        when = clock_text(residuals[least + few - 1][0])
         return [
             f"{name}: the residual grows, {medians[least]:.1%} at {when} and {now:.1%} now: has "
             "the bench changed (oil, air, a lock that gives)?"
@@ -151,8 +151,8 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
     rows: list[Row] = []
     for k in range(down):
         share = (room - len(rows)) // (down - k)
-        made = boxes[across * k : across * (k + 1)]
-        rows += hstack([(draws(view, name, each, share), each) for draws, name in made], share)
+        in_row = boxes[across * k : across * (k + 1)]
+        rows += hstack([(draws(view, name, each, share), each) for draws, name in in_row], share)
     if hidden > 0:
         text = ", ".join(name for _, name in boxes[-hidden:])
         foot = [fit(row((f" a larger terminal also shows {text}", DIM)), width)]
@@ -162,14 +162,14 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
 def _residual(view: PlotView, family: str, width: int, height: int) -> list[Row]:
     """Return the residual of new rows by the estimates before them, as a share of the rows."""
     name, unit = EQUATIONS.get(family, (family, ""))
-    left = shares(view.newest.estimates, family)
+    residuals = shares(view.newest.estimates, family)
     rms = view.newest.estimates[-1].residuals.get(family, (float("nan"),))[0]
-    time, share = np.array(left).reshape(-1, 2).T
-    bad = bool(_about_residual(name, left))
+    time, share = np.array(residuals).reshape(-1, 2).T
+    warned = bool(_about_residual(name, residuals))
     line = row(
         (f"{1e2 * share[-1]:.2g} %" if len(share) else "–", STRONG),
         (f", rms {rms:.2g} {unit}  ", DIM),
-        ("▲", WARN_TEXT) if bad else ("", ""),
+        ("▲", WARN_TEXT) if warned else ("", ""),
     )
     return _box(
         view, f"residual of {name}, held out", line, time, 1e2 * share, 1e2 * share, width, height

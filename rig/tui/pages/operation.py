@@ -40,9 +40,9 @@ def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
         return block([text], width, height)
     at = min(max(view.look.marked, 0), len(listed) - 1)
     rows = []
-    for k, (alarm, follows) in enumerate(listed):
+    for k, (alarm, is_consequence) in enumerate(listed):
         mark = ("▸", STRONG) if k == at else (" ", "")
-        indent = "   └ " if follows else " "
+        indent = "   └ " if is_consequence else " "
         moment = f"{run_time(view.frame, alarm.time):9.2f} s  "
         rows.append(row(mark, (moment, DIM), indent, *alarm_mark(view, alarm), f" {alarm.key}"))
     above = min(len(rows), max(height // 3, 1))
@@ -60,7 +60,7 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     else:
         acts = "acknowledged" if alarm.acknowledged else "k acknowledges"
     where = f"joint {alarm.joint}" if alarm.joint else "the bench"
-    facts = [
+    fields = [
         ("cause", alarm.check),
         ("where", f"{alarm.channel or '–'} of {where}"),
         ("value", f"{how.number(alarm.value)} {how.unit}, allowed {allowed} {how.unit}"),
@@ -71,7 +71,7 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     ]  # fmt: skip
     inner = width - 4
     body = wrapped(alarm.sentence, inner, STRONG)
-    body += columns([[(name, DIM), text] for name, text in facts])
+    body += columns([[(name, DIM), text] for name, text in fields])
     body += [row(("do    ", ASK_TEXT), *line) for line in wrapped(alarm.remedy, inner - 6)]
     plot = _curve_before(view, alarm, inner, height - 2 - len(body))
     return box(alarm.key, [*body, *plot], width, height)
@@ -129,11 +129,11 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 def filtered(lines: Sequence[EventLine], view: PlotView) -> list[EventLine]:
     """Return the lines of a log that match the operator's filter and search."""
-    wanted = view.look.search.lower()
+    search = view.look.search.lower()
     return [
         line
         for line in lines
-        if view.look.only in ("all", line.kind) and wanted in line.text.lower()
+        if view.look.only in ("all", line.kind) and search in line.text.lower()
     ]
 
 
@@ -147,8 +147,8 @@ def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
     log = view.browsed.log
     if log is None:
         return block([row((" no run was opened", DIM))], width, height)
-    of = [run for run in view.browsed.runs if run.path == log.folder]
-    state = f"  {of[0].state}  {of[0].message}" if of else ""
+    opened = [run for run in view.browsed.runs if run.path == log.folder]
+    state = f"  {opened[0].state}  {opened[0].message}" if opened else ""
     head = [fit(row((f" log of {log.folder}", STRONG), (state, DIM)), width)]
     if log.reading:
         return block([*head, row((" reading ...", DIM))], width, height)
@@ -165,10 +165,10 @@ def log_rows(
     """Return lines of a log, wrapped, the newest last; scrolled by rows."""
     lines = filtered(event_lines, view)
     room = height - 1
-    wanted = view.look.offset
+    scrolled = view.look.offset
     # A line has at least one row: lines above the window need not be wrapped.
-    rows = [line for entry in lines[-(room + wanted) :] for line in _log_line(entry, width)]
-    offset = min(wanted, max(len(rows) - room, 0))
+    rows = [line for entry in lines[-(room + scrolled) :] for line in _log_line(entry, width)]
+    offset = min(scrolled, max(len(rows) - room, 0))
     search = f"  search: {view.look.search}" if view.look.search else ""
     where = f"  {offset} rows back" if offset else ""
     count = f"  {len(lines)} of {len(event_lines)}{where}"

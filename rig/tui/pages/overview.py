@@ -48,21 +48,21 @@ def _band(
     room = width - sum(sizes) - len(tiles)
     if room < min(large_width(headline.word), width) and headline.level == "alarm":
         tiles, sizes, room = [], [], width  # the word matters most
-    fits = next((s for s in (scale, 1) if large_width(headline.word, s) + 4 <= room), 0)
-    high = ROWS * scale
+    letter_scale = next((s for s in (scale, 1) if large_width(headline.word, s) + 4 <= room), 0)
+    letter_rows = ROWS * scale
     style = ground or STRONG
-    if fits:
-        letters: list[Row] = large(headline.word, style, fits)
+    if letter_scale:
+        letters: list[Row] = large(headline.word, style, letter_scale)
     else:
         spaced = " ".join(headline.word)
         letters = [row(), row((spaced if len(spaced) + 1 < room else headline.word, style))]
     word = [fit((("  ", style), *line), room, ground) for line in letters]
     caption = row((f" {headline.symbol} {headline.word} ", ground or DIM))
-    word = [*block(word, room, high, ground), fit(caption, room, ground)]
+    word = [*block(word, room, letter_rows, ground), fit(caption, room, ground)]
     blocks: list[tuple[list[Row], int]] = [(word, room)]
     for (text, below, tile_style), size in zip(tiles, sizes, strict=True):
         blocks.append(([*large(text, tile_style, scale), row((below, DIM))], size))
-    return hstack(blocks, high + 1)
+    return hstack(blocks, letter_rows + 1)
 
 
 def _step_line(view: PlotView, snapshot: Snapshot, width: int) -> Row:
@@ -98,9 +98,9 @@ def alarm_lines(view: PlotView, width: int, most: int) -> list[Row]:
         rows.append(
             fit(row((" ", ""), *alarm_mark(view, first), f" {first.sentence}{more}"), width)
         )
-    left = len(groups) - most
-    if left > 0:
-        rows.append(fit(row((f" … and {left} more: 5 shows them", DIM)), width))
+    hidden = len(groups) - most
+    if hidden > 0:
+        rows.append(fit(row((f" … and {hidden} more: 5 shows them", DIM)), width))
     return rows
 
 

@@ -159,8 +159,8 @@ def _warned(snapshot: Snapshot, name: str) -> tuple[float, float] | None:
     low, high = limit(view.warn_low), limit(view.warn_high)
     if low is None or high is None or not high > low:
         return None
-    spare = 0.5 * (high - low)
-    return low - spare, high + spare
+    margin = 0.5 * (high - low)
+    return low - margin, high + margin
 
 
 def curve(
@@ -201,9 +201,9 @@ def curves(view: PlotView, names: dict[str, str], width: int, height: int) -> li
     axis = height > CURVE_HEIGHT * count
     rows: list[Row] = []
     for k, (name, label) in enumerate(list(names.items())[:count]):
-        left = height - len(rows)
-        share = left // (count - k) if k < count - 1 else left
-        rows += curve(view, name, label, width, share, axis=axis and k == count - 1)
+        remaining = height - len(rows)
+        rows_each = remaining // (count - k) if k < count - 1 else remaining
+        rows += curve(view, name, label, width, rows_each, axis=axis and k == count - 1)
     return rows
 
 

@@ -26,8 +26,8 @@ def runs_page(view: PlotView, width: int, height: int) -> list[Row]:
     for k, name in enumerate(TABS):
         tabs = (*tabs, (f" {name} ", NORMAL if k == browsed.tab else DIM), (" ", ""))
     reading = " reading ..." if browsed.reading else ""
-    about = f" in {browsed.folder.absolute()}   rig {browsed.rig or '–'}{reading}"
-    head = [fit((*tabs, (about, DIM)), width)]
+    location = f" in {browsed.folder.absolute()}   rig {browsed.rig or '–'}{reading}"
+    head = [fit((*tabs, (location, DIM)), width)]
     if browsed.trouble:
         head += wrapped(f" {browsed.trouble}", width, WARN_TEXT)
     lines = _lines(view)
@@ -53,18 +53,18 @@ def _lines(view: PlotView) -> list[Row]:
 
 def _as_reported(view: PlotView, run: RunSummary) -> RunSummary:
     """Return a run with the final state that it reported; its folder has it once all is written."""
-    said = view.newest.snapshot
-    if said is None or said.state not in ENDED_STATES or said.run != str(run.path.absolute()):
+    newest = view.newest.snapshot
+    if newest is None or newest.state not in ENDED_STATES or newest.run != str(run.path.absolute()):
         return run
-    return replace(run, state=said.state, message=said.message)
+    return replace(run, state=newest.state, message=newest.message)
 
 
 def _run(run: RunSummary) -> list[str | Part]:
     style = ALARM_TEXT if run.state in ("tripped", "unreadable") else ""
     count = f"{run.records} records" if run.records >= 0 else ""
-    said = run.message if run.state != "done" else ""
+    message = run.message if run.state != "done" else ""
     state = (f"{STATES.get(run.state, '□')} {run.state}", style)
-    return [f" {run.path.name}", state, run.protocol, count, (run.created[:16], DIM), said]
+    return [f" {run.path.name}", state, run.protocol, count, (run.created[:16], DIM), message]
 
 
 def _item(item: Item) -> list[str | Part]:

@@ -139,8 +139,8 @@ def free_run_rows(stored: StoredTrace, chosen: int, width: int, height: int) -> 
     each = max((height - 3) // len(errors) - 1, 1)
     rows: list[Row] = [fit(head, width)]
     for word, error in errors:
-        kept = error[np.isfinite(error)]
-        rms = float(np.sqrt(np.mean(kept**2))) if len(kept) else math.nan
+        finite = error[np.isfinite(error)]
+        rms = float(np.sqrt(np.mean(finite**2))) if len(finite) else math.nan
         title = row((f" {word}", STRONG), (f"  rms {plain(how.factor * rms, 3)} {how.unit}", DIM))
         trace = PlotTrace(time, error, error, float(time[0]), float(time[-1]), ends, how)
         rows += [fit(title, width), *draw(trace, width, each)]

@@ -99,9 +99,9 @@ def _who(view: PlotView, width: int) -> Row:
     badge = (f" {head.symbol} {head.word} ", LEVELS[head.level])
     snapshot = view.newest.snapshot
     if snapshot is None:
-        who = view.newest.endpoint
-        about = f"{who.rig} (process {who.pid})" if who else "no run attached"
-        return fit(row(badge, f" {about}"), width)
+        endpoint = view.newest.endpoint
+        text = f"{endpoint.rig} (process {endpoint.pid})" if endpoint else "no run attached"
+        return fit(row(badge, f" {text}"), width)
     fresh = view.fresh
     age = view.newest.age(view.now)
     style = "" if fresh is Freshness.LIVE else WARN_TEXT if age <= VERY_OLD else LEVELS["alarm"]
@@ -136,14 +136,14 @@ def _where(view: PlotView, width: int) -> Row:
 
 def _tabs(view: PlotView, width: int) -> Row:
     count = len(view.alarms.alarms)
-    fresh = len(view.alarms.unacknowledged)
+    unacknowledged = len(view.alarms.unacknowledged)
     line: Row = ()
-    here = "runs" if view.look.page in OF_A_RECORDED_RUN else view.look.page
+    open_page = "runs" if view.look.page in OF_A_RECORDED_RUN else view.look.page
     for key, name, short in PAGES:
         text = name if width >= 116 else short
         if name == "alarms" and count:
-            text += f" {count}{'▲' if fresh else ''}"
-        style = NORMAL if name == here else WARN_TEXT if text[-1] == "▲" else DIM
+            text += f" {count}{'▲' if unacknowledged else ''}"
+        style = NORMAL if name == open_page else WARN_TEXT if text[-1] == "▲" else DIM
         line = (*line, (f" {key} {text}{' ' * (width >= 116)}", style))
     return fit(line, width)
 
@@ -151,10 +151,10 @@ def _tabs(view: PlotView, width: int) -> Row:
 def notice_rows(view: PlotView, width: int) -> list[Row]:
     """Return the notices, each on its own colour over the whole width."""
     rows: list[Row] = []
-    standing = notices(view.newest, view.stop, view.now, paused=view.held)
+    shown = notices(view.newest, view.stop, view.now, paused=view.held)
     if view.look.page == "overview":  # it lists the alarms itself
-        standing = [notice for notice in standing if not notice.text.startswith("WARNING")]
-    for notice in standing:
+        shown = [notice for notice in shown if not notice.text.startswith("WARNING")]
+    for notice in shown:
         style = LEVELS[notice.level]
         lines = wrapped(notice.text, width - 4)
         for k, line in enumerate(lines):
@@ -214,10 +214,10 @@ def _above(rows: list[Row], view: PlotView, width: int) -> list[Row]:
     if dialog.text is not None:
         body.append(fit(row(("> ", STRONG), dialog.text, ("█", "")), inner))
     body += [row(), row((dialog.keys, DIM))]
-    high = min(len(body) + 2, len(rows))
-    drawn = box(dialog.title, body, wide, high, STRONG)
-    top, left = max((len(rows) - high) // 2, 0), (width - wide) // 2
+    rows_high = min(len(body) + 2, len(rows))
+    drawn = box(dialog.title, body, wide, rows_high, STRONG)
+    top, left = max((len(rows) - rows_high) // 2, 0), (width - wide) // 2
     # On these rows only the question is shown.
-    blank = [row()] * high
-    middle = hstack([(blank, left), (drawn, wide), (blank, width - wide - left)], high, gap=0)
-    return [*rows[:top], *middle, *rows[top + high :]]
+    blank = [row()] * rows_high
+    middle = hstack([(blank, left), (drawn, wide), (blank, width - wide - left)], rows_high, gap=0)
+    return [*rows[:top], *middle, *rows[top + rows_high :]]

@@ -92,10 +92,10 @@ def host_name(host: str) -> str:
     """Return the name in a `Host` header without its port, '' for an invalid header."""
     try:
         parts = urlsplit(f"//{host}")
-        whole = parts.netloc == host and "@" not in host and (parts.port or 0) >= 0
+        valid = parts.netloc == host and "@" not in host and (parts.port or 0) >= 0
     except ValueError:
         return ""
-    return parts.hostname or "" if whole else ""
+    return parts.hostname or "" if valid else ""
 
 
 class PageServer(Server):
@@ -135,15 +135,15 @@ class PageServer(Server):
         origins = request.headers.getall("Origin", [])
         if request.path == "/ws" and not origins:  # every browser names one
             origins = [""]
-        why = refusal(
+        reason = refusal(
             request.headers.getall("Host", []),
             origins,
             request.query.getall("token", []),
             self._token,
         )
-        if why is not None:
-            log.info("refused a request from %s: %s", request.remote, why)
-            return web.Response(status=403, text=f"bramah: refused: {why}\n")
+        if reason is not None:
+            log.info("refused a request from %s: %s", request.remote, reason)
+            return web.Response(status=403, text=f"bramah: refused: {reason}\n")
         return await handler(request)
 
     async def _with_headers(self, request: web.Request, response: web.StreamResponse) -> None:
@@ -230,10 +230,10 @@ class PageServer(Server):
             mark = f"{mark}?token={self._token}"
         await page.send_json([kind, mark])
 
-    async def _end(self, page: web.WebSocketResponse, why: str) -> None:
+    async def _end(self, page: web.WebSocketResponse, reason: str) -> None:
         """Show on a page why its screen has ended, and close it."""
         if not page.closed:
-            await page.send_json(["ended", why])
+            await page.send_json(["ended", reason])
             await page.close()
 
     async def on_shutdown(self, app: web.Application) -> None:
@@ -261,12 +261,12 @@ async def _serve(
 ) -> int:
     ended: asyncio.Future[signal.Signals] = asyncio.get_running_loop().create_future()
 
-    def heard(number: signal.Signals) -> None:
+    def on_signal(number: signal.Signals) -> None:
         if not ended.done():
             ended.set_result(number)
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(number, heard, number)
+        asyncio.get_running_loop().add_signal_handler(number, on_signal, number)
     # Another program's requests must not cause tracebacks in the operator's terminal.
     logging.getLogger("aiohttp.server").addFilter(_InOneLine())
     logging.getLogger("textual-serve").setLevel(logging.CRITICAL)  # a screen states why it ended
