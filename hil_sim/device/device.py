@@ -27,10 +27,10 @@ from rig.model.wire.registers import BlockHeader, Refusal, Status, TripCause
 
 logger = logging.getLogger(__name__)
 
-QUEUE_SECONDS = 4.0
-SETTLE_SECONDS = 0.2  # virtual time with zero outputs after the host has disconnected
-VIRTUAL_SILENCE = 10.0  # virtual time stands still between requests
-POLL_SECONDS = 0.05
+QUEUE_SECONDS = 4.0  # [s] of samples that the queue holds
+SETTLE_SECONDS = 0.2  # [s] of virtual time with zero outputs after the host was lost
+VIRTUAL_SILENCE = 10.0  # [s] least watchdog time in virtual time, which pauses between requests
+POLL_SECONDS = 0.05  # [s] longest wait between two polls
 WATCHDOG_RANGE_MS = (round(1e3 * WATCHDOG_RANGE[0]), round(1e3 * WATCHDOG_RANGE[1]))
 _U32 = 0xFFFF_FFFF
 # Integers, because every block needs them and an enumeration is slow.
@@ -43,7 +43,7 @@ class Device:
 
     `client` arguments are any hashable that identifies a connection. Methods called by a client
     raise `Refused` where the device refuses. `faults` break the device while it runs; `on_restart`
-    is called when it restarts, for a server to end what was connected.
+    is called when it restarts, so that a server can end its connections.
     """
 
     def __init__(
@@ -63,16 +63,16 @@ class Device:
         self._faults = sorted(faults, key=lambda fault: fault.at)
         self._virtual_silence = virtual_silence
         # In real time the plant is never ahead of the clock; faults may change it between blocks.
-        ahead = not realtime and not faults
-        self._prefetch = Prefetch(plant) if ahead and isinstance(plant, Rewindable) else None
+        prefetches = not realtime and not faults
+        self._prefetch = Prefetch(plant) if prefetches and isinstance(plant, Rewindable) else None
         self._plant: PlantInterface = plant if self._prefetch is None else self._prefetch
         self._clock = clock
         self._last_request = self._last_poll = self._origin = clock()
         self._drift = 0.0  # relative error of the sample clock, positive if fast
         self._zero_tick = 0  # of the plant, at the device's tick 0
         self._first_tick = plant.tick
-        self._boots_until = -math.inf  # [s] of the clock
-        self._broken = False
+        self._restart_end = -math.inf  # [s] of the clock
+        self._plant_failed = False
         self._power_up()
 
     def _power_up(self) -> None:
@@ -98,9 +98,9 @@ class Device:
         return self._plant.tick - self._zero_tick
 
     @property
-    def boots(self) -> bool:
-        """Whether it restarts and does not answer."""
-        return self._clock() < self._boots_until
+    def restarting(self) -> bool:
+        """Whether the device is restarting and does not answer."""
+        return self._clock() < self._restart_end
 
     @property
     def status(self) -> Status:
@@ -122,10 +122,10 @@ class Device:
 
     def beat(self, client: object, heartbeat: int) -> None:
         """Reset the watchdog if the heartbeat changed, since a repeating host may hang."""
-        before = self._last_request
+        previous_request = self._last_request
         self.take_control(client)
         if heartbeat == self.heartbeat:
-            self._last_request = before
+            self._last_request = previous_request
         self.heartbeat = heartbeat
 
     def set_watchdog(self, milliseconds: int) -> None:
@@ -163,7 +163,7 @@ class Device:
 
     def reset(self) -> None:
         """Clear a latched trip; the outputs stay zero until laws are applied again."""
-        if self._broken:
+        if self._plant_failed:
             raise Refused(Refusal.FAULT)
         self.cause = TripCause.NONE
 
@@ -187,7 +187,7 @@ class Device:
         return reg.pack_header(header) + block.samples
 
     def measure_ahead(self) -> None:
-        """Measure all that the host may read: up to the present, or one block in virtual time."""
+        """Measure what the host may read: up to the present, or one block in virtual time."""
         self.catch_up()
         if not self.realtime and self.streaming and not len(self.queue):
             self._run(self.layout.samples)
@@ -197,7 +197,7 @@ class Device:
 
         It has no effect until it is read, and is discarded at a change of laws.
         """
-        if self._prefetch is not None and self.streaming and not self._broken:
+        if self._prefetch is not None and self.streaming and not self._plant_failed:
             self._prefetch.prefetch(self.layout.samples, self.laws.active)
 
     # -- actions without a request -------------------------------------------------------------
@@ -215,7 +215,7 @@ class Device:
 
     def idle_seconds(self) -> float:
         """Return how long `poll` may wait: until the block being filled is due."""
-        if not self.realtime or self._broken:
+        if not self.realtime or self._plant_failed:
             return POLL_SECONDS
         samples = self._plant.tick - self._first_tick + self.queue.room
         due = self._origin + samples / self._rate - self._clock()
@@ -224,10 +224,10 @@ class Device:
     def poll(self) -> None:
         """Do everything due by the clock; to be called again after `idle_seconds`."""
         now = self._clock()
-        stall, self._last_poll = now - self._last_poll, now
-        if stall > 2 * POLL_SECONDS:
+        pause, self._last_poll = now - self._last_poll, now
+        if pause > 2 * POLL_SECONDS:
             # While the device itself was paused the host does not count as silent.
-            self._last_request += stall
+            self._last_request += pause
         with suppress(Refused):  # a fault, already tripped and logged
             self.catch_up()
             if self._controller is not None and now - self._last_request > self._silence_allowed():
@@ -247,17 +247,17 @@ class Device:
 
     def catch_up(self) -> None:
         """In real time, run the plant up to the present."""
-        if not self.realtime or self._broken:
+        if not self.realtime or self._plant_failed:
             return
         rate = self._rate
         # A millionth of a sample early, so that rounding does not delay a sample that is due.
         elapsed = int((self._clock() - self._origin) * rate + 1e-6)
         due = elapsed - (self._plant.tick - self._first_tick)
-        most = int(QUEUE_SECONDS * rate)
-        if due > most:
+        longest = int(QUEUE_SECONDS * rate)
+        if due > longest:
             # The computer was suspended: the device's clock pauses instead of catching up hours.
-            self._origin += (due - most) / rate
-            due = most
+            self._origin += (due - longest) / rate
+            due = longest
         self._run(due)
 
     def restart(self, boot: float) -> None:
@@ -265,7 +265,7 @@ class Device:
         logger.warning("restarts at tick %d", self.tick)
         self._power_up()
         self._zero_tick = self._plant.tick
-        self._boots_until = self._clock() + boot
+        self._restart_end = self._clock() + boot
         self.on_restart()
 
     @property
@@ -312,13 +312,13 @@ class Device:
             ticks -= count
 
     def _advance(self, count: int, laws: tuple[Law, ...]) -> tuple[Codes, Codes]:
-        if self._broken:
+        if self._plant_failed:
             raise Refused(Refusal.FAULT)
         try:
             return self._plant.advance(count, laws)
         except Exception as error:
             # Any error in the plant counts as a fault of the bench.
-            self._broken = True
+            self._plant_failed = True
             self.trip(TripCause.FAULT)
             logger.exception("the plant failed at tick %d", self.tick)
             raise Refused(Refusal.FAULT) from error

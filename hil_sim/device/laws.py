@@ -40,7 +40,7 @@ OFF = Law(np.zeros(1))  # plants read the waveform of every law
 class _Upload:
     joint: int
     codes: NDArray[np.int16]
-    seen: NDArray[np.bool_]
+    received: NDArray[np.bool_]
 
 
 class LawTable:
@@ -49,8 +49,8 @@ class LawTable:
     def __init__(self, rig: Rig) -> None:
         self._ranges = [joint.valve.command_range for joint in rig.joints]
         # Largest values of one joint, in the order of LAW_FIELDS.
-        reach = max(abs(edge) for edge in rig.sensors.piston.range)
-        self._bounds = np.array([[GAIN_MAX, v, POSITION_GAIN_MAX, reach, v] for v in self._ranges])
+        travel = max(abs(edge) for edge in rig.sensors.piston.range)
+        self._bounds = np.array([[GAIN_MAX, v, POSITION_GAIN_MAX, travel, v] for v in self._ranges])
         self._staged = np.zeros((len(rig.joints), len(reg.LAW_FIELDS)), dtype=">f4")
         self._waves: list[Array] = [OFF.wave for _ in rig.joints]
         self._upload: _Upload | None = None
@@ -100,14 +100,14 @@ class LawTable:
         if end > len(self._upload.codes):
             raise Refused(Refusal.OUT_OF_RANGE, self._upload.joint)
         self._upload.codes[offset:end] = words.view(np.int16)
-        self._upload.seen[offset:end] = True
+        self._upload.received[offset:end] = True
 
     def commit_upload(self, checksum: int) -> None:
         """Make the upload ready for the next apply; raises Refused if anything is missing."""
         upload, self._upload = self._upload, None
         if upload is None:
             raise Refused(Refusal.UPLOAD_TORN)
-        if not upload.seen.all() or reg.wave_checksum(upload.codes) != checksum:
+        if not upload.received.all() or reg.wave_checksum(upload.codes) != checksum:
             raise Refused(Refusal.UPLOAD_TORN, upload.joint)
         index = upload.joint - 1
         self._waves[index] = decode_output(upload.codes, self._ranges[index], reg.WAVE_BITS)

@@ -54,13 +54,13 @@ def _exists(pid: int) -> bool:
 
 def run_until(ended: Sequence[object], parent: int | None, step: Callable[[], None]) -> None:
     """Call `step` until `ended` is not empty, or process `parent` has ended."""
-    owner = None if parent is None else ParentProcess(parent)
-    look = time.monotonic()
+    parent_process = None if parent is None else ParentProcess(parent)
+    next_check = time.monotonic()
     while not ended:
         step()
-        if owner is not None and time.monotonic() > look:
-            look = time.monotonic() + PARENT_SECONDS
-            if owner.has_ended():
+        if parent_process is not None and time.monotonic() > next_check:
+            next_check = time.monotonic() + PARENT_SECONDS
+            if parent_process.has_ended():
                 logger.info("process %d, which this server served, has ended", parent)
                 return
 
@@ -70,16 +70,16 @@ def termination_signals() -> Iterator[list[int]]:
     """Collect SIGTERM and SIGINT in the list returned, instead of ending."""
     signals: list[int] = []
 
-    def note(number: int, _frame: FrameType | None) -> None:
+    def collect(number: int, _frame: FrameType | None) -> None:
         signals.append(number)
 
-    before = {}
+    previous = {}
     # Only a main thread has signals; elsewhere the caller ends its process.
     with suppress(ValueError):
         for number in (signal.SIGTERM, signal.SIGINT):
-            before[number] = signal.signal(number, note)
+            previous[number] = signal.signal(number, collect)
     try:
         yield signals
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""The device's side of a wire of messages: messages in, messages out; no line, no clock.
+"""Execute a host's messages on the device and return answers and blocks; no line, no clock.
 
 Glossary: a request is *late* when a newer one of its session was carried out: it is dropped. The
 newest one is *remembered* with its answer, which is sent again when the request is repeated.
@@ -52,10 +52,10 @@ class MessageSession:
             Message.START: (self._start, 0, 0),
             Message.STOP: (self._stop, 0, 0),
             Message.APPLY: (self._apply, laws, laws),
-            Message.RESET: (self._writing(reg.CONTROL_RESET), 2, 2),
-            Message.UPLOAD_BEGIN: (self._writing(reg.UPLOAD_JOINT), 6, 6),
-            Message.UPLOAD_PAGE: (self._writing(reg.UPLOAD_OFFSET), 6, 4 + 2 * msg.PAGE_SAMPLES),
-            Message.UPLOAD_END: (self._writing(reg.UPLOAD_COMMIT), 4, 4),
+            Message.RESET: (self._writer_of(reg.CONTROL_RESET), 2, 2),
+            Message.UPLOAD_BEGIN: (self._writer_of(reg.UPLOAD_JOINT), 6, 6),
+            Message.UPLOAD_PAGE: (self._writer_of(reg.UPLOAD_OFFSET), 6, 4 + 2 * msg.PAGE_SAMPLES),
+            Message.UPLOAD_END: (self._writer_of(reg.UPLOAD_COMMIT), 4, 4),
         }
 
     @property
@@ -65,14 +65,14 @@ class MessageSession:
 
     def receive(self, frame: WireFrame) -> WireFrame | None:
         """Execute a message; return its answer, None if it has none."""
-        if self._device.boots:
+        if self._device.restarting:
             return None
         if frame.type == Message.ALIVE_NOTE:
-            self._alive(frame)
+            self._take_heartbeat(frame)
             return None
         host = self._host
-        known = host is not None and host.session == frame.session
-        if host is not None and known and frame.version == FRAME_VERSION:
+        current = host is not None and host.session == frame.session
+        if host is not None and current and frame.version == FRAME_VERSION:
             age = (frame.number - host.number) & 0xFFFF
             if frame.type not in FOR_ANYBODY:
                 if age == 0 and host.answer is not None:
@@ -84,7 +84,7 @@ class MessageSession:
                 host.number, host.answer = frame.number, None
         try:
             answer = WireFrame(
-                frame.type | ANSWER, frame.number, frame.session, self._carry_out(frame, known)
+                frame.type | ANSWER, frame.number, frame.session, self._execute(frame, current)
             )
         except Refused as refused:
             payload = msg.pack_refusal(msg.DeviceRefusal(refused.reason, refused.joint))
@@ -92,7 +92,7 @@ class MessageSession:
         host = self._host
         if host is not None and host.session == frame.session and frame.type not in FOR_ANYBODY:
             host.answer = answer
-        return None if self._device.boots else answer
+        return None if self._device.restarting else answer
 
     def push(self) -> WireFrame | None:
         """Return the next block that may be sent, else None."""
@@ -100,15 +100,15 @@ class MessageSession:
         oldest = device.queue.queued(0)
         if host is None or oldest is None or not device.streaming:
             return None
-        place = (self._next - oldest.sequence) & 0xFFFF
-        if place > len(device.queue):
-            place = 0  # the next block was dropped from a full queue
-        block = device.queue.queued(place)
-        if block is None or place >= WINDOW:
+        index = (self._next - oldest.sequence) & 0xFFFF
+        if index > len(device.queue):
+            index = 0  # the next block was dropped from a full queue
+        block = device.queue.queued(index)
+        if block is None or index >= WINDOW:
             return None
         self._next = (block.sequence + 1) & 0xFFFF
         status = device.status | Status.BLOCK
-        backlog = len(device.queue) - place - 1
+        backlog = len(device.queue) - index - 1
         header = BlockHeader(block.sequence, block.tick & _U32, status, backlog)
         payload = msg.pack_block(msg.PushedBlock(oldest.sequence, header, block.samples))
         return WireFrame(Message.BLOCK, self._stream, host.session, payload)
@@ -117,27 +117,27 @@ class MessageSession:
         self._host, self._stream, self._next = None, 0, 0
 
     def ended(self) -> None:
-        """Note that no program has the other end of the line open."""
+        """Handle the end of the connection: no program has the other end of the line open."""
         host, self._host = self._host, None
         if host is not None:
             self._device.disconnected(host)
 
     # -- requests ---------------------------------------------------------------------------
 
-    def _carry_out(self, frame: WireFrame, known: bool) -> bytes:
+    def _execute(self, frame: WireFrame, current: bool) -> bytes:
         if frame.version != FRAME_VERSION:
             raise Refused(Refusal.NO_SUCH_REGISTER)
         if frame.type in FOR_ANYBODY:
-            _sized(frame.payload, 0, 0)
+            _require_size(frame.payload, 0, 0)
             return self._for_anybody(frame.type)
         if frame.type == Message.OPEN:
-            return self._open(frame, known)
+            return self._open(frame, current)
         if frame.type not in self._requests:
             raise Refused(Refusal.NO_SUCH_REGISTER)
-        if self._host is None or not known:
+        if self._host is None or not current:
             raise Refused(Refusal.NOT_IN_CONTROL)
         request, least, most = self._requests[frame.type]
-        _sized(frame.payload, least, most)
+        _require_size(frame.payload, least, most)
         return request(self._host, frame.payload)
 
     def _for_anybody(self, kind: int) -> bytes:
@@ -147,9 +147,9 @@ class MessageSession:
         first, end = reg.IDENTITY_SPAN if kind == Message.IDENTIFY else reg.STATUS_SPAN
         return self._registers.read(None, first, end - first)
 
-    def _open(self, frame: WireFrame, known: bool) -> bytes:
-        _sized(frame.payload, 2, 2)
-        host = self._host if known and self._host else _Host(frame.session, frame.number)
+    def _open(self, frame: WireFrame, current: bool) -> bytes:
+        _require_size(frame.payload, 2, 2)
+        host = self._host if current and self._host else _Host(frame.session, frame.number)
         self._device.take_control(host)
         self._host = host
         self._registers.write(host, reg.CONTROL_WATCHDOG.address, frame.payload)
@@ -178,7 +178,7 @@ class MessageSession:
         self._registers.write(host, reg.CONTROL_APPLY.address, payload[:2])
         return self._registers.read(host, reg.STATUS_APPLY_TICK.address, 2)
 
-    def _writing(self, register: Register) -> Callable[[_Host, bytes], bytes]:
+    def _writer_of(self, register: Register) -> Callable[[_Host, bytes], bytes]:
         def write(host: _Host, payload: bytes) -> bytes:
             self._registers.write(host, register.address, payload)
             return b""
@@ -190,7 +190,7 @@ class MessageSession:
 
     # -- the stream -------------------------------------------------------------------------
 
-    def _alive(self, frame: WireFrame) -> None:
+    def _take_heartbeat(self, frame: WireFrame) -> None:
         host, device = self._host, self._device
         if host is None or frame.session != host.session or frame.version != FRAME_VERSION:
             return
@@ -208,6 +208,6 @@ class MessageSession:
             logger.debug("note of the host dropped: %s", error)
 
 
-def _sized(payload: bytes, least: int, most: int) -> None:
+def _require_size(payload: bytes, least: int, most: int) -> None:
     if not least <= len(payload) <= most or len(payload) % 2:
         raise Refused(Refusal.NO_SUCH_REGISTER)

@@ -54,7 +54,7 @@ class Request(ModbusPDU):
         """Execute the request; return the bytes after the answer's function code."""
         raise NotImplementedError
 
-    def answered(self, registers: DeviceRegisters, client: object) -> ModbusPDU:
+    def response_to(self, registers: DeviceRegisters, client: object) -> ModbusPDU:
         """Return the answer to a client, or Modbus's exception response."""
         self.map, self.client = registers, client
         try:
@@ -71,8 +71,8 @@ class Request(ModbusPDU):
         data = self.map.read(self.client, address, count)
         return bytes([len(data)]) + data
 
-    def _write(self, address: int, count: int, data: bytes, most: int) -> None:
-        if not 1 <= count <= most or len(data) != 2 * count:
+    def _write(self, address: int, count: int, data: bytes, largest: int) -> None:
+        if not 1 <= count <= largest or len(data) != 2 * count:
             raise ValueError("register count")
         self.map.write(self.client, address, data)
 

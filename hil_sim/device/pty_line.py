@@ -49,19 +49,19 @@ class PtyLine:
         if not self.connected:
             timeout = min(timeout, _UNPLUGGED_SECONDS)
         ready = self._poll.poll(timeout * 1e3 if self.connected else 0)
-        happened = ready[0][1] if ready else 0
-        if happened & select.POLLIN:
+        ready_events = ready[0][1] if ready else 0
+        if ready_events & select.POLLIN:
             self.connected = True
             with suppress(BlockingIOError):
                 return self._read()
-        if happened & select.POLLHUP:
-            gone, self.connected = self.connected, False
-            if gone:
+        if ready_events & select.POLLHUP:
+            was_connected, self.connected = self.connected, False
+            if was_connected:
                 return None
             time.sleep(timeout)
             return b""
         self.connected = True
-        if happened & select.POLLOUT:
+        if ready_events & select.POLLOUT:
             self.send(b"")
         return b""
 

@@ -29,14 +29,14 @@ class DeviceRegisters:
         if address == reg.BLOCK.address and count == device.layout.words:
             return device.read_block(client)
         laws = (reg.LAWS.address, reg.LAWS.address + reg.LAW_WORDS * device.laws.joints)
-        for (first, end), image in (
+        for (first, end), register_bytes in (
             (reg.STATUS_SPAN, self._status),
             (reg.IDENTITY_SPAN, lambda: self._identity),
             (reg.CONTROL_SPAN, self._control),
             (laws, device.laws.staged_bytes),
         ):
             if first <= address and 0 < count <= end - address:
-                return image()[2 * (address - first) : 2 * (address - first + count)]
+                return register_bytes()[2 * (address - first) : 2 * (address - first + count)]
         raise Refused(Refusal.NO_SUCH_REGISTER)
 
     def write(self, client: object, address: int, data: bytes) -> None:
@@ -159,6 +159,6 @@ def _u32(words: Words) -> int:
     return int(words[0]) << 16 | int(words[1])
 
 
-def _expect(holds: bool | np.bool_) -> None:
-    if not holds:
+def _expect(condition: bool | np.bool_) -> None:
+    if not condition:
         raise Refused(Refusal.OUT_OF_RANGE)

@@ -77,7 +77,7 @@ class RtuLine:
         self._device.prefetch()
 
     def _answer(self, frame: bytes) -> None:
-        if self._device.boots:
+        if self._device.restarting:
             return
         if not checksum_matches(frame):
             logger.debug("a damaged frame of %d bytes is left unanswered", len(frame))
@@ -85,22 +85,22 @@ class RtuLine:
             return
         if frame[0] != ADDRESS:
             return
-        kind = _BY_FUNCTION.get(frame[1])
-        if kind is None:
+        request_class = _BY_FUNCTION.get(frame[1])
+        if request_class is None:
             answer: ModbusPDU = ExceptionResponse(frame[1], 1)
         else:
-            request = kind()
+            request = request_class()
             assert isinstance(request, Request)
             request.decode(frame[2:-2])
-            answer = request.answered(self._registers, self)
-        if self._device.boots:  # since it has begun to answer
+            answer = request.response_to(self._registers, self)
+        if self._device.restarting:  # since it has begun to answer
             return
         body = bytes([ADDRESS, answer.function_code]) + answer.encode()
         os.write(self._master, body + checksum(body))
 
 
 def frame_length(data: bytes) -> int | None:
-    """Return the length [bytes] of the request that begins `data`, None if not known yet.
+    """Return the length [bytes] of the first request in `data`, None if not known yet.
 
     An unknown function is taken as the shortest frame.
     """

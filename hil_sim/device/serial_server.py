@@ -33,7 +33,7 @@ class SerialSession:
         return b"" if block is None else encode_frame(block)
 
     def ended(self) -> None:
-        """Note that no program has the other end of the line open."""
+        """Handle the end of the connection: no program has the other end of the line open."""
         self._decoder.reset()
         self._session.ended()
 

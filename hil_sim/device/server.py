@@ -58,12 +58,12 @@ class _Connection(ServerRequestHandler):
 
     def data_received(self, data: bytes) -> None:
         """Answer every complete request; keep an incomplete one."""
-        waiting = self.recv_buffer + data
+        received = self.recv_buffer + data
         used = 1
-        while waiting and used:
-            used = self._answer_first(waiting)
-            waiting = waiting[used:]
-        self.recv_buffer = waiting if len(waiting) <= self.max_buffer_size else b""
+        while received and used:
+            used = self._answer_first(received)
+            received = received[used:]
+        self.recv_buffer = received if len(received) <= self.max_buffer_size else b""
         self._device.prefetch()
 
     def _answer_first(self, data: bytes) -> int:
@@ -71,18 +71,18 @@ class _Connection(ServerRequestHandler):
         try:
             used, request = self.framer.handleFrame(data, 0, 0)
         except ModbusIOException as error:
-            bad = ExceptionResponse(
+            refusal = ExceptionResponse(
                 error.fcode or 0,
                 ExcCodes.ILLEGAL_FUNCTION,
                 device_id=error.dev_id,
                 transaction=error.transaction_id,
             )
-            self.pdu_send(bad)
+            self.pdu_send(refusal)
             return len(data)
         if request is None:
             return used
         if isinstance(request, Request):
-            answer = request.answered(self._registers, self)
+            answer = request.response_to(self._registers, self)
         else:
             answer = ExceptionResponse(request.function_code, ExcCodes.ILLEGAL_FUNCTION)
         answer.transaction_id, answer.dev_id = request.transaction_id, request.dev_id
@@ -94,7 +94,7 @@ class _Connection(ServerRequestHandler):
         """Pass the end of the connection on; a booting device accepts none."""
         if not connected:
             self._device.disconnected(self)
-        elif self._device.boots:
+        elif self._device.restarting:
             _abort(self)
 
 
@@ -246,9 +246,9 @@ async def _serve(
 
 async def _end_with(parent: int, stop: asyncio.Event) -> None:
     """Set `stop` when process `parent` has ended."""
-    owner = ParentProcess(parent)
+    parent_process = ParentProcess(parent)
     while not stop.is_set():
-        if owner.has_ended():
+        if parent_process.has_ended():
             logger.info("process %d, which this server served, has ended", parent)
             stop.set()
         await asyncio.sleep(PARENT_SECONDS)

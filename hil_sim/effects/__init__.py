@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from hil_sim.effects import fluid, friction, measurement, mechanics, valve
-from hil_sim.effects.base import PlantEffect, named_in
+from hil_sim.effects.base import PlantEffect, named_classes
 
 MODULES = (friction, mechanics, valve, fluid, measurement)
-CLASSES = named_in(PlantEffect, MODULES)
+CLASSES = named_classes(PlantEffect, MODULES)
 
 if TYPE_CHECKING:
     AnyEffect = PlantEffect

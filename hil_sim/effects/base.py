@@ -61,7 +61,7 @@ class Tables:
     channels: Table
 
 
-def named_in(base: type[Kind], modules: Iterable[ModuleType]) -> tuple[type[Kind], ...]:
+def named_classes(base: type[Kind], modules: Iterable[ModuleType]) -> tuple[type[Kind], ...]:
     """Return the classes of modules that derive from `base` and have a name in scenario files."""
     return tuple(
         kind
@@ -85,7 +85,7 @@ class PlantEffect(Part):
     ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); `sizes` are the ranges
     [SI] of its keys, drawn log-uniformly; keys in `signed` have a random sign. `forms` are the
     values of its key `form`: different physics of the same cause, the first by default. Random
-    scenarios have only those `drawn`: with a further one every seed would draw another scenario.
+    scenarios draw only classes with `drawn`: a further one would change the scenario of every seed.
     """
 
     places: ClassVar[tuple[str, ...]] = ("joint",)

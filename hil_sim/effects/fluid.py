@@ -89,7 +89,7 @@ class SupplySag(PlantEffect):
 
 
 class TankPressure(PlantEffect):
-    """Return pressure: a constant part and one that follows the returned flow's square."""
+    """Return pressure: a constant part and one proportional to the square of the returned flow."""
 
     drawn_at = "bench"
     sizes: ClassVar = {"pressure": (0.1e6, 0.4e6)}
@@ -108,7 +108,7 @@ class TankPressure(PlantEffect):
 
 
 class EntrainedAir(PlantEffect):
-    """Free air by volume at atmospheric pressure; it dissolves over `dissolution`."""
+    """Free air, a share by volume at atmospheric pressure; it dissolves over `dissolution`."""
 
     drawn_at = "bench"
     sizes: ClassVar = {"fraction": (3e-3, 3e-2)}

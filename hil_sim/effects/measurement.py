@@ -91,7 +91,7 @@ class SensorLag(_Sensor):
 
 
 class SensorCrosstalk(_Sensor):
-    """The channel reads a share of another in addition to its own, in the ratio of their units.
+    """The channel reads a share of another channel in addition, in the ratio of their units.
 
     ``wire`` reads the other as it is, ``coupling`` through a capacitor: high-passed with a time
     constant of a second.
@@ -110,18 +110,18 @@ class SensorCrosstalk(_Sensor):
     def _pressure(self) -> Self:
         kind = kind_of(self.channel)[0]
         if not self.other and kind not in ("cap_pressure", "rod_pressure"):
-            raise ValueError(f"say which channel {self.channel!r} sees, as `other`")
+            raise ValueError(f"{self.channel!r}: name the other channel that it reads, as `other`")
         return self
 
     @property
-    def seen(self) -> str:
-        """The other channel; of a chamber's pressure the other chamber's by default."""
+    def source_channel(self) -> str:
+        """The channel read in addition; of a chamber's pressure the other chamber's by default."""
         kind, joint = kind_of(self.channel)
         other = "rod_pressure" if kind == "cap_pressure" else "cap_pressure"
         return self.other or channel(other, joint or 1)
 
     def apply(self, t: Tables) -> None:
         k = t.rig.channels.index(self.channel)
-        t.channels["seen"][k] = 1 + t.rig.channels.index(self.seen)
-        t.channels["seen_share"][k] = self.share
-        t.channels["seen_quick"][k] = float(self.form == "coupling")
+        t.channels["crosstalk_source"][k] = 1 + t.rig.channels.index(self.source_channel)
+        t.channels["crosstalk_share"][k] = self.share
+        t.channels["crosstalk_high_pass"][k] = float(self.form == "coupling")

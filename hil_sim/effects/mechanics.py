@@ -72,7 +72,7 @@ class JointSpring(PlantEffect):
 
 
 class TorqueOffset(PlantEffect):
-    """A constant torque, positive opening."""
+    """A constant torque [N m], positive in the direction of a growing joint angle."""
 
     drawn_at = "joint"
     sizes: ClassVar = {"torque": (3.0, 15.0)}

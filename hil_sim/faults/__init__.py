@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from hil_sim.effects.base import named_in
+from hil_sim.effects.base import named_classes
 from hil_sim.faults import device, machine, sensors, wire
 from hil_sim.faults.base import Fault
 
-CLASSES = named_in(Fault, (sensors, machine, device, wire))
+CLASSES = named_classes(Fault, (sensors, machine, device, wire))
 
 if TYPE_CHECKING:
     AnyFault = Fault

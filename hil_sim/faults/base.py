@@ -57,11 +57,11 @@ class Fault(Part):
     ) -> None:  # fmt: skip
         """Change codes (n, channels) in place; `last` (channels,) are those before the fault began.
 
-        `seconds` (n,) is the time since then at each row.
+        `seconds` (n,) is the time since its beginning at each row.
         """
 
 
-def changed(row: Any, field: str, value: float) -> Restore:
+def set_field(row: Any, field: str, value: float) -> Restore:
     """Set a field of a table's row; return a function that restores it."""
     before = row[field].copy()
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from hil_sim.effects.base import Tables
 from hil_sim.effects.fluid import Conductance
-from hil_sim.faults.base import Fault, Restore, changed
+from hil_sim.faults.base import Fault, Restore, set_field
 from rig.model.quantity import Flow
 
 
@@ -30,7 +30,7 @@ class ValveStuck(JointFault):
 
     def begin(self, tables: Tables) -> Restore:
         """Set the spool's speed limit to zero."""
-        return changed(tables.joints[self.joint : self.joint + 1], "spool_rate", 0.0)
+        return set_field(tables.joints[self.joint : self.joint + 1], "spool_rate", 0.0)
 
 
 class HoseBurst(JointFault):
@@ -43,7 +43,7 @@ class HoseBurst(JointFault):
     def begin(self, tables: Tables) -> Restore:
         """Open the chamber to the outside."""
         row = tables.joints[self.joint : self.joint + 1]
-        return changed(row, f"leak_{self.chamber}", self.conductance)
+        return set_field(row, f"leak_{self.chamber}", self.conductance)
 
 
 class JointUnlocks(JointFault):
@@ -55,7 +55,7 @@ class JointUnlocks(JointFault):
     def begin(self, tables: Tables) -> Restore:
         """Connect the chambers."""
         row = tables.joints[self.joint : self.joint + 1]
-        return changed(row, "leak_internal", self.conductance)
+        return set_field(row, "leak_internal", self.conductance)
 
 
 class PumpOff(Fault):
@@ -66,4 +66,4 @@ class PumpOff(Fault):
 
     def begin(self, tables: Tables) -> Restore:
         """Reduce the pump's flow."""
-        return changed(tables.bench, "pump", self.flow)
+        return set_field(tables.bench, "pump", self.flow)

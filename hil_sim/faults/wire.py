@@ -1,7 +1,7 @@
 """Faults of the wire: changes of the frames between host and device, on any wire.
 
 A wire fault turns a frame into pieces of bytes, each with its time of release, and may end the
-link. `hil_sim.link` executes it on TCP, on pseudo-terminals and behind CAN adapters. `at` and
+link. `hil_sim.link` executes it on TCP, on pseudo-terminals and behind CAN adapters. `cut` and
 `until` are seconds of the device's time; delays are by the wall clock, like a host's timeouts.
 """
 
@@ -150,8 +150,8 @@ class FrameSplit(WireFault):
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
         """Cut the frame at a random place."""
-        at = int(rng.integers(1, max(2, len(frame))))
-        return Piece(frame[:at]), Piece(frame[at:], self.pause)
+        cut = int(rng.integers(1, max(2, len(frame))))
+        return Piece(frame[:cut]), Piece(frame[cut:], self.pause)
 
 
 class FramesMerged(WireFault):
@@ -193,11 +193,11 @@ class BitsFlipped(WireFault):
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
         """Invert bits, each in another place."""
-        turned = bytearray(frame)
+        flipped = bytearray(frame)
         count = min(self.bits, 8 * len(frame))
         for bit in rng.choice(8 * len(frame), size=count, replace=False):
-            turned[bit // 8] ^= 1 << bit % 8
-        return (Piece(bytes(turned)),)
+            flipped[bit // 8] ^= 1 << bit % 8
+        return (Piece(bytes(flipped)),)
 
 
 class Stall(WireFault):

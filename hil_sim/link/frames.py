@@ -53,12 +53,12 @@ def modbus_tcp(data: bytes) -> int:
     """Return the length of a Modbus TCP frame by its header."""
     if len(data) < _MBAP_LENGTH_ENDS:
         return 0
-    return _whole(data, _MBAP_LENGTH_ENDS + int.from_bytes(data[4:6], "big"))
+    return _if_complete(data, _MBAP_LENGTH_ENDS + int.from_bytes(data[4:6], "big"))
 
 
 def rtu_request(data: bytes) -> int:
     """Return the length of a request on a Modbus RTU line."""
-    return _whole(data, frame_length(data) or 0)
+    return _if_complete(data, frame_length(data) or 0)
 
 
 def rtu_answer(data: bytes) -> int:
@@ -66,14 +66,14 @@ def rtu_answer(data: bytes) -> int:
     if len(data) < 3:
         return 0
     if data[1] & _RTU_EXCEPTION:
-        return _whole(data, 5)
-    return _whole(data, 5 + data[2] if data[1] in _RTU_COUNTED else 8)
+        return _if_complete(data, 5)
+    return _if_complete(data, 5 + data[2] if data[1] in _RTU_COUNTED else 8)
 
 
 def between_zeros(data: bytes) -> int:
     """Return the length of a frame of the serial protocol: what ends with the next zero."""
-    begun = len(data) - len(data.lstrip(b"\0"))
-    return data.find(b"\0", begun) + 1 if begun < len(data) else 0
+    first = len(data) - len(data.lstrip(b"\0"))
+    return data.find(b"\0", first) + 1 if first < len(data) else 0
 
 
 def socketcand_text(data: bytes) -> int:
@@ -102,5 +102,5 @@ def slcan_frame(text: bytes) -> bool:
     return text[:1] in (b"t", b"T", b"d", b"D", b"b", b"B")
 
 
-def _whole(data: bytes, length: int) -> int:
+def _if_complete(data: bytes, length: int) -> int:
     return length if 0 < length <= len(data) else 0

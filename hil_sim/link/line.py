@@ -45,17 +45,17 @@ class LineLink(FaultyLink):
 
     def _plug_in(self) -> None:
         self._line = PtyLine()
-        fresh = self._name.with_suffix(".new")
-        fresh.symlink_to(self._line.name)
-        fresh.replace(self._name)
+        new_link = self._name.with_suffix(".new")
+        new_link.symlink_to(self._line.name)
+        new_link.replace(self._name)
 
     def _step(self) -> None:
         line = self._line
         if line.connected and self._device is not None:
             ways = (self._to_device, self._to_host)
             reading = [line.fd, *([] if self._to_host.full else [self._device])]
-            patience = self._patience(ways, time.monotonic())
-            ready, _, _ = select.select(reading, [], [], patience)
+            timeout = self._longest_wait(ways, time.monotonic())
+            ready, _, _ = select.select(reading, [], [], timeout)
             if self._device in ready:
                 self._from_device(self._device)
         data = line.receive(0.0 if line.connected else _UNPLUGGED_SECONDS)

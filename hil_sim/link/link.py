@@ -33,7 +33,7 @@ class FaultyLink(ABC):
     """
 
     endpoint: str  # the host's of this link
-    beneath: ClassVar[Carrier] = Carrier.LINE  # what carries it, but for a wire with its own
+    carrier: ClassVar[Carrier] = Carrier.LINE  # what carries it, but for a wire with its own
 
     def __init__(
         self,
@@ -46,11 +46,11 @@ class FaultyLink(ABC):
     ) -> None:
         self._framing = framing
         self._injectors = (
-            FaultInjector(TO_DEVICE, faults, (seed, 0), framing.carrier or self.beneath),
-            FaultInjector(TO_HOST, faults, (seed, 1), framing.carrier or self.beneath),
+            FaultInjector(TO_DEVICE, faults, (seed, 0), framing.carrier or self.carrier),
+            FaultInjector(TO_HOST, faults, (seed, 1), framing.carrier or self.carrier),
         )
-        made = time.monotonic()
-        self.seconds = seconds or (lambda: time.monotonic() - made)
+        created = time.monotonic()
+        self.seconds = seconds or (lambda: time.monotonic() - created)
         self._closing = False
         self._cut = False
         self._open(target, port)
@@ -112,7 +112,7 @@ class FaultyLink(ABC):
             Way(to_host, framing.to_host, on_wire, framing.error_of),
         )
 
-    def _patience(self, ways: Sequence[Way], now: float) -> float:
+    def _longest_wait(self, ways: Sequence[Way], now: float) -> float:
         """Return how long [s] the link may wait for bytes before a piece is due."""
         due = min((way.next_time() for way in ways), default=math.inf)
         return min(max(due - now, 0.0), LONGEST_WAIT)

@@ -63,16 +63,16 @@ class ServedDevice:
         if loop is None:
             with self._lock:
                 return call()
-        done: Future[Answer] = Future()
+        result: Future[Answer] = Future()
 
-        def work() -> None:
+        def make_call() -> None:
             try:
-                done.set_result(call())
+                result.set_result(call())
             except BaseException as error:
-                done.set_exception(error)
+                result.set_exception(error)
 
-        loop.call_soon_threadsafe(work)
-        return done.result(_SECONDS)
+        loop.call_soon_threadsafe(make_call)
+        return result.result(_SECONDS)
 
     def close(self) -> None:
         """End link, server and thread."""

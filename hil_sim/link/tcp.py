@@ -37,7 +37,7 @@ class _Side:
 class TcpLink(FaultyLink):
     """Listens on loopback and connects to the device at `target` for each host."""
 
-    beneath: ClassVar[Carrier] = Carrier.TCP
+    carrier: ClassVar[Carrier] = Carrier.TCP
 
     def _open(self, target: str, port: int) -> None:
         match = _ADDRESS.search(target)
@@ -50,8 +50,8 @@ class TcpLink(FaultyLink):
                 f"cannot listen on 127.0.0.1:{port}: {error.strerror}; end what uses the port, "
                 "or choose another one (0: any free one)"
             ) from error
-        here = f"127.0.0.1:{self._listener.getsockname()[1]}"
-        self.endpoint = _ADDRESS.sub(here, target, count=1)
+        address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        self.endpoint = _ADDRESS.sub(address, target, count=1)
         self._sides: dict[socket.socket, _Side] = {}
 
     def _step(self) -> None:
@@ -59,8 +59,8 @@ class TcpLink(FaultyLink):
         reading = [
             end for end, side in self._sides.items() if not side.finished and not side.sends.full
         ]
-        patience = self._patience(ways, time.monotonic())
-        ready, _, _ = select.select([self._listener, *reading], [], [], patience)
+        timeout = self._longest_wait(ways, time.monotonic())
+        ready, _, _ = select.select([self._listener, *reading], [], [], timeout)
         for end in ready:
             if end is self._listener:
                 self._accept()

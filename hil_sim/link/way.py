@@ -55,8 +55,8 @@ class FaultInjector:
         """
         for number, fault in enumerate(self._faults):
             until = math.inf if fault.until is None else fault.until
-            spent = fault.most is not None and self._injected[number] >= fault.most
-            if spent or not fault.at <= seconds < until:
+            exhausted = fault.most is not None and self._injected[number] >= fault.most
+            if exhausted or not fault.at <= seconds < until:
                 continue
             if fault.probability < 1.0 and self._rng.random() >= fault.probability:
                 continue
@@ -102,7 +102,7 @@ class Way:
         return sum(len(due.piece.data) for due in self._ready) > MOST_WAITING
 
     def take(self, data: bytes, now: float, seconds: float) -> int:
-        """Take bytes; return how many complete frames they contain."""
+        """Add bytes; return the number of frames completed."""
         self._buffer += data
         self._last = now
         frames = 0
@@ -112,7 +112,7 @@ class Way:
         return frames
 
     def other_way(self, now: float) -> None:
-        """Note a frame of the other direction, which releases late answers."""
+        """Release late answers, after a frame of the other direction."""
         late, self._for_other_way = self._for_other_way, []
         self._queue(late, now)
 
@@ -126,8 +126,8 @@ class Way:
         while self._held and (quiet or self._held[0].at <= now):  # older than the buffer
             self._queue([replace(self._held.pop(0).piece, wait=0.0)], now)
         if quiet:
-            whole, self._buffer = self._buffer, b""
-            self._queue([Piece(whole)], now)
+            incomplete, self._buffer = self._buffer, b""
+            self._queue([Piece(incomplete)], now)
         chunks = []
         while self._ready and self._ready[0].at <= now:
             chunks.append(self._ready.popleft().piece)
@@ -139,20 +139,20 @@ class Way:
         return min([*times, *([self._last + QUIET] if self._buffer else [])], default=math.inf)
 
     def _frame(self, frame: bytes, now: float, seconds: float) -> bool:
-        """Take one frame; returns whether it is one of the wire, not of the adapter."""
+        """Queue the pieces of one frame; return whether it is of the wire, not of the adapter."""
         if not self._on_wire(frame):
             self._queue([] if self.ended else [Piece(frame)], now)
             return False
         if self.ended:
             return True
         pieces = list(self._injector.inject(frame, seconds, self._error_of(frame)))
-        joined, self._held = b"".join(due.piece.data for due in self._held), []
-        behind, self._after_next = self._after_next, []
-        if joined:
+        held_data, self._held = b"".join(due.piece.data for due in self._held), []
+        after_this, self._after_next = self._after_next, []
+        if held_data:
             first = pieces.pop(0) if pieces else Piece(b"")
-            pieces.insert(0, replace(first, data=joined + first.data))
+            pieces.insert(0, replace(first, data=held_data + first.data))
         self._queue(pieces, now)
-        self._queue([replace(piece, release=Release.TIME) for piece in behind], now)
+        self._queue([replace(piece, release=Release.TIME) for piece in after_this], now)
         return True
 
     def _queue(self, pieces: Sequence[Piece], now: float) -> None:

@@ -20,14 +20,14 @@ STREAM: Final = 3  # of a bench's seed; 0 and 1 are the plant's, 2 is that of dr
 
 
 @dataclass
-class _Timed:
+class _TimedFault:
     """A fault with its first and last tick, and how to restore its changes while it acts."""
 
     fault: Fault
     first: int
     end: float
     restore: Restore | None = None
-    last: Codes = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    codes_before: Codes = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 class FaultyPlant:
@@ -39,7 +39,7 @@ class FaultyPlant:
         self._rng = np.random.default_rng([seed, STREAM])
         self._last = np.zeros(len(rig.channels), dtype=np.int64)
         self._faults = [
-            _Timed(
+            _TimedFault(
                 fault,
                 round(fault.at * rig.sample_rate),
                 math.inf if fault.until is None else round(fault.until * rig.sample_rate),
@@ -82,7 +82,7 @@ class FaultyPlant:
     def _switch(self) -> None:
         for fault in self._faults:
             if fault.first == self.tick:
-                fault.last = self._last.copy()
+                fault.codes_before = self._last.copy()
                 fault.restore = fault.fault.begin(self.plant.tables)
             elif fault.end == self.tick and fault.restore is not None:
                 fault.restore()
@@ -92,7 +92,7 @@ class FaultyPlant:
         for fault in self._faults:
             if fault.first <= first < fault.end:
                 seconds = (first - fault.first + np.arange(len(codes))) / self._rig.sample_rate
-                fault.fault.distort(codes, fault.last, seconds, self._rig, self._rng)
+                fault.fault.distort(codes, fault.codes_before, seconds, self._rig, self._rng)
         if len(codes):
             self._last = codes[-1].copy()
         return codes, outputs

@@ -46,21 +46,21 @@ def pressure(z: float, bench: Any) -> float:
 
 
 @jit
-def softening(z: float, warmth: float, bench: Any) -> float:
+def softening(z: float, bulk_ratio: float, bench: Any) -> float:
     """Return the ratio of the present bulk modulus to dp/dz of `pressure`.
 
-    `warmth` is b(T)/b; entrained air adds V_g = a (p0 / p_abs)^(1/n) exp(-p / p_d) per volume of
-    oil: a polytropic gas of exponent n (Wylie) that dissolves as the pressure rises (Henry's law).
+    `bulk_ratio` is b(T)/b; entrained air adds V_g = a (p0 / p_abs)^(1/n) exp(-p / p_d) per volume
+    of oil: a polytropic gas of exponent n (Wylie) that dissolves with rising pressure (Henry).
     """
     if bench.air <= 0.0:
-        return warmth
+        return bulk_ratio
     root = sqrt(z * z + bench.trapped)
     absolute = bench.half_bulk * (z + root) + 1e-3
     stiff = absolute / root
     n = bench.air_exponent
     free = bench.air * (ATMOSPHERE / absolute) ** (1.0 / n) * exp(-absolute / bench.air_dissolution)
     gas = free * (1.0 / (n * absolute) + 1.0 / bench.air_dissolution)
-    ratio: float = warmth / (1.0 + warmth * stiff * gas)
+    ratio: float = bulk_ratio / (1.0 + bulk_ratio * stiff * gas)
     return ratio
 
 
@@ -110,18 +110,18 @@ def opening(travel: float, lap: float, rounding: float, notch: float) -> float:
 @jit
 def contact(s: float, v: float, joint: Any) -> float:
     """Return the end stops' force against extension [N] (Hunt and Crossley, exponent 3/2)."""
-    over = abs(s) - joint.half_stroke
-    if over <= 0.0:
+    penetration = abs(s) - joint.half_stroke
+    if penetration <= 0.0:
         return 0.0
     side = copysign(1.0, s)
-    force = joint.contact_stiffness * over * sqrt(over)
-    against: float = side * force * max(1.0 + joint.contact_damping * v * side, 0.0)
-    return against
+    force = joint.contact_stiffness * penetration * sqrt(penetration)
+    contact_force: float = side * force * max(1.0 + joint.contact_damping * v * side, 0.0)
+    return contact_force
 
 
 @jit
-def level(s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> float:
-    """Return the steady friction's level [N], above zero, in the direction of v."""
+def friction_level(s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> float:
+    """Return the steady friction force [N], above zero, in the direction of v."""
     force = joint.friction_plus if v >= 0.0 else joint.friction_minus
     ratio = v / joint.stribeck_speed
     force += joint.stribeck * exp(-ratio * ratio)
@@ -132,13 +132,13 @@ def level(s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> float:
 
 @jit
 def sliding(s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> float:
-    """Return seal friction without memory [N], smooth over a speed `friction_width`.
+    """Return seal friction without memory [N], F being `friction_level`, smooth over a speed width.
 
-    level tanh(v / width), or level v / sqrt(v^2 + width^2) where `friction_corner` is set.
+    F tanh(v / width), or F v / sqrt(v^2 + width^2) where `friction_corner` is set.
     """
     x = v / joint.friction_width
     share = x / sqrt(1.0 + x * x) if joint.friction_corner > 0.0 else tanh(x)
-    force: float = level(s, v, p_cap, p_rod, joint) * share
+    force: float = friction_level(s, v, p_cap, p_rod, joint) * share
     return force
 
 
@@ -149,7 +149,7 @@ def bristle(deflection: float, s: float, v: float, p_cap: float, p_rod: float, j
     Its relaxation rate |v| sigma0 / g is bounded at `bristle_limit`, so that the fixed step holds
     at any speed; the steady force stays g(v) sign(v).
     """
-    relax = abs(v) * joint.bristle_stiffness / level(s, v, p_cap, p_rod, joint)
+    relax = abs(v) * joint.bristle_stiffness / friction_level(s, v, p_cap, p_rod, joint)
     rate = (v - relax * deflection) / (1.0 + relax / joint.bristle_limit)
     return joint.bristle_stiffness * deflection + joint.bristle_damping * rate, rate
 
@@ -170,7 +170,7 @@ def drag(v: float, lever: float, joint: Any) -> float:
 
 @jit
 def wave(cycles: float, form: float) -> float:
-    """Return a periodic torque's share of its amplitude after so many cycles."""
+    """Return a periodic torque over its amplitude, after `cycles` cycles."""
     turn = sin(2.0 * pi * cycles)
     if form == 1.0:
         return 2.0 / pi * asin(turn)
@@ -179,10 +179,10 @@ def wave(cycles: float, form: float) -> float:
 
 @jit
 def relief(p: float, bench: Any) -> float:
-    """Return the relief valve's flow [m^3/s]: a slope above cracking, rounded at its foot."""
-    over = p - bench.relief_crack
+    """Return the relief valve's flow [m^3/s]: a slope above cracking, rounded at cracking."""
+    excess = p - bench.relief_crack
     rounding = bench.relief_rounding
-    flow: float = 0.5 * bench.relief_slope * (over + sqrt(over * over + rounding * rounding))
+    flow: float = 0.5 * bench.relief_slope * (excess + sqrt(excess * excess + rounding * rounding))
     return flow
 
 
@@ -225,28 +225,28 @@ def port_flows(
 
 @jit
 def supply_rates(
-    y: Any, port: float, demand: float, returned: float, warmth: float, bench: Any, dy: Any
+    y: Any, port: float, demand: float, returned: float, bulk_ratio: float, bench: Any, dy: Any
 ) -> None:
     """Write the rates of supply, manifold and tank pressure, the last three of the state.
 
     Pump = relief + line; a turbulent line to the valves where there is one; the tank's pressure
     follows the square of the returned flow with the line's lag.
     """
-    at = len(y) - 3
-    p_supply, line = pressure(y[at], bench), demand
-    dy[at + 1] = 0.0
+    first = len(y) - 3
+    p_supply, line = pressure(y[first], bench), demand
+    dy[first + 1] = 0.0
     if bench.line_gain > 0.0:
         drop = p_supply - port
         line = bench.line_gain * orifice(drop, bench.laminar)
         if bench.line_laminar > 0.0:
             line = bench.line_laminar * drop
-        stiff = softening(y[at + 1], warmth, bench)
-        dy[at + 1] = stiff * (line - demand) / bench.manifold_volume
-    stiff = softening(y[at], warmth, bench)
-    dy[at] = stiff * (bench.pump - relief(p_supply, bench) - line) / bench.supply_volume
+        ratio = softening(y[first + 1], bulk_ratio, bench)
+        dy[first + 1] = ratio * (line - demand) / bench.manifold_volume
+    ratio = softening(y[first], bulk_ratio, bench)
+    dy[first] = ratio * (bench.pump - relief(p_supply, bench) - line) / bench.supply_volume
     back = bench.tank_pressure + bench.tank_laminar * returned
     back += bench.tank_resistance * returned * abs(returned)
-    dy[at + 2] = (back - y[at + 2]) / bench.tank_lag
+    dy[first + 2] = (back - y[first + 2]) / bench.tank_lag
 
 
 @jit
@@ -259,41 +259,41 @@ def angular(theta: Any, torque: Any, rate: Any, joints: Any, inertia: Any, m: An
     """
     n = len(joints)
     for i in range(n):
-        own = torque[i] - joints[i].weight * theta[0, i]
+        row_torque = torque[i] - joints[i].weight * theta[0, i]
         if i + 1 < n:
-            own -= torque[i + 1]
+            row_torque -= torque[i + 1]
         for k in range(i):
-            turned = theta[1, i] * theta[1, k] + theta[0, i] * theta[0, k]
-            twist = inertia[i, k] * (theta[0, i] * theta[1, k] - theta[1, i] * theta[0, k])
-            m[i, k] = inertia[i, k] * turned
-            own -= twist * rate[k] * rate[k]
-            torque[k] += twist * rate[i] * rate[i]
-        torque[i] = own
+            cosine_ik = theta[1, i] * theta[1, k] + theta[0, i] * theta[0, k]
+            R_sine = inertia[i, k] * (theta[0, i] * theta[1, k] - theta[1, i] * theta[0, k])
+            m[i, k] = inertia[i, k] * cosine_ik
+            row_torque -= R_sine * rate[k] * rate[k]
+            torque[k] += R_sine * rate[i] * rate[i]
+        torque[i] = row_torque
     # m[i, i] keeps 1 / D_i, m[i, k] first L_ik D_k, then L_ik.
     for i in range(n):
-        diagonal, own = inertia[i, i], torque[i]
+        diagonal, row_torque = inertia[i, i], torque[i]
         for k in range(i):
             scaled = m[i, k]
             for r in range(k):
                 scaled -= m[i, r] * m[k, r] / m[r, r]
             m[i, k] = scaled * m[k, k]
             diagonal -= m[i, k] * scaled
-            own -= m[i, k] * torque[k]
-        m[i, i], torque[i] = 1.0 / diagonal, own
+            row_torque -= m[i, k] * torque[k]
+        m[i, i], torque[i] = 1.0 / diagonal, row_torque
     for i in range(n - 1, -1, -1):
-        own = torque[i] * m[i, i]
+        row_torque = torque[i] * m[i, i]
         for k in range(i + 1, n):
-            own -= m[k, i] * torque[k]
-        torque[i] = own
+            row_torque -= m[k, i] * torque[k]
+        torque[i] = row_torque
 
 
 @jit
 def rates(
-    y: Any, spool: Any, warmth: float, joints: Any, bench: Any, inertia: Any, w: Any, dy: Any
+    y: Any, spool: Any, bulk_ratio: float, joints: Any, bench: Any, inertia: Any, w: Any, dy: Any
 ) -> None:
     """Write the state's rate at effective openings `spool`, (N,) [V], into dy.
 
-    `warmth` is b(T)/b; w is work, (N + 4, N).
+    `bulk_ratio` is b(T)/b; w is work, (N + 4, N).
     """
     n = len(joints)
     theta, torque, turns, m = w[n : n + 2], w[n + 2], w[n + 3], w[:n]
@@ -308,14 +308,14 @@ def rates(
         s, v = length - j.mid_length, lever * y[n + i]
         p_cap, p_rod = pressure(y[2 * n + i], bench), pressure(y[3 * n + i], bench)
 
-        q_cap, q_rod, taken, given = port_flows(
+        q_cap, q_rod, drawn, drained = port_flows(
             spool[i], s, p_cap, p_rod, port, tank, j, bench.laminar, bench.laminar_form
         )
-        demand, returned = demand + taken, returned + given
-        stiff = softening(y[2 * n + i], warmth, bench)
-        dy[2 * n + i] = stiff * (q_cap - j.cap_area * v) / (j.cap_volume + s * j.cap_area)
-        stiff = softening(y[3 * n + i], warmth, bench)
-        dy[3 * n + i] = stiff * (q_rod + j.rod_area * v) / (j.rod_volume - s * j.rod_area)
+        demand, returned = demand + drawn, returned + drained
+        ratio = softening(y[2 * n + i], bulk_ratio, bench)
+        dy[2 * n + i] = ratio * (q_cap - j.cap_area * v) / (j.cap_volume + s * j.cap_area)
+        ratio = softening(y[3 * n + i], bulk_ratio, bench)
+        dy[3 * n + i] = ratio * (q_rod + j.rod_area * v) / (j.rod_volume - s * j.rod_area)
 
         force = j.cap_area * p_cap - j.rod_area * p_rod - contact(s, v, j)
         dy[4 * n + i] = 0.0
@@ -326,8 +326,8 @@ def rates(
             force -= friction
         if j.drag_plus != j.drag_minus:
             force -= drag(v, lever, j)
-        twist = y[i] - j.spring_rest
-        spring = j.spring * twist * (1.0 + j.spring_hardening * twist * twist)
+        deflection = y[i] - j.spring_rest
+        spring = j.spring * deflection * (1.0 + j.spring_hardening * deflection * deflection)
         torque[i] = lever * force - j.viscous * y[n + i] - spring + j.torque_offset + j.wave_now
 
         dy[i] = y[n + i]
@@ -339,4 +339,4 @@ def rates(
     angular(theta, torque, turns, joints, inertia, m)
     for i in range(n):
         dy[n + i] = torque[i] - (torque[i - 1] if i > 0 else 0.0)
-    supply_rates(y, port, demand, returned, warmth, bench, dy)
+    supply_rates(y, port, demand, returned, bulk_ratio, bench, dy)

@@ -63,9 +63,9 @@ BENCH: Final = _records(
     "temperature band period_1 phase_1 period_2 phase_2 bulk_temperature viscosity_temperature",
 )
 CHANNEL: Final = _records(
-    "kind joint filter_stages seen",
+    "kind joint filter_stages crosstalk_source",
     "noise gain offset lag low step scale top filter_time filter_before filter_first filter_second "
-    "filter_started seen_share seen_quick seen_slow",
+    "filter_started crosstalk_share crosstalk_high_pass crosstalk_slow",
 )
 LAW: Final = _records("start first period", "gain bias position_gain setpoint limit")
 

@@ -25,15 +25,15 @@ def spool_rates(u: float, w: float, x: float, target: float, joint: Any) -> Any:
     u'' = omega^2 (target - u) - 2 zeta omega u', |u'| bounded; the opening may lag the LVDT.
     """
     slew = min(max(w, -joint.spool_rate), joint.spool_rate)
-    push = joint.omega * joint.omega * (target - u) - 2.0 * joint.zeta * joint.omega * w
-    return slew, push, (u - joint.null - x) * joint.opening_rate
+    acceleration = joint.omega * joint.omega * (target - u) - 2.0 * joint.zeta * joint.omega * w
+    return slew, acceleration, (u - joint.null - x) * joint.opening_rate
 
 
 @jit
-def pushed(x: float, u_before: float, x_before: float, u: float, joint: Any) -> float:
-    """Return the opening behind a spool's play, x being where it would stand without.
+def with_play(x: float, u_before: float, x_before: float, u: float, joint: Any) -> float:
+    """Return the opening [V] behind a spool's play, x being the opening without play.
 
-    It stands off by at most half the play, reached at once or along a travel.
+    It deviates by at most half the play, reached at once or along `play_travel`.
     """
     half = 0.5 * joint.play
     if joint.play_travel <= 0.0:
@@ -67,7 +67,7 @@ def move_spool(start: Any, target: Any, h: float, joints: Any, end: Any) -> None
         if j.opening_rate <= 0.0 or abs(x - u + j.null) < 1e-13:
             x = u - j.null
         if j.play > 0.0:
-            x = pushed(x, start[0, i], start[2, i], u, j)
+            x = with_play(x, start[0, i], start[2, i], u, j)
         end[0, i], end[1, i], end[2, i] = u, w, x
 
 
@@ -101,7 +101,7 @@ def step(
     spool: Any,
     target: Any,
     h: float,
-    warmth: float,
+    bulk_ratio: float,
     joints: Any,
     bench: Any,
     inertia: Any,
@@ -128,17 +128,17 @@ def step(
             move_spool(spool, target, 0.5 * d, joints, half)
             move_spool(half, target, 0.5 * d, joints, end)
         if not first_known:
-            rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
+            rates(y, spool[2], bulk_ratio, joints, bench, inertia, w, k[0])
         first_known = False
         for n in range(size):
             trial[n] = y[n] + 0.5 * d * k[0, n]
-        rates(trial, half[2], warmth, joints, bench, inertia, w, k[1])
+        rates(trial, half[2], bulk_ratio, joints, bench, inertia, w, k[1])
         for n in range(size):
             trial[n] = y[n] + 0.5 * d * k[1, n]
-        rates(trial, half[2], warmth, joints, bench, inertia, w, k[2])
+        rates(trial, half[2], bulk_ratio, joints, bench, inertia, w, k[2])
         for n in range(size):
             trial[n] = y[n] + d * k[2, n]
-        rates(trial, end[2], warmth, joints, bench, inertia, w, k[3])
+        rates(trial, end[2], bulk_ratio, joints, bench, inertia, w, k[3])
         for n in range(size):
             y[n] += d / 6.0 * (k[0, n] + 2.0 * (k[1, n] + k[2, n]) + k[3, n])
         for i in range(len(joints)):
@@ -151,7 +151,7 @@ def sense(
     y: Any,
     dy: Any,
     spool: Any,
-    heat: float,
+    T_oil: float,
     joints: Any,
     bench: Any,
     channels: Any,
@@ -176,7 +176,7 @@ def sense(
             stiff = (value[c] + ATMOSPHERE) / sqrt(y[at] * y[at] + bench.trapped)
             rate[c] = stiff * dy[at]
         else:
-            value[c], rate[c] = heat, 0.0
+            value[c], rate[c] = T_oil, 0.0
         rate[c] *= period
 
 
@@ -198,41 +198,41 @@ def delayed(now: int, c: int, lag: float, values: Any, slopes: Any) -> float:
     if whole > 0:
         u, e = values[b, c], slopes[b, c]
         bend = t * t * (3.0 * (u - v) - 2.0 * d - e + t * (d + e - 2.0 * (u - v)))
-    shown: float = v + t * d + bend
-    return shown
+    delayed_value: float = v + t * d + bend
+    return delayed_value
 
 
 @jit
 def filtered(x: float, h: Any, period: float) -> float:
-    """Return what a sensor's filter shows of x, exact for an input straight between ticks."""
+    """Return a sensor filter's output for input x, exact where x is linear between ticks."""
     if h.filter_time <= 0.0:
         return x
     tau = h.filter_time / h.filter_stages
-    kept = exp(-period / tau)
+    decay = exp(-period / tau)
     if h.filter_started == 0.0:
         h.filter_started = 1.0
         h.filter_before = h.filter_first = h.filter_second = x
-    first = behind(x, h.filter_before, h.filter_first, tau / period, kept)
-    second = behind(first, h.filter_first, h.filter_second, tau / period, kept)
+    first = lag_output(x, h.filter_before, h.filter_first, tau / period, decay)
+    second = lag_output(first, h.filter_first, h.filter_second, tau / period, decay)
     h.filter_before, h.filter_first, h.filter_second = x, first, second
-    shown: float = second if h.filter_stages > 1 else first
-    return shown
+    filtered_value: float = second if h.filter_stages > 1 else first
+    return filtered_value
 
 
 @jit
-def behind(x: float, before: float, shown: float, tau: float, kept: float) -> float:
-    """Return a lag's output one tick later, tau in ticks; its input went from `before` to x."""
+def lag_output(x: float, before: float, previous: float, tau: float, decay: float) -> float:
+    """Return a first-order lag's output one tick later, its input going from `before` to x."""
     slope = tau * (x - before)
-    return x - slope + (shown - before + slope) * kept
+    return x - slope + (previous - before + slope) * decay
 
 
 @jit
-def seen(x: float, h: Any, period: float) -> float:
-    """Return what a channel sees of another's x: its share, or of its quick part alone."""
-    if h.seen_quick > 0.0:
-        h.seen_slow += (x - h.seen_slow) * period  # a filter of one second
-        x -= h.seen_slow
-    return float(h.seen_share * x)
+def crosstalk(x: float, h: Any, period: float) -> float:
+    """Return the crosstalk from another channel's x: a share of it, or of its high-passed part."""
+    if h.crosstalk_high_pass > 0.0:
+        h.crosstalk_slow += (x - h.crosstalk_slow) * period  # a filter of one second
+        x -= h.crosstalk_slow
+    return float(h.crosstalk_share * x)
 
 
 @jit
@@ -240,8 +240,8 @@ def temperature(time: float, bench: Any) -> float:
     """Return the oil's temperature [degC]: two slow waves that stay within the band."""
     a = sin(2.0 * np.pi * (time / bench.period_1 + bench.phase_1))
     b = sin(2.0 * np.pi * (time / bench.period_2 + bench.phase_2))
-    heat: float = bench.temperature + bench.band * (0.7 * a + 0.3 * b)
-    return heat
+    T_oil: float = bench.temperature + bench.band * (0.7 * a + 0.3 * b)
+    return T_oil
 
 
 @jit
@@ -308,20 +308,20 @@ def run(
     w = work[b:c].reshape(n + 4, n)
     target, position = work[c : c + n], work[c + n :]
     for row in range(len(measured)):
-        heat = temperature(tick * period, bench)
-        warmth = 1.0 + bench.bulk_temperature * (heat - bench.temperature)
+        T_oil = temperature(tick * period, bench)
+        bulk_ratio = 1.0 + bench.bulk_temperature * (T_oil - bench.temperature)
         ring = tick % len(values)
         length = period / substeps
         hold_waves(tick, 0.5 * length, period, joints, laws)
-        rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
-        sense(y, k[0], spool, heat, joints, bench, channels, period, values[ring], slopes[ring])
+        rates(y, spool[2], bulk_ratio, joints, bench, inertia, w, k[0])
+        sense(y, k[0], spool, T_oil, joints, bench, channels, period, values[ring], slopes[ring])
         for c in range(len(channels)):
             h = channels[c]
             true = filtered(delayed(ring, c, h.lag / period, values, slopes), h, period)
-            if h.seen > 0:
-                source = h.seen - 1
+            if h.crosstalk_source > 0:
+                source = h.crosstalk_source - 1
                 lag = channels[source].lag / period
-                true += seen(delayed(ring, source, lag, values, slopes), h, period)
+                true += crosstalk(delayed(ring, source, lag, values, slopes), h, period)
             read = h.gain * true + h.offset + h.noise * noise[row, c]
             code = min(max(np.rint((read - h.low) * h.scale), 0.0), h.top)
             measured[row, c] = int(code)
@@ -337,5 +337,5 @@ def run(
         for part in range(substeps):
             if part:
                 hold_waves(tick, (part + 0.5) * length, period, joints, laws)
-            step(y, spool, target, length, warmth, joints, bench, inertia, w, k, ends, part == 0)
+            step(y, spool, target, length, bulk_ratio, joints, bench, inertia, w, k, ends, not part)
         tick += 1

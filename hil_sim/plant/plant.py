@@ -26,7 +26,7 @@ from rig.model.wire.codes import Array, Codes
 # Longest integration step [s]. plant_bench.accuracy gives 3e-7 of the pressures' range with it
 # (1e-7 at 1/6 ms, 8e-7 at 1/4 ms); the stiffest edge, wide open at an end stop, allows 1/4 ms.
 STEP = 2e-4
-DRAWN: Final = 256  # ticks of noise drawn at once, and kept for `rewind`
+NOISE_TICKS: Final = 256  # ticks of noise drawn at once, and kept for `rewind`
 
 
 class Plant:
@@ -41,14 +41,14 @@ class Plant:
         machine = load_machine(rig, scenario.parameters)
         self._truth = dict(machine.parameters)
         # Streams of one seed: 0 sensor noise, 1 oil temperature; 2 is reserved for drawn scenarios.
-        self._noise = np.random.default_rng([seed, 0])
-        # The compiled loop reads them: a change acts from the next tick on.
+        self._noise_rng = np.random.default_rng([seed, 0])
+        # Read by the compiled loop: a change acts from the next tick on.
         self.tables = build(rig, machine, scenario, _periods(np.random.default_rng([seed, 1])))
         self._period = 1.0 / rig.sample_rate
         self._substeps = math.ceil(self._period / STEP * (1.0 - 1e-9))
         self._state, self._spool = rest(self.tables)
         self._joints, self._width = len(rig.joints), len(rig.channels)
-        self._draws, self._used = np.empty((0, self._width)), 0
+        self._noise_rows, self._noise_used = np.empty((0, self._width)), 0
         self._work = np.zeros(kernel_loop.work_size(self._joints))
         self._laws: tuple[Law, ...] = ()
         ring = ring_length(self.tables.channels, self._period)
@@ -61,8 +61,8 @@ class Plant:
         """Run `ticks` ticks under one law per joint.
 
         Returns AD codes in the order of rig.channels, (ticks, channels), and the DA codes put out
-        at each tick and held until the next, (ticks, joints). A law given again (the same object)
-        keeps the wave it had: give a new Law for a new wave. Raises ValueError for a wrong
+        at each tick and held until the next, (ticks, joints). A law passed again (the same object)
+        keeps its wave: pass a new Law for a new wave. Raises ValueError for a wrong
         number of laws.
         """
         joints = self._joints
@@ -88,7 +88,7 @@ class Plant:
             t.channels,
             table,
             waves,
-            self._noise_of(ticks),
+            self._next_noise(ticks),
             measured,
             outputs,
             self._work,
@@ -98,34 +98,35 @@ class Plant:
 
     def mark(self) -> object:
         """Return the state for `rewind`."""
-        return self.tick, [array.copy() for array in self._changing]
+        return self.tick, [array.copy() for array in self._mutable_arrays]
 
     def rewind(self, mark: Any) -> None:
         """Restore the state of a mark, with the same noise from there on."""
-        tick, before = mark
-        self._used -= self.tick - tick
+        tick, arrays = mark
+        self._noise_used -= self.tick - tick
         self.tick = tick
-        for array, values in zip(self._changing, before, strict=True):
+        for array, values in zip(self._mutable_arrays, arrays, strict=True):
             array[:] = values
 
     @property
-    def _changing(self) -> tuple[NDArray[Any], ...]:
+    def _mutable_arrays(self) -> tuple[NDArray[Any], ...]:
         """The arrays that a tick changes in place; of the channels the states of their filters."""
         return self._state, self._spool, self._values, self._slopes, self.tables.channels
 
-    def _noise_of(self, ticks: int) -> Array:
+    def _next_noise(self, ticks: int) -> Array:
         """Return the noise of the next `ticks` ticks, (ticks, channels).
 
         The newest noise is kept as long as `rewind` may need it again.
         """
-        first, last = self._used, self._used + ticks
-        if last > len(self._draws):
-            fresh = self._noise.standard_normal((max(DRAWN, last - len(self._draws)), self._width))
-            keep = max(first - DRAWN, 0)
-            self._draws = np.concatenate([self._draws[keep:], fresh])
+        first, last = self._noise_used, self._noise_used + ticks
+        if last > len(self._noise_rows):
+            rows = max(NOISE_TICKS, last - len(self._noise_rows))
+            drawn = self._noise_rng.standard_normal((rows, self._width))
+            keep = max(first - NOISE_TICKS, 0)
+            self._noise_rows = np.concatenate([self._noise_rows[keep:], drawn])
             first, last = first - keep, last - keep
-        self._used = last
-        return self._draws[first:last]
+        self._noise_used = last
+        return self._noise_rows[first:last]
 
     def truth(self) -> dict[str, float]:
         """Return the true parameters [SI] by the names of rig.model.parameters.

@@ -60,11 +60,11 @@ class Scenario(Part):
     @field_validator("effects")
     @classmethod
     def _each_once(cls, value: tuple[AnyEffect, ...]) -> tuple[AnyEffect, ...]:
-        seen = set()
+        places = set()
         for effect in value:
-            if (effect.name, effect.place) in seen:
+            if (effect.name, effect.place) in places:
                 raise ValueError(f"{effect.name} at {effect.place} occurs twice")
-            seen.add((effect.name, effect.place))
+            places.add((effect.name, effect.place))
         return value
 
 

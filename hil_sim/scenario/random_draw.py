@@ -43,8 +43,8 @@ def draw(rig: Rig, seed: int) -> Scenario:
         effects = [_effect(effect_class, sizes, rig, rng)]
     elif kind != NONE:
         count = 1 if kind == ONE else 2
-        kinds = [effect for effect in CLASSES if effect.drawn]
-        chosen = [kinds[int(i)] for i in rng.choice(len(kinds), size=count, replace=False)]
+        drawable = [effect for effect in CLASSES if effect.drawn]
+        chosen = [drawable[int(i)] for i in rng.choice(len(drawable), size=count, replace=False)]
         effects = [_effect(effect, effect.sizes, rig, rng) for effect in chosen]
     scenario = Scenario.model_validate({"description": f"drawn: {kind}", "effects": effects})
     check_fits(scenario, rig)

@@ -1,4 +1,4 @@
-"""The true parameters of the simulated bench, and constants that only the plant needs.
+"""Load the true parameters of the simulated bench, and constants that only the plant needs.
 
 A shipped machine file `machines/<rig name>.yaml` holds them; a rig without one is built from its
 own `nominal` values. None of this is sent over a wire.

@@ -129,7 +129,7 @@ class SocketcandServer:
         frames = []
         for client in list(self._clients):
             if client.end in writable:
-                self._say(client, b"")
+                self._send_to(client, b"")
             if client.end in ready:
                 frames += self._received(client)
         return frames
@@ -140,7 +140,7 @@ class SocketcandServer:
             text = b"".join(map(_frame_text, frames))
             for client in list(self._clients):
                 if client.raw:
-                    self._say(client, text)
+                    self._send_to(client, text)
 
     def close(self) -> None:
         """Close the server and its connections."""
@@ -155,7 +155,7 @@ class SocketcandServer:
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             client = _Client(end)
             self._clients.append(client)
-            self._say(client, b"< hi >")
+            self._send_to(client, b"< hi >")
 
     def _received(self, client: _Client) -> list[CanFrame]:
         lines = client.lines()
@@ -164,31 +164,31 @@ class SocketcandServer:
             return []
         frames = []
         for line in lines:
-            frame = self._executed(client, line)
+            frame = self._execute(client, line)
             if frame is not None:
                 frames.append(frame)
                 for other in list(self._clients):
                     if other.raw and other is not client:
-                        self._say(other, _frame_text(frame))
+                        self._send_to(other, _frame_text(frame))
         return frames
 
-    def _executed(self, client: _Client, line: bytes) -> CanFrame | None:
+    def _execute(self, client: _Client, line: bytes) -> CanFrame | None:
         words = line.split()
         if words[:1] == [b"open"] and len(words) == 2:
-            known = words[1] == CHANNEL.encode()
-            self._say(client, b"< ok >" if known else b"< error could not open bus >")
+            is_channel = words[1] == CHANNEL.encode()
+            self._send_to(client, b"< ok >" if is_channel else b"< error could not open bus >")
         elif words == [b"rawmode"]:
-            self._say(client, b"< ok >")
+            self._send_to(client, b"< ok >")
             client.raw = True
         elif words == [b"echo"]:
-            self._say(client, b"< echo >")
+            self._send_to(client, b"< echo >")
         elif words[:1] == [b"send"] and client.raw:
             return _frame_of_words(words[1:])
         else:
-            self._say(client, b"< error unknown command >")
+            self._send_to(client, b"< error unknown command >")
         return None
 
-    def _say(self, client: _Client, data: bytes) -> None:
+    def _send_to(self, client: _Client, data: bytes) -> None:
         try:
             client.say(data)
         except OSError:
@@ -235,7 +235,7 @@ class SlcanLine:
         *lines, self._partial = (self._partial + data).split(b"\r")
         if len(self._partial) > _MOST_PARTIAL:
             self._partial = b""
-        frames = [self._executed(line) for line in lines]
+        frames = [self._execute(line) for line in lines]
         return [frame for frame in frames if frame is not None and self._on_bus]
 
     def send(self, frames: list[CanFrame]) -> None:
@@ -247,7 +247,7 @@ class SlcanLine:
         """Remove the terminal."""
         self._line.close()
 
-    def _executed(self, line: bytes) -> CanFrame | None:
+    def _execute(self, line: bytes) -> CanFrame | None:
         if line in (b"O", b"C"):
             self._opened = line == b"O"
         elif line in _CLASSIC_RATES:
