@@ -59,8 +59,6 @@ _OTHER_ORDER: Final = {WordOrder.BIG: WordOrder.LITTLE, WordOrder.LITTLE: WordOr
 class MapSettings(WireSettings):
     """The module's address and its register map, entry by entry."""
 
-    example: ClassVar = "modbus-tcp://127.0.0.1:5020 (a register map fits into a rig file only)"
-
     host: str = Field(min_length=1)
     port: int = Field(default=502, ge=1, le=65535)
     unit: int = Field(default=1, ge=0, le=255)

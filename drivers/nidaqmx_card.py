@@ -46,8 +46,6 @@ _CHANNEL: Final = r"^[^/\s,:]+(/[^/\s,:]+)+$"  # Dev1/ai0: one channel, no list 
 class CardSettings(WireSettings):
     """The card's channels by their physical names, and its watchdog."""
 
-    example: ClassVar = "modbus-tcp://127.0.0.1:5020 (a card's channels fit into a rig file only)"
-
     inputs: dict[str, Any]
     outputs: dict[int, Any]
     zero_by: dict[str, Any] | Literal["none"] = _NO_WATCHDOG

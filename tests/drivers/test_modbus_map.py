@@ -451,5 +451,5 @@ def test_it_is_found_by_its_name_and_has_no_endpoint(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(registry, "_installed", lambda: EntryPoints([entry]))
     rig = rig_of()
     assert isinstance(make_driver(rig.wire, rig), ModbusMapDriver)
-    with pytest.raises(InputError, match="a register map fits into a rig file only"):
+    with pytest.raises(InputError, match="expected the settings of modbus-map in the rig file"):
         wire_at("modbus-map://127.0.0.1:502", rig.wire)
