@@ -314,7 +314,7 @@ def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
     joints = range(1, len(rig.joints) + 1)
     positive = [f"Fv{i}" for i in joints] + ["b"]
     positive += [name for i in joints for name in gain_names(i)]
-    bad = [
+    violations = [
         f"{name} = {estimates[name].value:.4g}"
         for name in positive
         if name in estimates and estimates[name].value <= 0
@@ -322,7 +322,7 @@ def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
     judged = (
         "friction, bulk modulus and flow gains are" if "fluid" in rig.families else "friction is"
     )
-    return Check("signs", not bad, "; ".join(bad) or f"{judged} positive")
+    return Check("signs", not violations, "; ".join(violations) or f"{judged} positive")
 
 
 def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:

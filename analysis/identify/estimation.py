@@ -272,9 +272,9 @@ def merged(
 ) -> Solution:
     """Return the solution with value, covariance and dof replaced for those of `names` it has."""
     known = [k for k, name in enumerate(names) if name in solution.names]
-    place = [solution.names.index(names[k]) for k in known]
+    indices = [solution.names.index(names[k]) for k in known]
     value, dof = solution.value.copy(), solution.dof.copy()
     covariance = solution.covariance.copy()
-    value[place], dof[place] = beta[known], error.dof[known]
-    covariance[np.ix_(place, place)] = error.covariance[np.ix_(known, known)]
+    value[indices], dof[indices] = beta[known], error.dof[known]
+    covariance[np.ix_(indices, indices)] = error.covariance[np.ix_(known, known)]
     return replace(solution, value=value, covariance=covariance, dof=dof)

@@ -396,12 +396,12 @@ class Monitor(Starts, App[int]):
     def act_search(self) -> None:
         """Ask for a text to search in the log."""
 
-        def found(text: str) -> None:
+        def search(text: str) -> None:
             page = self.look.page if self.look.page == "run log" else "log"
             self.look = replace(self.look, search=text.strip(), page=page, offset=0)
 
         lines = ("Lines that contain the text are kept; an empty text keeps all.",)
-        self.ask(Dialog("search", lines, text="", keys="Enter keeps, Esc closes"), found)
+        self.ask(Dialog("search", lines, text="", keys="Enter keeps, Esc closes"), search)
 
     def act_end(self) -> None:
         """Go to the newest line."""

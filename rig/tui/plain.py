@@ -32,10 +32,10 @@ def status_line(frame: Frame, now: float) -> str:
         parts.append(f"{time_left(snapshot)} left")
     margin = nearest_margin(frame)
     if margin is not None:
-        how = shown(margin.unit)
+        form = shown(margin.unit)
         parts.append(
-            f"nearest limit {margin.channel} {how.number(margin.value)} of "
-            f"{how.short(margin.limit)} {how.unit} ({margin.share:.0%})"
+            f"nearest limit {margin.channel} {form.number(margin.value)} of "
+            f"{form.short(margin.limit)} {form.unit} ({margin.share:.0%})"
         )
     unacknowledged = sum(not alarm.acknowledged for alarm in snapshot.alarms)
     if snapshot.alarms:

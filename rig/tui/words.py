@@ -120,7 +120,7 @@ def headline(frame: Frame, now: float) -> Headline:
         (snapshot.engine in ("prompting", "paused"), Headline(snapshot.engine.upper(), "ask")),
     )
     word = snapshot.engine or state
-    return next((head for so, head in cases if so), Headline(word.upper(), "normal"))
+    return next((head for applies, head in cases if applies), Headline(word.upper(), "normal"))
 
 
 def nearest_margin(frame: Frame) -> Margin | None:
@@ -289,13 +289,13 @@ def value(view: ChannelView, fresh: Freshness, *, sign: bool = False) -> Row:
 
     ▲ close to a limit, ■ beyond it, ✕ not a number, ◌ stale, ⊘ disconnected, ‖ held.
     """
-    how = shown(view.unit)
-    unit = (f" {how.unit}", DIM)
+    form = shown(view.unit)
+    unit = (f" {form.unit}", DIM)
     if fresh is Freshness.DISCONNECTED:
-        return (("⊘", ALARM_TEXT), (how.number(view.last, sign=sign), STALE), unit)
+        return (("⊘", ALARM_TEXT), (form.number(view.last, sign=sign), STALE), unit)
     if math.isnan(view.last):
         return (("✕ invalid", ALARM_TEXT),)
-    number = how.number(view.last, sign=sign)
+    number = form.number(view.last, sign=sign)
     if fresh is Freshness.STALE:
         return (("◌", WARN_TEXT), (number, STALE), unit)
     if fresh is not Freshness.LIVE:

@@ -101,8 +101,8 @@ def segments(time: Array, period: float, shared: tuple[float, float] | None = No
         begin, end = shared or ((time[0], time[-1]) if len(time) else (0.0, 1.0))
         span = float(end - begin) + 1e-9
     count = int(np.clip(span / IDENTIFY.shortest_segment, 1, IDENTIFY.period_segments))
-    place = (time - begin) / span
-    part = np.floor((place % 1.0 if period > 0 else place) * count)
+    phase = (time - begin) / span
+    part = np.floor((phase % 1.0 if period > 0 else phase) * count)
     return np.asarray(np.clip(part, 0, count - 1), dtype=np.int64)
 
 
@@ -180,7 +180,7 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
         score.append(inside @ (z * (weight * e)[:, None]))
         if single:
             information += [(z * (weight * selected)[:, None]).T @ b.X for selected in inside]
-        keys += [(strata[b.stratum], b.repeat, place) for place in parts.tolist()]
+        keys += [(strata[b.stratum], b.repeat, part_label) for part_label in parts.tolist()]
     stratum, repeat, part = np.array(keys, dtype=np.int64).T
     first, number = numbered(stratum, repeat, part)
     return Pieces(
@@ -216,10 +216,10 @@ def shared_ticks(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], Ar
 
 def groups(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], list[int]]:
     """Return the indices of the blocks of all repeats, by run, step and equation."""
-    places: dict[tuple[int, str, str], list[int]] = {}
+    indices: dict[tuple[int, str, str], list[int]] = {}
     for k, b in enumerate(blocks):
-        places.setdefault(b.shared, []).append(k)
-    return places
+        indices.setdefault(b.shared, []).append(k)
+    return indices
 
 
 def rows_of(b: RepeatBlock, selected: NDArray[np.bool_]) -> RepeatBlock:
@@ -244,21 +244,21 @@ def _with_levels(
         group = [blocks[k] for k in indices]
         ticks = np.concatenate([b.ticks for b in group])
         state = np.concatenate([_state(b, records[*b.stratum, b.record]) for b in group])
-        times, place = np.unique(ticks, return_inverse=True)
-        mean = np.bincount(place, state) / np.bincount(place)
+        times, tick_index = np.unique(ticks, return_inverse=True)
+        mean = np.bincount(tick_index, state) / np.bincount(tick_index)
         rank = np.empty(len(times), dtype=np.int64)
         rank[np.argsort(mean, kind="stable")] = np.arange(len(times))
         label = number * IDENTIFY.state_levels + rank * IDENTIFY.state_levels // len(times)
         ends = np.cumsum([len(b.time) for b in group])[:-1]
-        for k, level in zip(indices, np.split(label[place], ends), strict=True):
+        for k, level in zip(indices, np.split(label[tick_index], ends), strict=True):
             out[k] = replace(blocks[k], level=level)
     return out
 
 
 def _state(b: RepeatBlock, record: Record) -> Array:
     kind, joint = b.equation.rsplit("_", 1)
-    place = ch.POSITION if ch.channel(ch.POSITION, int(joint)) in record.channels else ch.PISTON
-    channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, place)
+    position = ch.POSITION if ch.channel(ch.POSITION, int(joint)) in record.channels else ch.PISTON
+    channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, position)
     x = bridged(np.asarray(record.channels[ch.channel(channel, int(joint))], dtype=np.float64))
     width = max(1, round(IDENTIFY.averaging_time * record.sample_rate))
     smooth = np.convolve(x, np.full(width, 1.0 / width), mode="same")

@@ -68,8 +68,8 @@ def _scales(
     blocks: Sequence[RepeatBlock], residuals: Sequence[Array], weights: Sequence[Array]
 ) -> list[float]:
     scale = {}
-    for key, places in groups(blocks).items():
-        deviations = [np.abs(residuals[k][weights[k] > 0.5]) for k in places]
+    for key, indices in groups(blocks).items():
+        deviations = [np.abs(residuals[k][weights[k] > 0.5]) for k in indices]
         median = float(np.median(np.concatenate(deviations)))
         scale[key] = max(IDENTIFY.mad_to_std * median, 1e-300)
     return [scale[b.shared] for b in blocks]
@@ -84,8 +84,8 @@ def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
         times = np.unique(np.concatenate([blocks[i].ticks for i in members]))
         width = blocks[members[0]].X.shape[1] + 1
         stack = np.full((len(members), len(times), width), np.nan)
-        places = [np.searchsorted(times, blocks[i].ticks) for i in members]
-        for n, (i, at) in enumerate(zip(members, places, strict=True)):
+        tick_indices = [np.searchsorted(times, blocks[i].ticks) for i in members]
+        for n, (i, at) in enumerate(zip(members, tick_indices, strict=True)):
             stack[n, at] = np.column_stack((blocks[i].X, blocks[i].y))
         distances = np.abs(stack - np.nanmedian(stack, axis=0))
         # Repeats differ slightly throughout (drift, trim): scale by the record's own median
@@ -93,7 +93,7 @@ def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
         typical = IDENTIFY.mad_to_std * np.nanmedian(distances, axis=1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.nanmax(np.where(typical > 0, distances / typical, 0.0), axis=2)
-        for n, (i, at) in enumerate(zip(members, places, strict=True)):
+        for n, (i, at) in enumerate(zip(members, tick_indices, strict=True)):
             out[i] = (
                 IDENTIFY.leverage_limit / np.maximum(distance[n, at], IDENTIFY.leverage_limit)
             ) ** 4

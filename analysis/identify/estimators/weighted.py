@@ -45,13 +45,13 @@ def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
         (e - total / n) * np.sqrt(n / max(n - 1, 1))
         for e, (total, n) in zip(residuals, over_repeats(blocks, residuals), strict=True)
     ]
-    place = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
+    index_of = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
 
     def with_other_chamber(i: int) -> list[int]:
         """Return a block's place, and that of the other chamber where that has the same rows."""
         kind, joint = blocks[i].equation.rsplit("_", 1)
         other = {"flow_cap": "flow_rod", "flow_rod": "flow_cap"}.get(kind)
-        k = place.get((blocks[i].run, blocks[i].record, f"{other}_{joint}"))
+        k = index_of.get((blocks[i].run, blocks[i].record, f"{other}_{joint}"))
         return [i] if k is None or len(blocks[k].y) != len(blocks[i].y) else [i, k]
 
     pairs = [with_other_chamber(i) for i in range(len(blocks))]

@@ -269,12 +269,12 @@ def _solve_in_turn(
     known: dict[str, StepValue] = {}
     lost: dict[str, str] = {}
     pending: list[StepRows] = []
-    for place, step in enumerate(steps):
+    for index, step in enumerate(steps):
         pending.append(step)
         if len(known) == len(names):
             break
         solution = _solve_unknown(names, pending, known, reject_noise)
-        last = place == len(steps) - 1
+        last = index == len(steps) - 1
         for name, value in _values(step.name, solution).items():
             if value.precise or last:
                 known[name] = value

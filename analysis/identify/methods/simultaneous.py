@@ -66,5 +66,5 @@ def gravity_order(rig: Rig, estimates: dict[str, Estimate]) -> list[Check]:
     ]
     ok = all(a >= b for a, b in zip(loads, [*loads[1:], 0.0], strict=True))
     detail = ", ".join(f"{n} = {estimates[n].value:.4g} kg m" for n in names)
-    wanted = "masses within their links give W_i/l_i >= W_(i+1)/l_(i+1) >= 0"
-    return [Check("gravity order", ok, f"{detail}; {wanted}")]
+    expected = "masses within their links give W_i/l_i >= W_(i+1)/l_(i+1) >= 0"
+    return [Check("gravity order", ok, f"{detail}; {expected}")]

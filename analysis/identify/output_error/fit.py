@@ -105,9 +105,9 @@ class Search:
         for halving in range(IDENTIFY.fit_halvings):
             size = 0.5**halving
             new_theta = np.clip(theta + size * step, self.low, self.high)
-            taken = new_theta - theta
+            dtheta = new_theta - theta
             new_starts = [
-                s if r is None else self.windows.moved(window, s, size * r.offset - r.back @ taken)
+                s if r is None else self.windows.moved(window, s, size * r.offset - r.back @ dtheta)
                 for window, s, r in zip(self.placed, starts, reduced, strict=True)
             ]
             new = self.windows.linearised(new_theta, new_starts, sigma)

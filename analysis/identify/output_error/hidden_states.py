@@ -89,8 +89,8 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> ShootingEstimate 
         theta = _theta(windows, model)
         low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
         for name, shape in bounds.items():
-            place = windows.names.index(name)
-            low[place], high[place] = shape.low, shape.high
+            index = windows.names.index(name)
+            low[index], high[index] = shape.low, shape.high
         search = Search(windows, low, high).run(theta)
     except (InputError, np.linalg.LinAlgError) as error:
         log.info("%s is not fitted by shooting: %s", effect.name, error)

@@ -265,8 +265,8 @@ class Windows:
         active = self._active(window.record)
         y0 = np.zeros((1 + len(places) + len(active), len(start) + ready.hidden))
         y0[:, : len(start)] = start
-        for row, (place, size) in enumerate(zip(places, state_sizes, strict=True), start=1):
-            y0[row, place] += size
+        for row, (state_index, size) in enumerate(zip(places, state_sizes, strict=True), start=1):
+            y0[row, state_index] += size
         selected = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
         if y0.shape[1] > len(start):
             y0[:, len(start) :] = [perturbed.hidden[k][window.first] for k in selected]

@@ -147,14 +147,14 @@ def _sequential(data: Mapping[str, Any]) -> str:
     rows = []
     for name, estimates in data["per_step"].items():
         by_step = {e["step"]: e for e in estimates}
-        apart = data["disagreement"].get(name)
+        disagreement = data["disagreement"].get(name)
         rows.append(
             [
                 name,
                 *(_number(by_step.get(step)) for step in steps),
                 _number(data["E1"][name]),
                 _number(data["E2"][name]),
-                "" if apart is None else f"{apart:.1f}",
+                "" if disagreement is None else f"{disagreement:.1f}",
             ]
         )
     header = ["parameter [SI]", *steps, "E1: the first", "E2: average", "apart [95 % intervals]"]

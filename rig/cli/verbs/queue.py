@@ -380,14 +380,14 @@ def run(
                 f"the queue is {store.paused}; continue it with `bramah queue pause --off`"
             )
         hook = Hook(command, folder_of(store.path) / "hook.log")
-        began = datetime.now(UTC)
+        start = datetime.now(UTC)
         with Runner(store, progress, hook, serve=serve) as runner:
             report = runner.run()
         if page is not None:
             from rig.cli.text.night import write_page
 
             try:
-                write_page(page, store, began)
+                write_page(page, store, start)
             except InputError as error:  # the exit code is the queue's, not that of its page
                 progress(f"bramah: {error}")
     document = {

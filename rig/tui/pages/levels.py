@@ -99,13 +99,13 @@ def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
         listed.append(row((f"{mark}{near} {name}", STRONG if k == at else "")))
     name, room = names[at], width - LIST - 1
     channel = snapshot.channels[name]
-    how = shown(channel.unit)
+    form = shown(channel.unit)
     words = [
-        ("trips beyond", how.short(limit(channel.low)), how.short(limit(channel.high))),
-        ("warns beyond", how.short(limit(channel.warn_low)), how.short(limit(channel.warn_high))),
+        ("trips beyond", form.short(limit(channel.low)), form.short(limit(channel.high))),
+        ("warns beyond", form.short(limit(channel.warn_low)), form.short(limit(channel.warn_high))),
     ]
     text = [
-        fit(row((f"{what}  ", DIM), _band(low, high, how.unit)), room) for what, low, high in words
+        fit(row((f"{what}  ", DIM), _band(low, high, form.unit)), room) for what, low, high in words
     ]
     plot = curve(view, name, name, room, height - len(text), axis=True)
     return hstack([(listed, LIST), ([*plot, *text], room)], height)

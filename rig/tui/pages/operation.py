@@ -51,9 +51,9 @@ def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
-    how = shown(alarm.unit)
+    form = shown(alarm.unit)
     low, high = (limit(end) if math.isfinite(end) else None for end in alarm.limit)
-    allowed = " … ".join(how.short(end) or "any" for end in (low, high))
+    allowed = " … ".join(form.short(end) or "any" for end in (low, high))
     if alarm.state == "latched":
         acts = "k acknowledges"
         acts += ", r resets with a reason" if alarm.acknowledged else "; only then r resets it"
@@ -63,7 +63,7 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     fields = [
         ("cause", alarm.check),
         ("where", f"{alarm.channel or '–'} of {where}"),
-        ("value", f"{how.number(alarm.value)} {how.unit}, allowed {allowed} {how.unit}"),
+        ("value", f"{form.number(alarm.value)} {form.unit}, allowed {allowed} {form.unit}"),
         ("when", f"{run_time(view.frame, alarm.time):.3f} s since the run began"),
         ("state", f"{alarm.state}, {'acknowledged' if alarm.acknowledged else 'UNACKNOWLEDGED'}"
                   + (f", came {alarm.count} times" if alarm.count > 1 else "")),

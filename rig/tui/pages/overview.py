@@ -76,13 +76,13 @@ def _step_line(view: PlotView, snapshot: Snapshot, width: int) -> Row:
 def _margin_line(margin: Margin | None, width: int) -> Row:
     if margin is None:
         return fit(row((" limit ", DIM), ("no channel has limits", DIM)), width)
-    how = shown(margin.unit)
+    form = shown(margin.unit)
     near = margin.share < NEAR
     symbol = "■ " if margin.share < 0 else "▲ " if near else ""
     style = ALARM_TEXT if margin.share < 0 else WARN_TEXT if near else ""
     text = (
-        f"{symbol}{margin.channel} {how.number(margin.value)} {how.unit}, "
-        f"{how.number(margin.distance)} {how.unit} from its limit {how.short(margin.limit)}"
+        f"{symbol}{margin.channel} {form.number(margin.value)} {form.unit}, "
+        f"{form.number(margin.distance)} {form.unit} from its limit {form.short(margin.limit)}"
     )
     return fit(row((" limit ", DIM), (text, style)), width)
 

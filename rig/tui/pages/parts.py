@@ -123,16 +123,16 @@ def gauge(
 
     The bar covers `reach`; without it the line ends in the travel as numbers.
     """
-    how = shown(view.unit)
+    form = shown(view.unit)
     limits = (limit(view.low), limit(view.high))
-    number = value(view, fresh, sign=how.signed)
+    number = value(view, fresh, sign=form.signed)
     space = (" " * max(NUMBER - width_of(number), 0), "")
     line: Row = ((f"{label:<{LABEL}}", DIM), space, *number)
     if reach is None:
         # The range of a bar is unknown: show the travel in numbers.
-        numbers = [how.number(end, sign=how.signed) for end in travel or ()]
+        numbers = [form.number(end, sign=form.signed) for end in travel or ()]
         return fit((*line, (f"  {' … '.join(numbers)}", DIM)), width)
-    low, high = (f"{how.short(level):>{LIMIT}}" for level in limits)
+    low, high = (f"{form.short(level):>{LIMIT}}" for level in limits)
     line = (*line, (f" {low} ", DIM))
     room = width - width_of(line) - max(LIMIT, len(high.strip())) - 1
     warnings = (limit(view.warn_low), limit(view.warn_high))
@@ -170,13 +170,13 @@ def curve(
     snapshot, window = view.frame.snapshot, view.frame.window
     assert snapshot is not None
     channel = snapshot.channels[name]
-    how = shown(channel.unit)
+    form = shown(channel.unit)
     stop = view.frame.device_time
     start = stop - view.look.seconds
-    line: Row = ((f"{label:<9}", STRONG), *value(channel, view.fresh, sign=how.signed))
+    line: Row = ((f"{label:<9}", STRONG), *value(channel, view.fresh, sign=form.signed))
     span = window.span(name, start)
     if span is not None:
-        numbers = " … ".join(how.number(end, sign=how.signed) for end in span)
+        numbers = " … ".join(form.number(end, sign=form.signed) for end in span)
         line = (*line, (f"   {numbers}", DIM))
     low, high = window.of(name)
     trace = PlotTrace(
@@ -186,7 +186,7 @@ def curve(
         start,
         stop,
         (limit(channel.low), limit(channel.high)),
-        how,
+        form,
         view.fresh is Freshness.LIVE,
         view.look.zoomed,
         (limit(channel.warn_low), limit(channel.warn_high)),

@@ -30,9 +30,9 @@ def run_trace_page(view: PlotView, width: int, height: int) -> list[Row]:
         return block([row((" no run was opened", DIM))], width, height)
     head = [fit(row((f" {trace.path or trace.folder}", STRONG)), width)]
     if trace.stored is None:
-        said = "reading ..." if trace.reading else trace.trouble
+        status = "reading ..." if trace.reading else trace.trouble
         style = DIM if trace.reading else WARN_TEXT
-        return block([*head, *wrapped(f" {said}", width, style)], width, height)
+        return block([*head, *wrapped(f" {status}", width, style)], width, height)
     room = height - len(head)
     beside_it = width >= WIDE
     left = width * 11 // 20 if beside_it else width
@@ -129,20 +129,21 @@ def free_run_rows(stored: StoredTrace, chosen: int, width: int, height: int) -> 
     names = list(run.channels)
     name = names[min(chosen, len(names) - 1)]
     curves = run.channels[name]
-    how = shown(curves.unit)
+    form = shown(curves.unit)
     before, after = errors_of(curves)
     time = np.array(run.time)
     largest = float(np.nanmax(np.abs(np.concatenate((before, after, [0.0])))))
     ends = (-largest, largest) if largest > 0.0 else (None, None)
-    head = row((f" {name}", STRONG), (f"  free run minus measured, {run.record} [{how.unit}]", DIM))
+    what = f"  free run minus measured, {run.record} [{form.unit}]"
+    head = row((f" {name}", STRONG), (what, DIM))
     errors = (("before", before), ("after", after)) if stored.changed else (("error", before),)
     each = max((height - 3) // len(errors) - 1, 1)
     rows: list[Row] = [fit(head, width)]
     for word, error in errors:
         finite = error[np.isfinite(error)]
         rms = float(np.sqrt(np.mean(finite**2))) if len(finite) else math.nan
-        title = row((f" {word}", STRONG), (f"  rms {plain(how.factor * rms, 3)} {how.unit}", DIM))
-        trace = PlotTrace(time, error, error, float(time[0]), float(time[-1]), ends, how)
+        title = row((f" {word}", STRONG), (f"  rms {plain(form.factor * rms, 3)} {form.unit}", DIM))
+        trace = PlotTrace(time, error, error, float(time[0]), float(time[-1]), ends, form)
         rows += [fit(title, width), *draw(trace, width, each)]
     first, last = (f"{at:.3g} s" for at in (time[0], time[-1]))
     axis = f"{' ' * GUTTER}{first:<{max(width - GUTTER - len(last), 0)}}{last}"

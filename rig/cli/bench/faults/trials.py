@@ -197,7 +197,7 @@ def _session(
     collector = _Collector()
     period = round(rig.sample_rate)
     wave = _AMPLITUDE * np.sin(2.0 * np.pi * np.arange(period) / period)
-    off = [OutputLaw()] * (len(rig.joints) - 1)
+    off_laws = [OutputLaw()] * (len(rig.joints) - 1)
     rng = np.random.default_rng(seed)
     fault_start: tuple[float, float] | None = None  # [s] of wall-clock time and of device time
     recorder = Recorder(folder / "run", rig)
@@ -209,7 +209,7 @@ def _session(
             session.upload(0, wave)
             limit = rig.joints[0].limits.command
             law = OutputLaw(gain=1.0, position_gain=_POSITION_GAIN, limit=limit)
-            session.apply([law, *off], restart=True)
+            session.apply([law, *off_laws], restart=True)
             session.run_for(0.3)
             session.guard([EXCITED, *_locked(rig, collector.blocks[-1])])
             session.run_for(0.3 + float(rng.uniform(0.0, 0.3)))
@@ -319,9 +319,9 @@ def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Diagnos
 def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Diagnosis:
     if isinstance(trip, SafetyTrip) and trip.limit in LATE:
         return Diagnosis.UNKNOWN
-    own = {getattr(fault, key, None) for key in ("channel", "other")} - {None}
-    if own:
-        return Diagnosis.NAMED if trip.channel in own else Diagnosis.WRONG
+    channels_of_fault = {getattr(fault, key, None) for key in ("channel", "other")} - {None}
+    if channels_of_fault:
+        return Diagnosis.NAMED if trip.channel in channels_of_fault else Diagnosis.WRONG
     joint = getattr(fault, "joint", None)
     if joint is not None and trip.joint == joint + 1:
         return Diagnosis.NAMED

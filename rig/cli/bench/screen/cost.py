@@ -39,25 +39,25 @@ def publish(seconds: float, folder: str) -> None:
     level = {"Pa": (3e6, 1e6), "m": (0.0, 5e-3), "V": (0.0, 0.5), "degC": (40.0, 0.1)}
     base, swing = np.array([level[ch.unit_of(name)] for name in rig.recorded]).T
     phase = np.arange(len(rig.recorded))
-    began = time.monotonic()
+    start = time.monotonic()
     for k in range(round(seconds / BLOCK)):
         ticks = k * count + np.arange(count)
         wave = np.sin(2 * np.pi * ticks[:, None] / rig.sample_rate + phase)
         display.commands()
         block = SampleBlock(k, k * count, base + swing * wave, saturated, 0, False)
         display.show(block, 0.001, 0, roles)
-        time.sleep(max(began + (k + 1) * BLOCK - time.monotonic(), 0.0))
+        time.sleep(max(start + (k + 1) * BLOCK - time.monotonic(), 0.0))
     display.ended("done", "")
     display.close()
 
 
 def _load(screen: Screen, seconds: float) -> tuple[float, float]:
     """Return (processor share [% of one core], bytes a second) of the screen."""
-    before, began = screen.processor_seconds(), time.monotonic()
+    before, start = screen.processor_seconds(), time.monotonic()
     time.sleep(seconds)
-    spent = time.monotonic() - began
+    spent = time.monotonic() - start
     share = 100.0 * (screen.processor_seconds() - before) / spent
-    return share, screen.bytes_since(began) / spent
+    return share, screen.bytes_since(start) / spent
 
 
 def cost_figures(runtime: Path, say: Callable[[str], None], seconds: float) -> list[Figure]:

@@ -92,9 +92,9 @@ def journal_figures(folder: Path, rig: Rig) -> list[Figure]:
     for k in range(JOURNAL_BLOCKS):
         data = rng.normal(size=(n, len(rig.recorded)))
         block = SampleBlock(k, k * n, data, saturated, 0, tripped=False)
-        began = time.perf_counter()
+        start = time.perf_counter()
         journal.append(1, block, 0.0)
-        times.append(1e3 * (time.perf_counter() - began))
+        times.append(1e3 * (time.perf_counter() - start))
     journal.close()
     name = "a block of 100 ms into the journal"
     return [
@@ -134,9 +134,9 @@ def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[
 
 def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
     """Return the cost of a block and the number of blocks, which `work` returns."""
-    began, busy = time.perf_counter(), time.process_time()
+    start, busy = time.perf_counter(), time.process_time()
     blocks = work()
-    busy, wall = time.process_time() - busy, time.perf_counter() - began
+    busy, wall = time.process_time() - busy, time.perf_counter() - start
     return _Cost(busy / blocks, wall / blocks), blocks
 
 
