@@ -194,7 +194,7 @@ class CanOpenValves:
         return None
 
     def reset(self) -> None:
-        """Leave the faults by a rising reset bit, the outputs at zero."""
+        """Clear the faults by a rising reset bit, the outputs at zero."""
         zero = np.zeros(len(self._nodes))
         self._heartbeat(force=True)
         for word in (Control.DISABLED, Control.DISABLED | Control.RESET, Control.DISABLED):

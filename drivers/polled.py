@@ -452,7 +452,7 @@ class PolledDriver:
         self._volts = np.zeros(len(self._rig.joints))
 
     def _make_safe(self) -> None:
-        """After a failed tick: drop all laws and try once to zero the outputs."""
+        """Drop all laws and try once to zero the outputs, after a failed tick."""
         self._zero_laws()
         self._streaming = False
         if self._open:

@@ -45,7 +45,7 @@ def spoiled_blocks_are_refused(trial: Trial) -> None:
 
 @check(FAULTS)
 def spoiled_calls_raise_declared_errors(trial: Trial) -> None:
-    """Whatever an answer suffers, calls work or raise DeviceError, and nothing else."""
+    """With any fault of the answers, calls work or raise DeviceError, and nothing else."""
     calls: dict[str, Callable[[Watched], object]] = {
         "apply": lambda driver: driver.apply(trial.driving()),
         "upload": lambda driver: driver.upload(0, trial.wave(seed=6)),

@@ -41,7 +41,7 @@ def long_waveform_is_played(trial: Trial) -> None:
 
 @check()
 def phase_is_kept_without_restart(trial: Trial) -> None:
-    """`apply` without restart goes on in the waveform; with restart it begins anew."""
+    """`apply` without restart keeps the waveform's phase; with restart it begins again."""
     driver, wave = trial.ready(), trial.wave()
     driver.upload(0, wave)
     first, second = trial.law(gain=1.0), trial.law(gain=0.5)
@@ -141,7 +141,7 @@ def position_law_pulls_to_setpoint(trial: Trial) -> None:
 @check()
 def impossible_laws_refused(trial: Trial) -> None:
     """A law that is not finite, of a negative limit, beyond the converter or for a wrong number of
-    joints is refused, and what was put out goes on."""
+    joints is refused, and the law before it stays in force."""
     driver, good = trial.ready(), trial.driving()
     tick = driver.apply(good)
     for joint in range(trial.joints):

@@ -15,7 +15,7 @@ from rig.model.rig import Rig
 
 @check(moves=False)
 def identity(trial: Trial) -> None:
-    """`connect` returns the rig's joints, channels and rate, and the kind of time declared."""
+    """`connect` returns the rig's joints, channels and rate, and whether time is virtual."""
     info = trial.connected().info
     assert info is not None
     rig = trial.rig
@@ -252,7 +252,7 @@ def silent_device_is_lost(trial: Trial) -> None:
 
 @check(LATCH, SILENCE)
 def trip_is_reported(trial: Trial) -> None:
-    """A tripped device says so: in `trip_cause` and in its blocks."""
+    """A tripped device reports it in `trip_cause` and marks its blocks."""
     driver = _driven(trial)
     _fall_silent(trial)
     require(driver.trip_cause() is not None, "trip_cause is None after a trip")

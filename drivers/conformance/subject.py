@@ -31,7 +31,7 @@ class Capabilities:
     evaluates the laws at the host's rate; its blocks may lag, and `stop` ends the laws.
     `virtual_time`: the device's clock stands still without reads. `latches_trips`: after a loss of
     the host the device keeps its outputs at zero until `reset`. `refuses_other_rigs`: the device
-    can tell which rig it is.
+    can compare its rig with the host's.
     """
 
     outputs: bool = True

@@ -16,11 +16,11 @@ Result = TypeVar("Result")
 
 
 class NotConforming(AssertionError):
-    """A driver violated a requirement; the message says which."""
+    """A driver violated a requirement, which the message names."""
 
 
 class Skipped(Exception):
-    """A check that cannot be made here; the message says why."""
+    """A check that cannot be made here, for the reason in the message."""
 
 
 def require(condition: object, message: str) -> None:

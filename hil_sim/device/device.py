@@ -246,7 +246,7 @@ class Device:
             logger.warning("tripped at tick %d: %s", self.tick, reg.TRIP_TEXT[cause])
 
     def catch_up(self) -> None:
-        """In real time, run the plant up to the present."""
+        """Run the plant up to the present, in real time only."""
         if not self.realtime or self._plant_failed:
             return
         rate = self._rate

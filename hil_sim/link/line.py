@@ -125,7 +125,7 @@ class LineLink(FaultyLink):
 
 
 def _prefix_and_device(target: str) -> tuple[str, str]:
-    """Return what stands before a device file in an endpoint, ``can://slcan``, and the file."""
+    """Split an endpoint into what precedes the device file, ``can://slcan``, and the file."""
     kind, _, rest = target.partition("://")
     before, _, path = rest.partition("/")
     return f"{kind}://{before}", f"/{path}"

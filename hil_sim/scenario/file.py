@@ -3,7 +3,7 @@
     effects:
       - {name: coulomb_friction, where: joint 2, force: 80 N}
       - {name: channel_delay, channel: piston_1, time: 2 ms}
-    parameters: {b: 200 MPa}     # the machine itself, otherwise than its file says
+    parameters: {b: 200 MPa}     # in place of those of the machine's file
     faults:                      # what breaks while the bench runs, by the device's time
       - {name: sensor_stuck, channel: cap_pressure_1, at: 12 s}
       - {name: frame_lost, probability: 0.01, at: 5 s, until: 20 s}

@@ -21,7 +21,7 @@ from hil_sim.scenario.file import Scenario, check_fits
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
-RANDOM: Final = "random"  # the word on a command line instead of a file
+RANDOM: Final = "random"  # in place of a file's name on a command line
 STREAM: Final = 2  # of a bench's seed; 0 and 1 are the plant's own
 NONE, ONE, TWO, NO_FORMULA = "none", "one", "two", "strange"
 SHARES: Final[Mapping[str, float]] = {NONE: 0.2, ONE: 0.4, TWO: 0.25, NO_FORMULA: 0.15}

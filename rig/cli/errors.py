@@ -28,7 +28,7 @@ _STDOUT = 1  # file descriptor
 
 
 class WorkError(Exception):
-    """The work could not be done; the message says why in one line (exit code 1)."""
+    """The work could not be done; the message gives the reason in one line (exit code 1)."""
 
 
 def coloured() -> bool:

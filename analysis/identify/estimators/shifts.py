@@ -117,7 +117,7 @@ def significant_shift(test: Hausman, p: FamilyBlocks) -> Array:
 def predicted_shift(solution: Solution, p: FamilyBlocks) -> Array:
     """Return the bias (k,) of the parameters that the stated sensor noise predicts.
 
-    It stands for the shift against instruments where no repeats give any.
+    It replaces the shift against instruments where there are no repeats.
     """
     bias = dict(zip(solution.names, solution.noise_bias, strict=True))
     predicted: Array = np.array([bias[name] for name in p.names[: p.parameters]])

@@ -265,7 +265,7 @@ def _values(step: str, solution: Solution) -> dict[str, StepValue]:
 def _solve_in_turn(
     names: tuple[str, ...], steps: Sequence[StepRows], reject_noise: bool
 ) -> tuple[dict[str, StepValue], dict[str, str]]:
-    """E1: solve each step with the parameters of the steps before it known."""
+    """Solve each step with the parameters of the steps before it known (E1)."""
     known: dict[str, StepValue] = {}
     lost: dict[str, str] = {}
     pending: list[StepRows] = []
@@ -295,7 +295,7 @@ def _average(
     own: Mapping[str, Sequence[StepValue]],
     reject_noise: bool,
 ) -> dict[str, StepValue]:
-    """E2: average the steps' own values; solve the others from all rows."""
+    """Average the steps' own values and solve the others from all rows (E2)."""
     known = {}
     for name, values in own.items():
         if values:

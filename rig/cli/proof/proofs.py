@@ -88,7 +88,7 @@ def proved(
 
     `predict` adds the predicted standard errors; `progress` receives the share done; `source` is
     the source of the twin's parameters (default: the last identified model of the rig). Raises
-    InputError if the twin cannot follow the plan. The report says whether limits are kept.
+    InputError if the twin cannot follow the plan. The report states whether limits are kept.
     """
     source = twin_source(rig) if source is None else source
     key = proof_key(plan, rig, source)

@@ -224,7 +224,7 @@ class Link:
         self._detach()
 
     def step(self, timeout: float) -> None:
-        """Look for sessions if it is time, wait `timeout` [s] for a snapshot, make a frame."""
+        """Search for sessions if due, wait `timeout` [s] for a snapshot, make a frame."""
         self._follow_sessions()
         if self._source is None:
             self._closing.wait(5 * timeout)

@@ -86,7 +86,7 @@ def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress the log meanwhile: the outcomes hold the hundreds of warnings that faults cause."""
+    """Suppress the log: the outcomes hold the hundreds of warnings that faults cause."""
     root = logging.getLogger()
     handlers, root.handlers = root.handlers, [logging.NullHandler()]
     try:
