@@ -42,7 +42,7 @@ from rig.model.wire.codes import decode_input, decode_output
 
 logger = logging.getLogger(__name__)
 
-BLOCK_SAMPLES = 10
+BLOCK_SAMPLES = 10  # of each call of `advance`, hence of each block
 _ZERO_WAVE = np.zeros(1)
 
 

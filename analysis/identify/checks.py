@@ -200,27 +200,27 @@ def leak_down(rig: Rig, records: Sequence[Record | RecordHead]) -> list[Check]:
     speed, creep, joint, head = max(creeps, key=lambda entry: entry[0])
     seconds = head.samples / head.sample_rate
     ok = speed < IDENTIFY.most_creep
-    why = "" if ok else "; oil passes the piston, leaves the joint, or passes a valve at rest"
+    cause = "" if ok else "; oil passes the piston, leaves the joint, or passes a valve at rest"
     return [
         Check(
             "leak-down",
             ok,
             f"record {head.name!r}: with every valve closed joint {joint} crept {1e3 * creep:.2g} "
             f"mm in {seconds:g} s, {1e3 * speed:.2g} mm/s (below {1e3 * IDENTIFY.most_creep:g} "
-            f"wanted){why}",
+            f"wanted){cause}",
         )
     ]
 
 
 def joints_excited(rig: Rig, records: Sequence[Record | RecordHead]) -> Check:
     """State joints that no record excites: their parameters cannot be identified."""
-    still = [
+    idle = [
         i for i in range(1, len(rig.joints) + 1) if all(i in record.locked for record in records)
     ]
-    if still:
+    if idle:
         return Check(
             "excited joints", False,
-            f"no record excites joint {' '.join(map(str, still))}: its gains and friction are not "
+            f"no record excites joint {' '.join(map(str, idle))}: its gains and friction are not "
             "identifiable from these records; add a step that excites it",
         )  # fmt: skip
     return Check("excited joints", True, "every joint is excited in some record")
@@ -244,7 +244,7 @@ def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
     """State each family's unidentified parameters, with reasons, and its condition number."""
     out = []
     for family, solution in solutions.items():
-        reasons = "; ".join(f"{name}: {why}" for name, why in solution.unidentifiable.items())
+        reasons = "; ".join(f"{name}: {cause}" for name, cause in solution.unidentifiable.items())
         out.append(
             Check(f"identifiable {family}", not reasons, reasons or "every parameter is determined")
         )

@@ -204,7 +204,7 @@ def _prepare(
             continue
         nuisances = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
         # Without their columns, parameters excited by the same motion would absorb their share.
-        noisy = [n for n, why in solution.unidentifiable.items() if why == MOSTLY_NOISE]
+        noisy = [n for n, reason in solution.unidentifiable.items() if reason == MOSTLY_NOISE]
         nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
         names = (*determined, *nuisances)
         selected = [columns.index(name) for name in names]
@@ -271,10 +271,10 @@ def merged(
     solution: Solution, names: Sequence[str], beta: Array, error: CovarianceParts
 ) -> Solution:
     """Return the solution with value, covariance and dof replaced for those of `names` it has."""
-    known = [k for k, name in enumerate(names) if name in solution.names]
-    indices = [solution.names.index(names[k]) for k in known]
+    shared = [k for k, name in enumerate(names) if name in solution.names]
+    indices = [solution.names.index(names[k]) for k in shared]
     value, dof = solution.value.copy(), solution.dof.copy()
     covariance = solution.covariance.copy()
-    value[indices], dof[indices] = beta[known], error.dof[known]
-    covariance[np.ix_(indices, indices)] = error.covariance[np.ix_(known, known)]
+    value[indices], dof[indices] = beta[shared], error.dof[shared]
+    covariance[np.ix_(indices, indices)] = error.covariance[np.ix_(shared, shared)]
     return replace(solution, value=value, covariance=covariance, dof=dof)

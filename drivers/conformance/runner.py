@@ -132,8 +132,8 @@ def run(
         if only and check.name not in only:
             continue
         if check.moves and not outputs:
-            why = "asks for outputs other than zero"
-            results.append(Result(check.name, CheckVerdict.SKIPPED, why))
+            cause = "asks for outputs other than zero"
+            results.append(Result(check.name, CheckVerdict.SKIPPED, cause))
             continue
         results.append(run_check(check, subject, effort))
         if until_failure and results[-1].verdict == CheckVerdict.FAILED:

@@ -20,7 +20,7 @@ from rig.model.wire.registers import Refusal
 Words = NDArray[np.uint16]
 
 _SINGLE = 1.0 + 1e-6  # registers hold single precision: 0.0375 arrives as 0.037500001
-GAIN_MAX = 100.0
+GAIN_MAX = 100.0  # of the waveform [1]
 POSITION_GAIN_MAX = 1e5  # [V/m]
 
 

@@ -242,8 +242,8 @@ def _stop_of_shown_run(frame: Frame, stop: Stop, now: float) -> Notice:
     if stop.answer is KeyAnswer.SENDING:
         return Notice("warn", "STOP: sending ...")
     if frame.over:
-        why = frame.snapshot.message if frame.snapshot is not None else ""
-        reason = f" ({why})" if why else ""
+        message = frame.snapshot.message if frame.snapshot is not None else ""
+        reason = f" ({message})" if message else ""
         return Notice("alarm", f"STOP TAKEN, NOT CONFIRMED: the run ended{reason}. {EMERGENCY}")
     late = now - stop.at
     if late > CONFIRM:

@@ -66,7 +66,7 @@ def test_a_run_that_nobody_stops_loses_nothing_when_its_screen_is_killed(runtime
         played(RunPlace(endpoint, runtime, runtime / "run"), driven=False) as run,
     ):
         with Screen(runtime):
-            assert run.said("watched", 60.0)
+            assert run.has_sent("watched", 60.0)
         times = run.end()
     assert times.lost == 0
     assert times.reason == ""

@@ -209,8 +209,8 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
         worst = max(biased, key=lambda s: abs(s.relative))
         return Check(
             NOISE_CHECK, False,
-            f"least squares is biased by noise in the regressors, {_figures(worst)}; so are "
-            f"{len(biased) - 1} others; --estimator auto or iv is not",
+            f"least squares is biased by noise in the regressors in {len(biased)} of "
+            f"{len(shifts)} parameters, most {_figures(worst)}; --estimator auto or iv is not",
         )  # fmt: skip
     if significant:
         worst = max(significant, key=lambda s: s.t)

@@ -79,14 +79,14 @@ class StepRows:
 
 @dataclass(frozen=True)
 class StepwiseFit:
-    """One family solved step by step: each step's values (`own`) and condition number, E1, E2.
+    """One family solved step by step: each step's values (`alone`) and condition number, E1, E2.
 
     E1 is `first`, E2 `averaged`. `rows` counts the rows of all steps, `triangle` (k+1, k+1)
     represents them; `lost` states, by parameter, why E1 has no value.
     """
 
     names: tuple[str, ...]
-    own: Mapping[str, Sequence[StepValue]]
+    alone: Mapping[str, Sequence[StepValue]]
     first: Mapping[str, StepValue]
     averaged: Mapping[str, StepValue]
     condition: Mapping[str, float]
@@ -144,7 +144,7 @@ def sequential(
             for value in values
         }
         for f, o in outcomes.items()
-        for name, values in o.own.items()
+        for name, values in o.alone.items()
     }
     statements = (
         _uniqueness(by_name),
@@ -236,18 +236,18 @@ def _solved_by_steps(
     names: tuple[str, ...], steps: Sequence[StepRows], reject_noise: bool
 ) -> StepwiseFit:
     """Solve one family step by step: each step alone, E1 and E2."""
-    own: dict[str, list[StepValue]] = {name: [] for name in names}
+    step_values: dict[str, list[StepValue]] = {name: [] for name in names}
     condition = {}
     for step in steps:
-        alone = solve(names, step.clusters, step.noise, reject_noise)
-        condition[step.name] = alone.condition_number
-        for name, value in _values(step.name, alone).items():
+        step_solution = solve(names, step.clusters, step.noise, reject_noise)
+        condition[step.name] = step_solution.condition_number
+        for name, value in _values(step.name, step_solution).items():
             if value.precise:
-                own[name].append(value)
+                step_values[name].append(value)
     first, lost = _solve_in_turn(names, steps, reject_noise)
-    averaged = _average(names, steps, own, reject_noise)
+    averaged = _average(names, steps, step_values, reject_noise)
     return StepwiseFit(
-        names, own, first, averaged, condition,
+        names, step_values, first, averaged, condition,
         sum(c.rows for s in steps for c in s.clusters),
         merge(c.triangle for s in steps for c in s.clusters), lost,
     )  # fmt: skip
@@ -292,12 +292,12 @@ def _has_unknown(names: tuple[str, ...], step: StepRows, known: Mapping[str, Ste
 def _average(
     names: tuple[str, ...],
     steps: Sequence[StepRows],
-    own: Mapping[str, Sequence[StepValue]],
+    step_values: Mapping[str, Sequence[StepValue]],
     reject_noise: bool,
 ) -> dict[str, StepValue]:
     """Average the steps' own values and solve the others from all rows (E2)."""
     known = {}
-    for name, values in own.items():
+    for name, values in step_values.items():
         if values:
             n = len(values)
             std = float(np.sqrt(sum(v.std**2 for v in values))) / n

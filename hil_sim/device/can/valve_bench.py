@@ -28,8 +28,8 @@ from rig.model.wire.codes import decode_input
 
 logger = logging.getLogger(__name__)
 
-POLL_SECONDS = 0.01
-_MOST_SECONDS = 4.0  # simulated at once at most; after a longer pause the clock skips the rest
+POLL_SECONDS = 0.01  # longest wait for a frame between two advances of the plant
+_LONGEST_STEP = 4.0  # [s] simulated at once; after a longer pause the clock skips the rest
 
 
 class AdapterNetwork(canopen.Network):
@@ -51,7 +51,7 @@ class ValveNode:
         eds: Any = io.StringIO(cia408.shipped_eds())
         eds.name = "valve-408.eds"
         self.state = ValveState.INIT
-        self._word = 0
+        self._control_word = 0
         self._clock = clock
         self._heartbeat: float | None = None
         # Every variable here is an integer, which the library's types do not state.
@@ -95,27 +95,28 @@ class ValveNode:
         tpdo = self.node.tpdo
         tpdo[1][0].raw = int(self.state)
         tpdo[1][1].raw = round(spool * cia408.FULL_SCALE)
-        for place, code in enumerate(sensors):
-            tpdo[2 + place // 3][place % 3].raw = code
+        for position, code in enumerate(sensors):
+            tpdo[2 + position // 3][position % 3].raw = code
         for number in (1, 2, 3):
             tpdo[number].transmit()
 
     def _consumed(self) -> tuple[int, float]:
+        """Return the supervised host's node number and the time [s] allowed between heartbeats."""
         entry = self.node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw
         return entry >> 16 & 0x7F, 1e-3 * (entry & 0xFFFF)
 
     def _commanded(self, pdo: Any) -> None:
-        self._follow(pdo[0].raw)
+        self._apply(pdo[0].raw)
 
     def _written(self, index: int, data: bytes, **_: object) -> None:
         if index == cia408.CONTROL_WORD:
-            self._follow(int.from_bytes(data, "little"))
+            self._apply(int.from_bytes(data, "little"))
         elif index == cia408.CONSUMER_HEARTBEAT:
             self._heartbeat = None  # CiA 301: supervision begins with the next heartbeat
 
-    def _follow(self, word: int) -> None:
-        self.state = cia408.next_state(self.state, self._word, word)
-        self._word = word
+    def _apply(self, control_word: int) -> None:
+        self.state = cia408.next_state(self.state, self._control_word, control_word)
+        self._control_word = control_word
 
 
 class ValveBench:
@@ -159,24 +160,24 @@ class ValveBench:
     def _catch_up(self) -> None:
         rate = self._rig.sample_rate
         due = int((self._clock() - self._origin) * rate) - (self._plant.tick - self._first)
-        most = int(_MOST_SECONDS * rate)
-        if due > most:
-            self._origin += (due - most) / rate
-            due = most
+        longest = int(_LONGEST_STEP * rate)
+        if due > longest:
+            self._origin += (due - longest) / rate
+            due = longest
         if due > 0:
             laws = [Law(OFF.wave, bias=volts, limit=abs(volts)) for volts in self.volts]
             measured, _ = self._plant.advance(due, laws)
             self._codes = measured[-1]
 
     def _transmit(self) -> None:
-        names = self._rig.channels
+        measured = self._rig.channels
         sensor = self._rig.sensors.spool
         for index, valve in enumerate(self.valves, start=1):
-            code = self._codes[names.index(ch.channel(ch.SPOOL, index))]
+            code = self._codes[measured.index(ch.channel(ch.SPOOL, index))]
             spool = decode_input(code, *sensor.range, sensor.bits) / max(map(abs, sensor.range))
-            wanted = [ch.channel(kind, index) for kind in (ch.PISTON, ch.CAP, ch.ROD)]
-            wanted += [ch.SUPPLY, ch.TEMPERATURE]
-            codes = [int(self._codes[names.index(n)]) if n in names else 0 for n in wanted]
+            channels = [ch.channel(kind, index) for kind in (ch.PISTON, ch.CAP, ch.ROD)]
+            channels += [ch.SUPPLY, ch.TEMPERATURE]
+            codes = [int(self._codes[measured.index(n)]) if n in measured else 0 for n in channels]
             valve.transmit(float(spool), codes)
 
 

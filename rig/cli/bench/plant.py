@@ -135,11 +135,11 @@ def reference_run(rig: Rig, targets: Array, **options: Any) -> tuple[Array, floa
     """Integrate `targets` (ticks, joints) from rest: (signals per tick, processor time [s])."""
     reference = Reference(Plant(rig, Scenario(), 1))
     rows = []
-    began = time.process_time()
+    start = time.process_time()
     for target in targets:
         reference.advance(target, **options)
         rows.append(reference.signals())
-    return np.stack(rows), time.process_time() - began
+    return np.stack(rows), time.process_time() - start
 
 
 def plant_run(rig: Rig, ticks: int) -> tuple[Array, Array]:
@@ -180,24 +180,24 @@ def speed(seconds: float = 5.0) -> dict[str, float]:
     """
     rig = load_rig("shinshu-2dof")
     laws, ticks = hard_laws(rig), round(seconds * rig.sample_rate)
-    taken = math.inf
+    cost = math.inf  # [s] of processor time per simulated second
     for _ in range(3):  # the best of three, to exclude the load of other programs
         plant = Plant(rig, Scenario(), 1)
-        began = time.process_time()
+        start = time.process_time()
         plant.advance(ticks, laws)
-        taken = min(taken, (time.process_time() - began) / seconds)
+        cost = min(cost, (time.process_time() - start) / seconds)
     part = 0.3
     simulated, targets = plant_run(rig, round(part * rig.sample_rate))
     true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-11)
-    own = max(errors(simulated, true, len(rig.joints)).values())
+    plant_error = max(errors(simulated, true, len(rig.joints)).values())
     for rtol in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
         rough, lsoda = reference_run(rig, targets, method="LSODA", rtol=rtol)
-        other = max(errors(rough, true, len(rig.joints)).values())
-        if other <= own:
+        lsoda_error = max(errors(rough, true, len(rig.joints)).values())
+        if lsoda_error <= plant_error:
             break
     return {
-        "real_time_ratio": 1.0 / taken,
-        "lsoda_ratio": lsoda / part / taken,
-        "lsoda_error": other,
-        "plant_error": own,
+        "real_time_ratio": 1.0 / cost,
+        "lsoda_ratio": lsoda / part / cost,
+        "lsoda_error": lsoda_error,
+        "plant_error": plant_error,
     }

@@ -97,8 +97,8 @@ def physical_text(physical: Physical) -> str:
         rows.append(cells)
     level = physical.levels[physical.returned]
     rejected = physical.levels[physical.returned + 1 :]
-    why = f"; '{rejected[0].name}' is rejected by the data" if rejected else ""
-    return f"{table(header, rows)}\nresult: '{level.name}'{why}"
+    rejection = f"; '{rejected[0].name}' is rejected by the data" if rejected else ""
+    return f"{table(header, rows)}\nresult: '{level.name}'{rejection}"
 
 
 def validation_text(results: Sequence[RecordValidation]) -> str:

@@ -78,9 +78,9 @@ def _effect(effect: StoredEffect, width: int) -> list[Row]:
 
 def _refused(effect: StoredEffect, width: int) -> list[Row]:
     failed = next((gate for gate in effect.gates if not gate.ok), None)
-    why = f": {failed.name}, {failed.detail}" if failed is not None else ""
+    cause = f": {failed.name}, {failed.detail}" if failed is not None else ""
     name = effect.name.replace("_", " ")
-    return wrapped(f"   fitted best, but not named: {name} at {effect.location}{why}", width, DIM)
+    return wrapped(f"   fitted best, but not named: {name} at {effect.location}{cause}", width, DIM)
 
 
 def estimate_text(estimate: StoredEstimate) -> str:

@@ -109,7 +109,7 @@ def arrival_figures(runtime: Path, say: Callable[[str], None], seconds: float) -
             drawn: list[list[tuple[float, str]]] = []  # drawn text of each screen
             for name, after in (("open", "killed"), ("restarted", "closed again")):
                 with Screen(runtime) as screen:
-                    if not run.said("watched", ATTACH):
+                    if not run.has_sent("watched", ATTACH):
                         raise WorkError("bench --only screen: the screen did not attach")
                     screen.press(PAGE)
                     measure(name, screen)
@@ -143,8 +143,8 @@ def _lateness_figures(times: RunTimes, phases: list[Phase]) -> list[Figure]:
 
 def _age_figures(times: RunTimes, drawn: list[list[tuple[float, str]]]) -> list[Figure]:
     rate = load_rig(RIG).sample_rate
-    seen_ages = [ages_on_screen(picture, times.origin, rate) for picture in drawn]
-    ages, stays = (np.concatenate(parts) for parts in zip(*seen_ages, strict=True))
+    of_screens = [ages_on_screen(picture, times.origin, rate) for picture in drawn]
+    ages, stays = (np.concatenate(parts) for parts in zip(*of_screens, strict=True))
     if not len(ages):
         raise WorkError("bench --only screen: no tick was drawn on the page of diagnostics")
     quantile = {share: 1e3 * age_quantile(ages, stays, share) for share in (0.5, 0.99, 1.0)}

@@ -39,10 +39,10 @@ from rig.runs.rigs import load_rig
 Array = NDArray[np.float64]
 
 RIG: Final = "digger-3dof"  # three joints: 17 values a sample
-SQUARE: Final = 0.05  # [V] of a square wave that is never zero
+SQUARE: Final = 0.05  # amplitude of the square wave [V], never zero
 HALF_PERIOD: Final = 0.02  # half period of the square wave [s]
-AFTER: Final = 0.1  # recorded with the outputs at zero [s]
-ENDS: Final = 20.0  # time in which a run's process ends on request [s]
+ZERO_TAIL: Final = 0.1  # recorded at the end with the outputs at zero [s]
+END_TIMEOUT: Final = 20.0  # of a run's process, from the request to its end [s]
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,9 @@ class StampedDriver:
         block = self._driver.read_block()
         self.arrivals.append(time.monotonic())
         self.ends.append((block.tick + len(block.data)) / self._rate)
-        moved = np.flatnonzero((block.data[:, self._inputs :] != 0.0).any(axis=1))
-        if len(moved):
-            self.last_output = block.tick + int(moved[-1])
+        nonzero = np.flatnonzero((block.data[:, self._inputs :] != 0.0).any(axis=1))
+        if len(nonzero):
+            self.last_output = block.tick + int(nonzero[-1])
         return block
 
     def zero_outputs(self) -> None:
@@ -107,14 +107,14 @@ class StampedDriver:
 
     def times(self, lost: int, reason: str, *, held: bool) -> RunTimes:
         """Return the recorded times."""
-        known = self.last_output >= 0
-        zeroed = (self.last_output + 1) / self._rate if known else float("nan")
+        has_moved = self.last_output >= 0
+        zeroed = (self.last_output + 1) / self._rate if has_moved else float("nan")
         ends, arrivals = np.array(self.ends), np.array(self.arrivals)
         return RunTimes(ends, arrivals, lost, zeroed, tuple(self.zeroings), reason, held)
 
 
 def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
-    """Play one run, in its process, until it is stopped or `pipe` receives anything.
+    """Play one run in this process until it is stopped or `pipe` receives anything.
 
     `driven` puts a square wave on the first joint. Sends "watched" once a screen is attached,
     "held" once it is in command, and the RunTimes at the end.
@@ -128,21 +128,21 @@ def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
     reason, lost, held = "", 0, False
     try:
         with Bench(rig, cast("Driver", driver), recorder, publisher, state=state) as bench:
-            bench.recorded_after = AFTER
+            bench.recorded_after = ZERO_TAIL
             bench.guard([FREE] * len(rig.joints))
             if driven:
                 half = np.ones(round(HALF_PERIOD * rig.sample_rate))
                 bench.upload(0, SQUARE * np.concatenate((half, -half)))
                 laws = [OutputLaw(gain=1.0, limit=2 * SQUARE), *[OFF] * (len(rig.joints) - 1)]
                 bench.apply(laws, restart=True)
-            said = ""
+            reported = ""
             while not pipe.poll():
                 bench.exchange()
                 lost = bench.lost_samples
                 word = "held" if publisher.holder else "watched" if publisher.watched else ""
                 held = bool(publisher.holder)
-                if word and word != said:
-                    said = word
+                if word and word != reported:
+                    reported = word
                     pipe.send(word)
     except Exception as error:
         reason = str(error) or repr(error)
@@ -150,23 +150,23 @@ def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
 
 
 class PlayedRun:
-    """A run in a separate process, and its messages."""
+    """A run in a separate process and the messages it has sent."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
         self._words: list[str] = []
         self.times: RunTimes | None = None
 
-    def said(self, word: str, within: float) -> bool:
-        """Return whether the run has sent a word; waits for it at most `within` [s]."""
-        self._hear(within, lambda: word in self._words)
+    def has_sent(self, word: str, timeout: float) -> bool:
+        """Return whether the run has sent a word; waits `timeout` [s] for it, or for the end."""
+        self._receive(timeout, lambda: word in self._words)
         return word in self._words
 
-    def ended(self, within: float = ENDS) -> RunTimes:
+    def ended(self) -> RunTimes:
         """Return the times of a run that ends by itself; raises WorkError if it does not."""
-        self._hear(within, lambda: self.times is not None)
+        self._receive(END_TIMEOUT, lambda: self.times is not None)
         if self.times is None:
-            raise WorkError(f"bench --only screen: a run did not end within {within:g} s")
+            raise WorkError(f"bench --only screen: a run did not end within {END_TIMEOUT:g} s")
         return self.times
 
     def end(self) -> RunTimes:
@@ -175,19 +175,19 @@ class PlayedRun:
             self._pipe.send("end")
         return self.ended()
 
-    def _hear(self, within: float, enough: Callable[[], bool]) -> None:
-        until = time.monotonic() + within
-        while not enough() and self.times is None:
+    def _receive(self, timeout: float, complete: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + timeout
+        while not complete() and self.times is None:
             try:
-                if not self._pipe.poll(max(until - time.monotonic(), 0.0)):
+                if not self._pipe.poll(max(deadline - time.monotonic(), 0.0)):
                     return
-                heard = self._pipe.recv()
+                message = self._pipe.recv()
             except EOFError as error:
                 raise WorkError("bench --only screen: a run's process was lost") from error
-            if isinstance(heard, RunTimes):
-                self.times = heard
+            if isinstance(message, RunTimes):
+                self.times = message
             else:
-                self._words.append(heard)
+                self._words.append(message)
 
 
 @contextmanager
@@ -195,17 +195,17 @@ def played(place: RunPlace, *, driven: bool) -> Iterator[PlayedRun]:
     """Play a run in a separate process, and end the process afterwards."""
     context = get_context("forkserver")  # starts a process with all imports in 20 ms
     context.set_forkserver_preload([__name__])
-    ours, its = context.Pipe()
-    process = context.Process(target=play, args=(place, its), kwargs={"driven": driven})
+    pipe, run_pipe = context.Pipe()
+    process = context.Process(target=play, args=(place, run_pipe), kwargs={"driven": driven})
     process.start()
-    its.close()
+    run_pipe.close()
     try:
-        yield PlayedRun(ours)
+        yield PlayedRun(pipe)
     finally:
         with suppress(OSError):
-            ours.send("end")
-        process.join(ENDS)
+            pipe.send("end")
+        process.join(END_TIMEOUT)
         if process.is_alive():
             process.kill()
             process.join()
-        ours.close()
+        pipe.close()

@@ -54,14 +54,14 @@ def one_stop(screen: Screen, place: RunPlace, wait: float) -> tuple[float, float
     are infinite if the key did not stop the run. Raises RunFailed if the run ends before the key.
     """
     with played(place, driven=True) as run:
-        if not run.said("watched", ATTACH) and run.times is None:
+        if not run.has_sent("watched", ATTACH) and run.times is None:
             raise WorkError("bench --only screen: the screen did not attach to the run")
         time.sleep(SOON)
-        until = time.monotonic() + ATTACH
+        deadline = time.monotonic() + ATTACH
         screen.press("t")
-        while not run.said("held", AGAIN) and run.times is None and time.monotonic() < until:
+        while not run.has_sent("held", AGAIN) and run.times is None and time.monotonic() < deadline:
             screen.press("t")
-        run.said("nothing", wait)
+        run.has_sent("nothing", wait)  # returns early only at the run's end
         if run.times is not None:
             raise RunFailed(run.times.reason)
         pressed = screen.press(" ")
@@ -87,7 +87,7 @@ def many_stops(
             with simulated_bench(RIG, seed=SEED, real_time=True) as endpoint, suppress(RunFailed):
                 while len(delays) < count:
                     out = runtime / f"stop-{failed}-{len(delays)}"
-                    failed += 1  # until it has not
+                    failed += 1  # taken back below if the key stopped it
                     wait = float(rng.uniform(SOON, LATE))
                     delays.append(one_stop(screen, RunPlace(endpoint, runtime, out), wait))
                     failed -= 1

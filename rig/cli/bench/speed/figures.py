@@ -25,15 +25,15 @@ BLOCK, TICKS = 10, 5000
 def ratio_figures(
     group: str,
     name: str,
-    own: ProcessorTime,
+    measured: ProcessorTime,
     anchor: tuple[str, ProcessorTime] | None,
     limit: float | None,
 ) -> list[Figure]:
     """Return a time, its reference and their ratio; `limit` bounds the ratio, else the time."""
     bound = None if anchor else limit
     figures = [
-        Figure(group, name, 1e3 * own.least, "ms", bound),
-        Figure(group, f"{name}, median", 1e3 * own.median, "ms"),
+        Figure(group, name, 1e3 * measured.least, "ms", bound),
+        Figure(group, f"{name}, median", 1e3 * measured.median, "ms"),
     ]
     if anchor is None:
         return figures
@@ -42,17 +42,17 @@ def ratio_figures(
         *figures,
         Figure(group, other, 1e3 * reference.least, "ms"),
         Figure(group, f"{other}, median", 1e3 * reference.median, "ms"),
-        Figure(group, f"{name} over {other}", own.least / reference.least, "x as long", limit),
+        Figure(group, f"{name} over {other}", measured.least / reference.least, "x as long", limit),
     ]
 
 
 def free_run_figures(rig: Rig) -> list[Figure]:
     """Measure a free run of 10 s and other solvers of the same equations."""
     group, times = "analysis", free_run_times(rig)
-    own, hand = times["own"], times["hand"]
+    bramah, hand = times["bramah"], times["hand"]
     figures = [
         *ratio_figures(
-            group, "free run of 10 s, both joints", own, ("the same by hand", hand), 1.4
+            group, "free run of 10 s, both joints", bramah, ("the same by hand", hand), 1.4
         ),
         Figure(group, "free run", times["times_real_time"], "x real time", 500, True),
         Figure(group, "difference of the two", times["difference_to_hand"], "rad", 1e-9),
@@ -68,7 +68,7 @@ def free_run_figures(rig: Rig) -> list[Figure]:
                 Figure(
                     group,
                     f"{name} over free run",
-                    other.least / own.least,
+                    other.least / bramah.least,
                     "x as long",
                     limit,
                     True,

@@ -35,7 +35,7 @@ TOLERANCES: Final = tuple(10.0 ** (-exponent / 4.0) for exponent in range(16, 41
 def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     """Return the processor times of a free run of 10 s with both joints moving, by four solvers.
 
-    `own`: this program. `hand`: the same equations and steps written by hand (`hand_fused`).
+    `simulated`: this program. `hand`: the same equations and steps written by hand (`hand_fused`).
     `odeint`: scipy's, with the same compiled right-hand side. `cvodes`: with generated C code
     (extra `bench`). The last two run at the loosest tolerance at which no state is less accurate
     (largest error over its range, against LSODA at rtol 1e-12). All return states, piston
@@ -68,8 +68,8 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     def error(states: Array) -> float:
         return float((np.abs(states - true).max(axis=0) / size).max())
 
-    own = np.hstack((simulation.q, simulation.qd, simulation.p_cap, simulation.p_rod))
-    exact = error(own)
+    simulated = np.hstack((simulation.q, simulation.qd, simulation.p_cap, simulation.p_rod))
+    exact = error(simulated)
     rtol = next(r for r in TOLERANCES if error(odeint(r)) <= exact)
     errors = {"odeint_error": error(odeint(rtol))}
     links = [joint.linkage for joint in rig.joints]
@@ -80,7 +80,7 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
             _ = link.jacobian(states[:, i]) * states[:, 2 + i]
 
     works: dict[str, Callable[[], object]] = {
-        "own": lambda: simulate(ready, drive, start),
+        "bramah": lambda: simulate(ready, drive, start),
         "hand": by_hand,
         "odeint": lambda: pistons(odeint(rtol)),
     }
@@ -95,7 +95,7 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
         times = processor_times(works, repeats)
     return {
         **times,
-        "times_real_time": float(t[-1] / times["own"].least),
+        "times_real_time": float(t[-1] / times["bramah"].least),
         "error": exact,
         **errors,
         "difference_to_hand": float(np.abs(out[:, :2] - simulation.q).max()),

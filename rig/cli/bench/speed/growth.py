@@ -88,7 +88,7 @@ def four_joints(rig: Rig) -> Rig:
     R_ij and m L_i to W_i, and has R_i4 = m c L_i, R_44 = m c^2 + I, W_4 = m c; L_i are the lengths
     of the preceding links.
     """
-    mass, centre, own = 1.0, 0.15, 0.03
+    mass, centre, inertia = 1.0, 0.15, 0.03
     lengths = (0.8, 0.45, 0.4)
     nominal = dict(rig.nominal)
     for i, reach in enumerate(lengths, start=1):
@@ -96,7 +96,7 @@ def four_joints(rig: Rig) -> Rig:
             nominal[f"R{i}{j}"] += mass * reach * lengths[j - 1]
         nominal[f"R{i}4"] = mass * centre * reach
         nominal[f"W{i}"] += mass * reach
-    nominal |= {"R44": mass * centre**2 + own, "W4": mass * centre, "Fv4": nominal["Fv3"]}
+    nominal |= {"R44": mass * centre**2 + inertia, "W4": mass * centre, "Fv4": nominal["Fv3"]}
     for edge in ("pp", "pm", "mp", "mm"):
         nominal[f"C_{edge}_4"] = nominal[f"C_{edge}_3"]
     joints = (*rig.joints, rig.joints[-1])

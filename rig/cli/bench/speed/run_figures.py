@@ -71,15 +71,15 @@ def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
     rig = load_rig(RIG)
     pairs = []
     for number in range(ROUNDS):
-        own, conversation = _protocol_run(rig, folder / f"run-{number}")
-        pairs.append((own, _repeated(rig, conversation)))
+        bramah, conversation = _protocol_run(rig, folder / f"run-{number}")
+        pairs.append((bramah, _repeated(rig, conversation)))
     figures = _figures("virtual time", pairs, 1.3)
     say(f"run: streaming in real time for {ROUNDS} times {seconds / ROUNDS:g} s")
     count = max(10, round(seconds / ROUNDS * rig.sample_rate / 10))
     pairs = []
     for number in range(ROUNDS):
-        own = _streamed(rig, folder / f"stream-{number}", count)
-        pairs.append((own, _bare(rig, count)))
+        bramah = _streamed(rig, folder / f"stream-{number}", count)
+        pairs.append((bramah, _bare(rig, count)))
     return [*figures, *_figures("real time", pairs, 1.6), *journal_figures(folder, rig)]
 
 
@@ -111,22 +111,22 @@ def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[
     time.
     """
     figures = []
-    own_costs, bare_costs = zip(*pairs, strict=True)
+    costs_of_both = tuple(zip(*pairs, strict=True))
     of: tuple[tuple[str, bool, Callable[[_Cost], float]], ...] = (
         ("processor", kind == "real time", lambda cost: cost.processor),
         ("wall", kind == "virtual time", lambda cost: cost.wall),
     )
-    for what, wished, time_of in of:
-        own, bare = ([1e3 * time_of(cost) for cost in costs] for costs in (own_costs, bare_costs))
+    for what, bounded, time_of in of:
+        bramah, bare = ([1e3 * time_of(cost) for cost in costs] for costs in costs_of_both)
         name = f"{kind}, a block, {what} time"
         figures += [
-            Figure(GROUP, name, min(own), "ms"),
-            Figure(GROUP, f"{name}, median", float(np.median(own)), "ms"),
+            Figure(GROUP, name, min(bramah), "ms"),
+            Figure(GROUP, f"{name}, median", float(np.median(bramah)), "ms"),
             Figure(GROUP, f"{name}, bare pymodbus", min(bare), "ms"),
             Figure(GROUP, f"{name}, bare pymodbus, median", float(np.median(bare)), "ms"),
             Figure(
-                GROUP, f"{name}, over bare", min(own) / min(bare), "x as long",
-                limit if wished else None,
+                GROUP, f"{name}, over bare", min(bramah) / min(bare), "x as long",
+                limit if bounded else None,
             ),
         ]  # fmt: skip
     return figures
