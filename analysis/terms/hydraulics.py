@@ -126,14 +126,14 @@ def edge_columns(signals: Signals, root: Callable[[Array], Array]) -> Columns:
         pp, pm, mp, mm = gain_names(i + 1)
         u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
         cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
-        opened, closed = np.maximum(u, 0.0), np.minimum(u, 0.0)
+        u_positive, u_negative = np.maximum(u, 0.0), np.minimum(u, 0.0)
         out[equation("flow_cap", i)] = {
-            pp: root(p_s - cap) * opened,
-            pm: root(cap - p_t) * closed,
+            pp: root(p_s - cap) * u_positive,
+            pm: root(cap - p_t) * u_negative,
         }
         out[equation("flow_rod", i)] = {
-            mp: -root(rod - p_t) * opened,
-            mm: -root(p_s - rod) * closed,
+            mp: -root(rod - p_t) * u_positive,
+            mm: -root(p_s - rod) * u_negative,
         }
     return out
 

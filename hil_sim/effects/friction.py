@@ -30,8 +30,8 @@ class _Friction(PlantEffect):
     presliding: Length = Field(default=40e-6, gt=0, description="bristle deflection at slip [m]")
     width: Speed = Field(default=1e-3, gt=0, description="of tanh and root [m/s]")
 
-    def seal(self, t: Tables, force: float) -> None:
-        """Add the contact of a friction of `force` [N]; one joint's frictions share one form."""
+    def add_contact(self, t: Tables, force: float) -> None:
+        """Add `force` [N] to the joint's sliding contact; its frictions share one form."""
         row = t.joints[self.joint : (self.joint or 0) + 1]
         row["friction_scale"] += force
         if self.form in ("tanh", "root"):
@@ -60,7 +60,7 @@ class CoulombFriction(_Friction):
         t.joints["friction_plus"][self.joint] += self.force
         t.joints["friction_minus"][self.joint] += self.force
         t.joints["friction_taper"][self.joint] += self.taper
-        self.seal(t, self.force)
+        self.add_contact(t, self.force)
 
 
 class StribeckFriction(_Friction):
@@ -76,7 +76,7 @@ class StribeckFriction(_Friction):
     def apply(self, t: Tables) -> None:
         t.joints["stribeck"][self.joint] += self.force
         t.joints["stribeck_speed"][self.joint] = self.speed
-        self.seal(t, self.force)
+        self.add_contact(t, self.force)
 
 
 class AsymmetricFriction(_Friction):
@@ -98,7 +98,7 @@ class AsymmetricFriction(_Friction):
     def apply(self, t: Tables) -> None:
         t.joints["friction_plus"][self.joint] += self.extending
         t.joints["friction_minus"][self.joint] += self.retracting
-        self.seal(t, max(self.extending, self.retracting))
+        self.add_contact(t, max(self.extending, self.retracting))
 
 
 class PressureDependentFriction(_Friction):
@@ -112,7 +112,7 @@ class PressureDependentFriction(_Friction):
 
     def apply(self, t: Tables) -> None:
         t.joints["friction_pressure"][self.joint] += self.coefficient
-        self.seal(t, self.coefficient * t.rig.supply.pressure)
+        self.add_contact(t, self.coefficient * t.rig.supply.pressure)
 
 
 class AsymmetricViscousFriction(PlantEffect):

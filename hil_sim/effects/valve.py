@@ -11,7 +11,7 @@ from rig.model.quantity import Pressure, Time, Voltage
 
 
 class ValveDeadband(PlantEffect):
-    """Overlapped edges: lap `width` for u > 0, `astern` (default: `width`) for u < 0."""
+    """Overlapped spool: dead band `width` for u > 0, `astern` (default: `width`) for u < 0 [V]."""
 
     drawn_at = "joint"
     sizes: ClassVar = {"width": (4e-3, 20e-3)}
@@ -34,7 +34,7 @@ class ValveDeadband(PlantEffect):
 
 
 class UnderlapLeakage(PlantEffect):
-    """Underlapped edges: near the null all are open, also from pump to tank."""
+    """Underlapped spool: within `width` [V] of null all edges are open, also pump to tank."""
 
     drawn_at = "joint"
     sizes: ClassVar = {"width": (4e-3, 15e-3)}

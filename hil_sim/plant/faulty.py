@@ -21,7 +21,7 @@ STREAM: Final = 3  # of a bench's seed; 0 and 1 are the plant's, 2 is that of dr
 
 @dataclass
 class _TimedFault:
-    """A fault with its first and last tick, and how to restore its changes while it acts."""
+    """A fault that acts from tick `first` to before `end`; `restore` undoes its changes."""
 
     fault: Fault
     first: int

@@ -17,7 +17,7 @@ from typing import IO, Any, Final
 
 from rig.queue.processes import BRAMAH, reason_in, start
 
-POLL: Final = 0.1  # [s]
+POLL: Final = 0.1  # time between two looks at a verb's output [s]
 TAIL: Final = 400  # lines of a verb's output that are shown
 MEANINGS: Final = {
     0: "done",

@@ -99,13 +99,13 @@ def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
     stratum, score = pieces.grouped(pieces.part, pieces.score)
     _, information = pieces.grouped(pieces.part, pieces.information)
     A = scaled_inverse(inverse)
-    left_out = np.array(
+    changes = np.array(
         [_without(A, inverse, part, g) for part, g in zip(information, score, strict=True)]
     )
     k = len(A)
     total, squares = np.zeros((k, k)), np.zeros(k)
     for s in np.unique(stratum):
-        u = left_out[stratum == s]
+        u = changes[stratum == s]
         n = len(u)
         part = u.T @ u * ((n - 1) / n if n > 1 else 1.0)
         total += part

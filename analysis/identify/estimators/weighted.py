@@ -48,7 +48,7 @@ def _whitened(blocks: Sequence[RepeatBlock], beta: Array) -> list[RepeatBlock]:
     index_of = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
 
     def with_other_chamber(i: int) -> list[int]:
-        """Return a block's place, and that of the other chamber where that has the same rows."""
+        """Return a block's index, and that of the other chamber where that has the same rows."""
         kind, joint = blocks[i].equation.rsplit("_", 1)
         other = {"flow_cap": "flow_rod", "flow_rod": "flow_cap"}.get(kind)
         k = index_of.get((blocks[i].run, blocks[i].record, f"{other}_{joint}"))

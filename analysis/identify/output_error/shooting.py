@@ -95,8 +95,8 @@ def shoot(
     steps. None where a simulation failed.
     """
     out = np.zeros((len(starts), points, starts.shape[1]))
-    good = _shoot(
+    succeeded = _shoot(
         ready.address, ready.context, pars, ready.geometry, ready.work(), starts, inputs, rate,
         locked, first, every, parts, out,
     )  # fmt: skip
-    return out if good else None
+    return out if succeeded else None

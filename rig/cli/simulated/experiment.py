@@ -39,12 +39,12 @@ HIDDEN = "worn-seal"  # effects of the demo's bench, unknown to the analysis
 class Experiment:
     """Runs of one simulated bench and their analysis; `truth` are the bench's true parameters.
 
-    `judged` are the runs for validation, `unseen` further hold-out runs for the trace.
+    `hold_out_runs` are further ones for the trace, beside `validation_runs`.
     """
 
     runs: tuple[Run, ...]
-    judged: tuple[Run, ...]
-    unseen: tuple[Run, ...]
+    validation_runs: tuple[Run, ...]
+    hold_out_runs: tuple[Run, ...]
     identification: Identification
     validation: Sequence[RecordValidation]
     truth: Mapping[str, float]
@@ -64,21 +64,20 @@ def experiment(
     say(f"starting the simulated bench {RIG}, seed {seed}")
     with simulated_bench(RIG, seed=seed, truth=truth, scenario=scenario) as endpoint:
         say(f"the simulated bench listens on {endpoint}")
-        first = run_protocol(
-            ProtocolJob(PROTOCOL, RIG, folder / "identify", endpoint, overrides), say
-        )
-        second = run_protocol(ProtocolJob(VALIDATE, RIG, folder / "validate", endpoint), say)
-        unseen: tuple[Path, ...] = ()
+        jobs = [
+            ProtocolJob(PROTOCOL, RIG, folder / "identify", endpoint, overrides),
+            ProtocolJob(VALIDATE, RIG, folder / "validate", endpoint),
+        ]
         if scenario is not None:
-            third = ProtocolJob(PROTOCOL, RIG, folder / "other-wave", endpoint, HELD_OUT)
-            unseen = (run_protocol(third, say),)
-    runs, judged = (load_run(first),), (load_run(second),)
+            jobs.append(ProtocolJob(PROTOCOL, RIG, folder / "other-wave", endpoint, HELD_OUT))
+        folders = [run_protocol(job, say) for job in jobs]
+    run, validation_run, *others = map(load_run, folders)
     say("identifying the parameters from the first run")
-    identification = identify(runs)
+    identification = identify([run])
     say("validating the model on the second run, which is held out")
-    results = validate(identification.model, judged)
+    results = validate(identification.model, [validation_run])
     return Experiment(
-        runs, judged, tuple(map(load_run, unseen)), identification, results, read_truth(truth)
+        (run,), (validation_run,), tuple(others), identification, results, read_truth(truth)
     )
 
 
@@ -90,7 +89,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     write_json(folder / "identify.json", identification_json(done.identification))
     write_json(folder / "validate.json", validation_json(done.validation))
     progress("tracing missing effects, judged on held-out runs")
-    held_out = (*done.unseen, *done.judged)
+    held_out = (*done.hold_out_runs, *done.validation_runs)
     traced = trace(done.runs, held_out, seed=seed, progress=Countdown("tracing"))
     write_json(folder / "trace.json", trace_json(traced))
     save_model(traced.model_after, folder / "model.json")
@@ -120,7 +119,7 @@ def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> N
         runs=done.runs,
         identification=done.identification,
         validation=done.validation,
-        validation_runs=done.judged,
+        validation_runs=done.validation_runs,
         truth=done.truth,
         title="A simulated bench, identified and validated",
         provenance=provenance(command, {"simulated bench": seed}),

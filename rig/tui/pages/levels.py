@@ -77,9 +77,9 @@ def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
     ]
     bars = bench_bars(view, width)
     room = max(height - len(head) - len(bars), 0)
-    others = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
-    each = (width - len(others) + 1) // len(others)
-    boxes = [(joint_box(view, number, each, room), each) for number in sorted(others)]
+    numbers = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
+    share = (width - len(numbers) + 1) // len(numbers)
+    boxes = [(joint_box(view, number, share, room), share) for number in sorted(numbers)]
     return [*head, *hstack(boxes, room), *bars]
 
 
@@ -94,9 +94,9 @@ def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
     first = min(max(at - height // 2, 0), max(len(names) - height, 0))
     listed = []
     for k, name in list(enumerate(names))[first : first + height]:
-        near = NEARNESS[band_of(snapshot.channels[name])] or " "
+        mark_of_band = NEARNESS[band_of(snapshot.channels[name])] or " "
         mark = "▸" if k == at else " "
-        listed.append(row((f"{mark}{near} {name}", STRONG if k == at else "")))
+        listed.append(row((f"{mark}{mark_of_band} {name}", STRONG if k == at else "")))
     name, room = names[at], width - LIST - 1
     channel = snapshot.channels[name]
     form = shown(channel.unit)
@@ -154,8 +154,8 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
     ]
     listed = columns(names)
     if width >= WIDE:
-        left = max(width // 2, 60)
-        return hstack([(table, left), (listed, width - left - 1)], height)
+        table_width = max(width // 2, 60)
+        return hstack([(table, table_width), (listed, width - table_width - 1)], height)
     return block([*table, row(), *listed], width, height)
 
 

@@ -20,9 +20,9 @@ from rig.tui.web.page_driver import BEAT, GRACE, NAME
 
 log = logging.getLogger(__name__)
 
-MOST_CELLS: Final = 1000  # columns or rows of a page
+MAX_CELLS: Final = 1000  # columns or rows of a page
 CLOSED: Final = "The screen is closed. A run that it showed goes on."
-_LONGEST = 4096  # of a beat's text or of an error, in characters
+_MAX_LENGTH = 4096  # of a beat's text or of an error, in characters
 
 
 class AttachedScreen(AppService):
@@ -97,14 +97,14 @@ class AttachedScreen(AppService):
         self._errors.close()
 
     async def set_terminal_size(self, width: int, height: int) -> None:
-        """Resize the screen [characters], within reason."""
-        if not all(isinstance(size, int) and 0 < size <= MOST_CELLS for size in (width, height)):
-            raise ValueError(f"size {width} × {height}, expected 1 to {MOST_CELLS} characters")
+        """Resize the screen [characters]; raises ValueError beyond MAX_CELLS."""
+        if not all(isinstance(size, int) and 0 < size <= MAX_CELLS for size in (width, height)):
+            raise ValueError(f"size {width} × {height}, expected 1 to {MAX_CELLS} characters")
         await super().set_terminal_size(width, height)
 
     async def beat(self, mark: object) -> None:
         """Send a page's mark through the screen and back."""
-        await self.send_meta({"type": BEAT, "mark": str(mark)[:_LONGEST]})
+        await self.send_meta({"type": BEAT, "mark": str(mark)[:_MAX_LENGTH]})
 
     async def on_meta(self, data: bytes) -> None:
         """Return a beat to the page; other messages are textual-serve's."""
@@ -115,7 +115,7 @@ class AttachedScreen(AppService):
             await super().on_meta(data)
 
     async def _leaving(self) -> None:
-        """Let a screen end that announces its end; the page is informed afterwards."""
+        """Give a screen that announces its end the time GRACE for it, then kill it."""
         asyncio.get_running_loop().call_later(GRACE, self._kill)
 
     def _kill(self) -> None:
@@ -137,4 +137,4 @@ class AttachedScreen(AppService):
         self._errors.seek(0)
         text = self._errors.read().decode(errors="replace")
         reason = reason_in(text) or f"with code {self._process.returncode}"
-        return reason[:_LONGEST]
+        return reason[:_MAX_LENGTH]
