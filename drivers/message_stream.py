@@ -297,10 +297,7 @@ class MessageStreamDriver:
                 self._send_heartbeat(resend=True)
 
     def _check_stream(self, *, overdue: bool, earlier: str = "") -> None:
-        """Raise DeviceError or DeviceLost if no block will come, naming the cause.
-
-        `earlier` is the line's complaint from before the wait.
-        """
+        """Raise DeviceError or DeviceLost if no block will come; `earlier`: the old complaint."""
         where = self._link.where
         try:
             status = self._status()

@@ -85,10 +85,10 @@ def with_identified_bulk_modulus(
     """
     groups = (tuple(runs), *map(tuple, more))
     rig = runs[0].rig
-    pressure_terms = tuple(used for used in terms if not isinstance(used.term, PortEffect))
-    if not any(c.parameter == BULK for used in pressure_terms for c in used.term.parameters(rig)):
+    reduced_terms = tuple(used for used in terms if not isinstance(used.term, PortEffect))
+    if not any(c.parameter == BULK for used in reduced_terms for c in used.term.parameters(rig)):
         return groups
-    b = coupled(runs, pressure_terms, estimator="ls").estimates.get(BULK)
+    b = coupled(runs, reduced_terms, estimator="ls").estimates.get(BULK)
     if b is None or not b.identified or b.value <= 0.0:
         return groups
     value = b.value

@@ -114,10 +114,7 @@ def shifts_of_reductions(
     reductions: Sequence[RecordReduction],
     moved: Sequence[Sequence[RecordReduction]],
 ) -> GeometryShifts | None:
-    """Return the shifts from reductions of all records; `moved` has those of each changed number.
-
-    None for a rig without tolerances.
-    """
+    """Return the shifts, None without tolerances; `moved`: reductions of each changed number."""
     if not rig.uncertain_numbers:
         return None
     return _shifts(rig, terms, _parts_of(reductions), list(map(_parts_of, moved)))

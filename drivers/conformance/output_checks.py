@@ -261,7 +261,7 @@ def off_law_is_zero(trial: Trial) -> None:
 
 @check(PROBE)
 def probe_agrees_with_samples(trial: Trial) -> None:
-    """What the samples show as commands is what the device puts out."""
+    """The device puts out the commands that its samples show."""
     driver, laws = trial.ready(), trial.driving()
     driver.apply(laws)
     driver.read(3)

@@ -167,7 +167,7 @@ def _fall_silent(trial: Trial) -> None:
 
 @check()
 def zero_after_connect(trial: Trial) -> None:
-    """`connect` leaves the outputs at zero, whatever the session before left behind."""
+    """`connect` leaves the outputs at zero, also after a session that ended with outputs on."""
     driver = _driven(trial)
     if trial.bench.cut is not None:
         trial.bench.cut()

@@ -28,7 +28,7 @@ def every_frame(frame: bytes) -> bool:
 
 
 def no_error(frame: bytes) -> bytes:
-    """Return what replaces a frame that a controller has dropped: nothing."""
+    """Return no bytes in place of a frame that a controller has dropped."""
     del frame
     return b""
 
@@ -71,7 +71,7 @@ def rtu_answer(data: bytes) -> int:
 
 
 def between_zeros(data: bytes) -> int:
-    """Return the length of a frame of the serial protocol: what ends with the next zero."""
+    """Return the length of a frame of the serial protocol, which ends with a zero byte."""
     first = len(data) - len(data.lstrip(b"\0"))
     return data.find(b"\0", first) + 1 if first < len(data) else 0
 

@@ -58,7 +58,7 @@ class BrowserState:
 
 
 def read_disk(previous: BrowserState) -> BrowserState:
-    """Read everything again; never raises: `trouble` states what cannot be read."""
+    """Read runs, queue and protocols; never raises: `trouble` states what cannot be read."""
     troubles: list[str] = []
     runs: tuple[RunSummary, ...] = ()
     queue: tuple[Item, ...] = ()

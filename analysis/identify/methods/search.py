@@ -70,8 +70,8 @@ class SearchOptions:
             )
         if not self.factor > 1.0 or self.windows < 1 or not self.seconds > 0.0:
             raise InputError(
-                f"a search over a factor of {self.factor:g} in {self.windows} windows of "
-                f"{self.seconds:g} s: expected a factor above 1, a window or more, and above 0 s"
+                f"a search has factor {self.factor:g}, windows {self.windows}, seconds "
+                f"{self.seconds:g}: expected above 1, at least 1, and above 0"
             )
 
 

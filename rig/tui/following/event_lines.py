@@ -112,11 +112,11 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
 
 
 def with_earlier(lines: Sequence[EventLine], earlier: Sequence[EventLine]) -> tuple[EventLine, ...]:
-    """Insert a run's event log where the screen attached to it; what both have stays once."""
+    """Insert a run's event log where the screen attached to it, without repeating its lines."""
     attached = [k for k, line in enumerate(lines) if line.text.startswith(_ATTACHED)]
     attached_at = attached[-1] if attached else 0
-    known = {line.text for line in earlier}
-    further = (line for line in lines[attached_at:] if line.text not in known)
+    earlier_texts = {line.text for line in earlier}
+    further = (line for line in lines[attached_at:] if line.text not in earlier_texts)
     return (*lines[:attached_at], *earlier, *further)
 
 
