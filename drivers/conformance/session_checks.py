@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from drivers.base import DeviceError
 from drivers.conformance.catalogue import CUT, IDENTITY, LATCH, LOSS, PROBE, SILENCE, check
 from drivers.conformance.subject import HEALTHY
-from drivers.conformance.trial import Trial, lost, patiently, quietly
+from drivers.conformance.trial import Trial, loss_raised_by, patiently, quietly
 from drivers.conformance.watched import NotConforming, Watched, follows, require
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -232,8 +232,8 @@ def cut_link_is_lost(trial: Trial) -> None:
     driver = trial.ready()
     driver.read(2)
     _cut(trial)
-    message = lost(driver.read_block)
-    require(message, "three calls of read_block after the end of the link raised no DeviceLost")
+    loss = loss_raised_by(driver.read_block)
+    require(loss, "three calls of read_block after the end of the link raised no DeviceLost")
 
 
 @check(LOSS, moves=False)
@@ -244,8 +244,8 @@ def silent_device_is_lost(trial: Trial) -> None:
         driver.read(2)
         trial.spoil(fault)
         trial.refused(f"read_block with the wire at fault ({fault})", driver.read_block)
-        message = lost(driver.read_block)
-        require(message, f"read_block with the wire at fault ({fault}) raised no DeviceLost")
+        loss = loss_raised_by(driver.read_block)
+        require(loss, f"read_block with the wire at fault ({fault}) raised no DeviceLost")
         trial.spoil(HEALTHY)
         driver.close()
 

@@ -221,9 +221,9 @@ def patiently(call: Callable[[], object]) -> None:
             return
 
 
-def lost(call: Callable[[], object], tries: int = 3) -> DeviceLost | None:
-    """Return the DeviceLost that a call raises within `tries`, None if it raises none."""
-    for _ in range(tries):
+def loss_raised_by(call: Callable[[], object]) -> DeviceLost | None:
+    """Return the DeviceLost that a call raises within three tries, None if it raises none."""
+    for _ in range(3):
         try:
             call()
         except DeviceLost as error:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 STATES: Final = 8
 COMPILER: Final = f"{sys.executable} -m ziglang cc"
-MOST_STEPS: Final = 10_000_000
+MAX_STEPS: Final = 10_000_000
 
 
 def available() -> bool:
@@ -43,11 +43,11 @@ def solver(
     y, w = ca.SX.sym("y", STATES), ca.SX.sym("w", 3)
     rates = ca.Function("rates", [y, w], [ca.vertcat(*_rates(ca, y, w, p))])
     state, t = ca.MX.sym("state", STATES), ca.MX.sym("t")
-    held = ca.interpolant(
+    interpolated = ca.interpolant(
         "inputs", "linear", [grid.tolist()], inputs.ravel().tolist(), {"lookup_mode": ["exact"]}
     )
-    equations = {"x": state, "t": t, "ode": rates(state * scale, held(t)) / scale}
-    options: dict[str, Any] = {"max_num_steps": MOST_STEPS}
+    equations = {"x": state, "t": t, "ode": rates(state * scale, interpolated(t)) / scale}
+    options: dict[str, Any] = {"max_num_steps": MAX_STEPS}
     if folder is not None:
         # The caller removes the folder.
         compiling = {"compiler": COMPILER, "linker": COMPILER, "flags": ["-O3"], "cleanup": False}
@@ -55,10 +55,10 @@ def solver(
         options["jit_options"] = compiling
 
     def at(tolerance: float, start: Array) -> Callable[[], Array]:
-        chosen = {**options, "abstol": tolerance, "reltol": tolerance}
+        with_tolerance = {**options, "abstol": tolerance, "reltol": tolerance}
         # CasADi writes into the current folder.
         with nullcontext() if folder is None else chdir(folder):
-            run = ca.integrator("run", "cvodes", equations, 0.0, grid, chosen)
+            run = ca.integrator("run", "cvodes", equations, 0.0, grid, with_tolerance)
         return lambda: np.asarray(run(x0=start / scale)["xf"]).T * scale
 
     return at
@@ -71,18 +71,18 @@ def _rates(ca: Any, y: Any, w: Any, p: Array) -> Sequence[Any]:
     """
     q, v, cap, rod = ([y[k], y[k + 1]] for k in (0, 2, 4, 6))
     spool, supply = [w[0], w[1]], w[2]
-    place, slope = [], []
+    piston, slope = [], []
     for i in range(2):
         squares, product, mid, offset = p[16 + 9 * i : 20 + 9 * i]
         length = ca.sqrt(squares - 2.0 * product * ca.cos(q[i] + offset))
-        place.append(length - mid)
+        piston.append(length - mid)
         slope.append(product * ca.sin(q[i] + offset) / length)
     force = [p[20 + 9 * i] * cap[i] - p[21 + 9 * i] * rod[i] for i in range(2)]
     c, s = p[2] * ca.cos(q[1]), p[2] * ca.sin(q[1])
     M11, M12, M22 = p[0] + 2.0 * c, p[1] + c, p[1]
-    pull = p[6] * ca.sin(q[0] + q[1])
-    tau2 = slope[1] * force[1] - p[4] * v[1] - pull - s * v[0] ** 2
-    tau1 = slope[0] * force[0] - p[3] * v[0] - pull - p[5] * ca.sin(q[0])
+    weight_torque = p[6] * ca.sin(q[0] + q[1])
+    tau2 = slope[1] * force[1] - p[4] * v[1] - weight_torque - s * v[0] ** 2
+    tau1 = slope[0] * force[0] - p[3] * v[0] - weight_torque - p[5] * ca.sin(q[0])
     tau1 += s * ((v[0] + v[1]) ** 2 - v[0] ** 2)
     det = M11 * M22 - M12 * M12
     flow_cap, flow_rod = [], []
@@ -92,9 +92,9 @@ def _rates(ca: Any, y: Any, w: Any, p: Array) -> Sequence[Any]:
         into = ca.if_else(u > 0.0, pp * _root(ca, supply - cap[i]) * u, pm * _root(ca, cap[i]) * u)
         out = ca.if_else(u > 0.0, mp * _root(ca, rod[i]) * u, mm * _root(ca, supply - rod[i]) * u)
         speed = slope[i] * v[i]
-        volume = pipe_cap + (half + place[i]) * area_cap
+        volume = pipe_cap + (half + piston[i]) * area_cap
         flow_cap.append((into - area_cap * speed) / (p[7] * volume))
-        volume = pipe_rod + (half - place[i]) * area_rod
+        volume = pipe_rod + (half - piston[i]) * area_rod
         flow_rod.append((area_rod * speed - out) / (p[7] * volume))
     return (
         *v, (M22 * tau1 - M12 * tau2) / det, (M11 * tau2 - M12 * tau1) / det, *flow_cap, *flow_rod,

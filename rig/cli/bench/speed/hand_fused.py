@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def constants(rig: Rig, values: Mapping[str, float]) -> Array:
-    """Return the parameters (13 + 2 x 9,) in the order in which `_rates` reads them."""
+    """Return the parameters (16 + 2 x 9,) in the order in which `_rates` reads them."""
     g = rig.gravity
     names = ("M1", "M2", "R12", "Fv1", "Fv2")
     gains = [values[f"C_{edge}_{i}"] for i in (1, 2) for edge in ("pp", "pm", "mp", "mm")]
@@ -51,9 +51,9 @@ def _linkage(q, squares, product, mid, offset):  # type: ignore[no-untyped-def]
 def _rates(t, y, dy, u, supply, rate, p):  # type: ignore[no-untyped-def]
     """Fill dy/dt of y = (q1, q2, q1', q2', cap1, cap2, rod1, rod2)."""
     q1, q2, v1, v2, cap1, cap2, rod1, rod2 = y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7]
-    place = min(max(t * rate, 0.0), len(supply) - 1.0)
-    low = min(int(place), len(supply) - 2)
-    w = place - low
+    position = min(max(t * rate, 0.0), len(supply) - 1.0)
+    low = min(int(position), len(supply) - 2)
+    w = position - low
     p_s = supply[low] + w * (supply[low + 1] - supply[low])
     u1 = u[low, 0] + w * (u[low + 1, 0] - u[low, 0])
     u2 = u[low, 1] + w * (u[low + 1, 1] - u[low, 1])
@@ -61,12 +61,12 @@ def _rates(t, y, dy, u, supply, rate, p):  # type: ignore[no-untyped-def]
     s2, G2 = _linkage(q2, p[25], p[26], p[27], p[28])
     c, s = p[2] * math.cos(q2), p[2] * math.sin(q2)
     M11, M12, M22 = p[0] + 2.0 * c, p[1] + c, p[1]
-    both = v1 + v2
-    pull = p[6] * math.sin(q1 + q2)
-    tau2 = G2 * (p[29] * cap2 - p[30] * rod2) - p[4] * v2 - pull - s * v1 * v1
+    v12 = v1 + v2
+    weight_torque = p[6] * math.sin(q1 + q2)
+    tau2 = G2 * (p[29] * cap2 - p[30] * rod2) - p[4] * v2 - weight_torque - s * v1 * v1
     tau1 = (
-        G1 * (p[20] * cap1 - p[21] * rod1) - p[3] * v1 - pull - p[5] * math.sin(q1)
-        + s * (both * both - v1 * v1)
+        G1 * (p[20] * cap1 - p[21] * rod1) - p[3] * v1 - weight_torque - p[5] * math.sin(q1)
+        + s * (v12 * v12 - v1 * v1)
     )  # fmt: skip
     det = M11 * M22 - M12 * M12
     a1, a2 = (M22 * tau1 - M12 * tau2) / det, (M11 * tau2 - M12 * tau1) / det
