@@ -70,8 +70,8 @@ class IdentifySettings:
     least_repeats: int = 3
     few_outliers: float = 0.02  # share of a record's rows, in the worst record
     weight_rounds: int = 2  # of weights from residuals; the first solution is close already
-    # A parameter's shift between estimators matters beyond a relative limit (b: the other), or
-    # beyond this share of its 95 % half-width unless below that part of the limit.
+    # A relative shift between estimators matters beyond `shift_limit` (b: its own), or beyond the
+    # share `shift_of_interval` of the 95 % half-width and `shift_least` of the limit.
     shift_limit: float = 0.005
     shift_limit_of_b: float = 0.02
     shift_of_interval: float = 0.5
