@@ -20,7 +20,7 @@ from analysis.effects.base import Array, Shape
 
 CORNER: Final = 1.0  # where a search begins
 # Below, the curve is nearly that of a 0, where a form has no corner; above, it is straight lines.
-CORNER_BOUNDS: Final = (0.5, 10.0)
+CORNER_BOUNDS: Final = (0.1, 10.0)
 
 
 def rounding(name: str, stroke: float) -> Shape:
