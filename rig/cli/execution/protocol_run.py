@@ -8,9 +8,10 @@ import select
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -92,7 +93,7 @@ class _PhaseReport:
             message=message,
         )
 
-    def tracked(self, estimate: str, tracking: Tracking) -> None:
+    def tracked(self, tracking: Tracking, estimate: str) -> None:
         """Publish an estimate, all estimates with their intervals, and the residuals."""
         tracked_values = tracking.parameters.items()
         known = {name: [interval["value"], *interval["ci95"]] for name, interval in tracked_values}
@@ -139,29 +140,6 @@ def _read_answer() -> str | None:
         return None
     line = sys.stdin.readline()
     return line.rstrip("\n") if line else None
-
-
-class TrackedEstimates:
-    """The tracker's estimates, for a protocol's conditions (see `run_inputs.Estimates`)."""
-
-    def __init__(self, tracking: Tracking) -> None:
-        self._tracking = tracking
-
-    def values(self) -> Mapping[str, float]:
-        """Return each finite estimate [SI] and its relative standard deviation, as NAME.rsd."""
-        values: dict[str, float] = {}
-        for name, estimate in self._tracking.parameters.items():
-            value, std = estimate["value"], estimate["std"]
-            if value is None:
-                continue
-            values[name] = float(value)
-            if std is not None and value:
-                values[f"{name}.rsd"] = abs(float(std) / float(value))
-        return {name: value for name, value in values.items() if math.isfinite(value)}
-
-    def complete(self, record: str) -> bool:
-        """Return whether the estimates include a record; True if the tracker has ended."""
-        return not self._tracking.alive or record in self._tracking.recorded
 
 
 def needed_bytes(plan: Plan, rig: Rig) -> float:
@@ -257,10 +235,9 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         bench.describe([PlanLine(part.name, part.title, part.seconds) for part in plan.sequence])
         inputs = RunInputs(machine=run_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
-            tracker = tracking  # for mypy: not None in the closure
-            tracking.subscribe(report.note, lambda text: report.tracked(text, tracker))
+            tracking.subscribe(report.note, partial(report.tracked, tracking))
             bench.observers.add(tracking)
-            inputs = replace(inputs, estimates=TrackedEstimates(tracking))
+            inputs = replace(inputs, estimates=tracking)
         engine.run(plan, rig, bench, report.phase, inputs)
     return job.out
 

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from types import TracebackType
@@ -107,15 +107,6 @@ class Follower:
         return self._tracker.feed({name: part[:, k] for k, name in enumerate(self._names)})
 
 
-@dataclass(frozen=True)
-class TrackingSettings:
-    """Settings of the tracker; `memory`: forgetting time constant [s], infinite for none."""
-
-    rig: Rig
-    memory: float
-    endpoint: str
-
-
 def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
     """Return bulk modulus and flow gains in one line, '?' for values not yet known."""
     parts = []
@@ -133,7 +124,9 @@ def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
 class Tracking:
     """The tracker as the run uses it: an observer of the bench, and a context manager.
 
-    Enter it before the bench and leave it after, so that no run waits with its outputs on.
+    Enter it before the bench and leave it after, so that no run waits with its outputs on. The
+    protocol's conditions read its estimates (`protocols.engine.run_inputs.Estimates`). `memory`:
+    forgetting time constant [s], infinite for none.
     """
 
     def __init__(self, rig: Rig, out: Path, say: Say, memory: float = math.inf) -> None:
@@ -166,9 +159,9 @@ class Tracking:
         self._socket.set(zmq.LINGER, 0)
         # This end connects, so that it queues messages sent before the tracker is ready.
         self._socket.connect(endpoint)
-        settings = TrackingSettings(self._rig, self._memory, endpoint)
-        spawn = get_context("spawn")
-        self._process = spawn.Process(target=track_run, args=(settings,), daemon=True)
+        self._process = get_context("spawn").Process(
+            target=track_run, args=(self._rig, self._memory, endpoint), daemon=True
+        )
         with environment():
             self._process.start()
         return self
@@ -192,15 +185,22 @@ class Tracking:
             self._process.close()
             self._scratch.close()
 
-    @property
-    def alive(self) -> bool:
-        """Whether the tracker's process is running."""
-        return self._process.is_alive()
+    def values(self) -> Mapping[str, float]:
+        """Return each finite estimate [SI] and its relative standard deviation, as NAME.rsd."""
+        values: dict[str, float] = {}
+        for name, estimate in self.parameters.items():
+            value, std = estimate["value"], estimate["std"]
+            if value is None:
+                continue
+            values[name] = float(value)
+            if std is not None and value:
+                values[f"{name}.rsd"] = abs(float(std) / float(value))
+        return {name: value for name, value in values.items() if math.isfinite(value)}
 
-    @property
-    def recorded(self) -> frozenset[str]:
-        """The names of the records in the estimates."""
-        return frozenset(str(entry["record"]) for entry in self._history)
+    def complete(self, record: str) -> bool:
+        """Return whether the estimates include a record; True if the tracker has ended."""
+        included = any(entry["record"] == record for entry in self._history)
+        return included or not self._process.is_alive()
 
     def _finish(self) -> None:
         """Wait for the last estimates and write all estimates into the run folder."""
@@ -295,7 +295,7 @@ class Tracking:
 # In the tracker's process
 
 
-def track_run(settings: TrackingSettings) -> None:
+def track_run(rig: Rig, memory: float, endpoint: str) -> None:
     """Process messages until one ends it, or until the run's process has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run sends a message instead
     os.nice(NICE)  # the acquisition has priority
@@ -303,9 +303,9 @@ def track_run(settings: TrackingSettings) -> None:
     socket = context.socket(zmq.PAIR)
     socket.set(zmq.RCVHWM, QUEUE_LENGTH)
     socket.set(zmq.LINGER, 2000)
-    socket.bind(settings.endpoint)
+    socket.bind(endpoint)
     try:
-        _serve(settings, socket)
+        _serve(rig, Tracker(rig, memory=memory), socket)
     except InputError as error:
         socket.send_string(json.dumps({"kind": "failed", "message": str(error)}))
     finally:
@@ -313,11 +313,8 @@ def track_run(settings: TrackingSettings) -> None:
         context.term()
 
 
-def _serve(settings: TrackingSettings, socket: zmq.Socket[bytes]) -> None:
-    tracker = Tracker(settings.rig, memory=settings.memory)
-    follower = Follower(settings.rig, tracker)
-    width = len(settings.rig.recorded)
-    parent = parent_process()
+def _serve(rig: Rig, tracker: Tracker, socket: zmq.Socket[bytes]) -> None:
+    follower, width, parent = Follower(rig, tracker), len(rig.recorded), parent_process()
     while True:
         if not socket.poll(1000):
             if parent is not None and not parent.is_alive():
