@@ -9,8 +9,8 @@ import pytest
 from analysis.simulation.simulate import compiled, simulate
 from rig.cli.bench.figure import Figure, processor_times
 from rig.cli.bench.figures import text
+from rig.cli.bench.speed.figures import four_joints
 from rig.cli.bench.speed.free_run import both_moving, free_run_times
-from rig.cli.bench.speed.growth import four_joints
 from rig.runs.rigs import load_rig
 
 

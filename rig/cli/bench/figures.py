@@ -24,10 +24,10 @@ from rig.cli.bench.screen.cost import cost_figures
 from rig.cli.bench.screen.stops import stop_figures
 from rig.cli.bench.speed.figures import (
     free_run_figures,
+    growth_figures,
     identify_figures,
     plant_over_kernel,
 )
-from rig.cli.bench.speed.growth import growth_figures
 from rig.cli.bench.speed.run_figures import run_figures
 from rig.cli.bench.stream_figures import stream_figures
 from rig.cli.bench.wire_figures import wire_figures

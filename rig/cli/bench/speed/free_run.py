@@ -21,7 +21,7 @@ from analysis.simulation.twin import holding_state
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.cli.bench.figure import REPEATS, processor_times
-from rig.cli.bench.speed import cvodes, hand_fused
+from rig.cli.bench.speed import reference_solvers
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -35,23 +35,22 @@ TOLERANCES: Final = tuple(10.0 ** (-exponent / 4.0) for exponent in range(16, 41
 def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     """Return the processor times of a free run of 10 s with both joints moving, by four solvers.
 
-    `simulated`: this program. `hand`: the same equations and steps written by hand (`hand_fused`).
-    `odeint`: scipy's, with the same compiled right-hand side. `cvodes`: with generated C code
-    (extra `bench`). The last two run at the loosest tolerance at which no state is less accurate
-    (largest error over its range, against LSODA at rtol 1e-12). All return states, piston
-    positions and piston velocities.
+    `bramah`: this program. `hand`: the same equations and steps written by hand. `odeint`: scipy's,
+    with the same compiled right-hand side. `cvodes`: with generated C code (extra `bench`). The
+    last two run at the loosest tolerance at which no state is less accurate (largest error over its
+    range, against LSODA at rtol 1e-12). All return states, piston positions and piston velocities.
     """
     model, drive, start = both_moving(rig)
     ready = compiled(model)
     simulation = simulate(ready, drive, start)
-    p = hand_fused.constants(rig, model.values)
+    p = reference_solvers.constants(rig, model.values)
     y0 = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
     angle, pressure = SIMULATION.angle_tolerance, SIMULATION.pressure_tolerance
     atol = np.repeat([angle, ready.rate_tolerance, pressure, pressure], 2)
     out = np.zeros((len(drive.u), 12))
 
     def by_hand() -> None:
-        hand_fused.free_run(
+        reference_solvers.free_run(
             y0, drive.u, drive.p_s, drive.rate, p, SIMULATION.relative_tolerance, atol, out
         )
 
@@ -62,7 +61,6 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
         return np.asarray(scipy_odeint(rates, y0, t, tfirst=True, rtol=rtol, atol=rtol * SCALE))
 
     true = odeint(1e-12)
-
     size = np.ptp(true, axis=0)
 
     def error(states: Array) -> float:
@@ -85,11 +83,12 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
         "odeint": lambda: pistons(odeint(rtol)),
     }
     with TemporaryDirectory(prefix="bramah-cvodes-") as folder:
-        if cvodes.available():
+        if reference_solvers.cvodes_available():
             inputs = np.column_stack((drive.u, drive.p_s))
-            interpreted = cvodes.solver(p, inputs, drive.rate, SCALE, None)
+            solver = reference_solvers.cvodes_solver
+            interpreted = solver(p, inputs, drive.rate, SCALE, None)
             loosest = next(r for r in TOLERANCES if error(interpreted(r, y0)()) <= exact)
-            by_cvodes = cvodes.solver(p, inputs, drive.rate, SCALE, Path(folder))(loosest, y0)
+            by_cvodes = solver(p, inputs, drive.rate, SCALE, Path(folder))(loosest, y0)
             errors["cvodes_error"] = error(by_cvodes())
             works["cvodes"] = lambda: pistons(by_cvodes())
         times = processor_times(works, repeats)

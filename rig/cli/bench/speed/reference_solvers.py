@@ -1,14 +1,23 @@
-"""Reference for the speed of a free run: the same equations written by hand, for two joints only.
+"""Reference solvers for the speed of a free run: by hand and by CVODES, for two joints only.
 
-The paper's model with both joints free, its state in local variables, with the same Runge-Kutta
-pair, step control and output as the simulation, from which it uses no code. A simulation of any
-model can at best be as fast.
+Both solve the paper's model with both joints free and use no code of the simulation.
+
+By hand: the state in local variables, with the same Runge-Kutta pair, step control and output as
+the simulation. A simulation of any model can at best be as fast.
+
+SUNDIALS' CVODES: CasADi generates the right-hand side and its Jacobian as C code, `zig cc` compiles
+them, and CVODES is called once for all samples. Needs the extra `bench` (casadi, ziglang).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir, nullcontext
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -17,6 +26,10 @@ from numpy.typing import NDArray
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+
+STATES: Final = 8
+COMPILER: Final = f"{sys.executable} -m ziglang cc"
+MAX_STEPS: Final = 10_000_000
 
 
 def constants(rig: Rig, values: Mapping[str, float]) -> Array:
@@ -106,7 +119,7 @@ _D = (
 
 @njit(error_model="numpy")
 def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-untyped-def]  # noqa: PLR0912  unrolled
-    """Fill out (n, 12) with states, piston positions, velocities; return the count of evaluations.
+    """Fill out (n, 12) with states, piston positions and velocities.
 
     `start` (8,): q, q', p_cap, p_rod. `u` (n, 2) and `supply` (n,) are sampled at `rate`. The
     root mean square error of a step stays below `atol` (8,) + `rtol` |y|.
@@ -118,7 +131,7 @@ def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-unt
     y, z = start.copy(), np.empty(8)
     r2, r3, r4, r5 = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
     out[0, :8] = y
-    t, h, filled, evaluations = 0.0, 0.2 / rate, 1, 1
+    t, h, filled = 0.0, 0.2 / rate, 1
     end = (n - 1) / rate + 1e-9
     _rates(t, y, k1, u, supply, rate, p)
     failed = False
@@ -150,7 +163,6 @@ def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-unt
                 + _A[5, 5] * k6[j]
             )  # fmt: skip
         _rates(t + h, z, k7, u, supply, rate, p)
-        evaluations += 6
         error = 0.0
         for j in range(8):
             e = _E[0] * k1[j] + _E[2] * k3[j] + _E[3] * k4[j] + _E[4] * k5[j] + _E[5] * k6[j]
@@ -185,4 +197,85 @@ def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-unt
                 out[k, i], p[16 + 9 * i], p[17 + 9 * i], p[18 + 9 * i], p[19 + 9 * i]
             )
             out[k, 8 + i], out[k, 10 + i] = place, slope * out[k, 2 + i]
-    return evaluations
+
+
+def cvodes_available() -> bool:
+    """Return whether the packages of the extra `bench` are installed."""
+    return find_spec("casadi") is not None and find_spec("ziglang") is not None
+
+
+def cvodes_solver(
+    p: Array, inputs: Array, rate: float, scale: Array, folder: Path | None
+) -> Callable[[float, Array], Callable[[], Array]]:
+    """Return a function of tolerance and start (8,) that prepares a free run: () to states (n, 8).
+
+    `p`: `constants`. `inputs` (n, 3): both spools [V] and the supply [Pa], sampled at `rate` [Hz],
+    linear between samples. `scale` (8,): absolute error of each state at a tolerance of one. With a
+    `folder` the C code is compiled there; without one CasADi interprets it.
+    """
+    import casadi as ca
+
+    grid = np.arange(len(inputs)) / rate
+    y, w = ca.SX.sym("y", STATES), ca.SX.sym("w", 3)
+    rates = ca.Function("rates", [y, w], [ca.vertcat(*_symbolic_rates(ca, y, w, p))])
+    state, t = ca.MX.sym("state", STATES), ca.MX.sym("t")
+    interpolated = ca.interpolant(
+        "inputs", "linear", [grid.tolist()], inputs.ravel().tolist(), {"lookup_mode": ["exact"]}
+    )
+    equations = {"x": state, "t": t, "ode": rates(state * scale, interpolated(t)) / scale}
+    options: dict[str, Any] = {"max_num_steps": MAX_STEPS}
+    if folder is not None:
+        # The caller removes the folder.
+        compiling = {"compiler": COMPILER, "linker": COMPILER, "flags": ["-O3"], "cleanup": False}
+        options |= {"jit": True, "compiler": "shell", "jit_cleanup": False}
+        options["jit_options"] = compiling
+
+    def at(tolerance: float, start: Array) -> Callable[[], Array]:
+        with_tolerance = {**options, "abstol": tolerance, "reltol": tolerance}
+        # CasADi writes into the current folder.
+        with nullcontext() if folder is None else chdir(folder):
+            run = ca.integrator("run", "cvodes", equations, 0.0, grid, with_tolerance)
+        return lambda: np.asarray(run(x0=start / scale)["xf"]).T * scale
+
+    return at
+
+
+def _symbolic_rates(ca: Any, y: Any, w: Any, p: Array) -> Sequence[Any]:
+    """Return dy/dt of y = (q1, q2, q1', q2', cap1, cap2, rod1, rod2) as expressions.
+
+    The equations are those of `_rates`; `w` are both spools and the supply.
+    """
+
+    def root(drop: Any) -> Any:
+        return ca.sign(drop) * ca.sqrt(ca.fabs(drop))
+
+    q, v, cap, rod = ([y[k], y[k + 1]] for k in (0, 2, 4, 6))
+    spool, supply = [w[0], w[1]], w[2]
+    piston, slope = [], []
+    for i in range(2):
+        squares, product, mid, offset = p[16 + 9 * i : 20 + 9 * i]
+        length = ca.sqrt(squares - 2.0 * product * ca.cos(q[i] + offset))
+        piston.append(length - mid)
+        slope.append(product * ca.sin(q[i] + offset) / length)
+    force = [p[20 + 9 * i] * cap[i] - p[21 + 9 * i] * rod[i] for i in range(2)]
+    c, s = p[2] * ca.cos(q[1]), p[2] * ca.sin(q[1])
+    M11, M12, M22 = p[0] + 2.0 * c, p[1] + c, p[1]
+    weight_torque = p[6] * ca.sin(q[0] + q[1])
+    tau2 = slope[1] * force[1] - p[4] * v[1] - weight_torque - s * v[0] ** 2
+    tau1 = slope[0] * force[0] - p[3] * v[0] - weight_torque - p[5] * ca.sin(q[0])
+    tau1 += s * ((v[0] + v[1]) ** 2 - v[0] ** 2)
+    det = M11 * M22 - M12 * M12
+    flow_cap, flow_rod = [], []
+    for i in range(2):
+        pp, pm, mp, mm, u = *p[8 + 4 * i : 12 + 4 * i], spool[i]
+        area_cap, area_rod, pipe_cap, pipe_rod, half = p[20 + 9 * i : 25 + 9 * i]
+        into = ca.if_else(u > 0.0, pp * root(supply - cap[i]) * u, pm * root(cap[i]) * u)
+        out = ca.if_else(u > 0.0, mp * root(rod[i]) * u, mm * root(supply - rod[i]) * u)
+        speed = slope[i] * v[i]
+        volume = pipe_cap + (half + piston[i]) * area_cap
+        flow_cap.append((into - area_cap * speed) / (p[7] * volume))
+        volume = pipe_rod + (half - piston[i]) * area_rod
+        flow_rod.append((area_rod * speed - out) / (p[7] * volume))
+    return (
+        *v, (M22 * tau1 - M12 * tau2) / det, (M11 * tau2 - M12 * tau1) / det, *flow_cap, *flow_rod,
+    )  # fmt: skip
