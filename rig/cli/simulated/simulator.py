@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,35 +29,14 @@ NAMED_FAULT_SHARE: Final = 0.01  # share of the frames that a fault given by its
 VALVES_RATE: Final = 1000.0
 
 
-@dataclass(frozen=True)
-class BenchRequest:
-    """Plant to simulate, and its wire.
-
-    `scenario`: a file of hidden effects, the name of a shipped one, or ``random``, drawn by
-    `seed`. `truth`: a file for the true parameters and hidden effects. `wire_faults`: a file of
-    faults, or the name of a fault of the wire that then affects one frame in a hundred.
-    """
-
-    rig: str
-    seed: int = 0
-    scenario: str | None = None
-    port: int | None = None
-    real_time: bool = False
-    truth: Path | None = None
-    parent: int | None = None
-    wire: str = TCP
-    wire_faults: str | None = None
-
-
-def scenario_of(request: BenchRequest, rig: Rig) -> Scenario:
-    """Return the scenario of a bench's hidden effects; raises InputError for a bad file."""
-    if request.scenario is None:
+def _scenario(name: str | None, rig: Rig, seed: int) -> Scenario:
+    if name is None:
         return Scenario()
-    if request.scenario == RANDOM:
-        return draw(rig, request.seed)
-    if request.scenario in shipped_scenarios():
-        return load_shipped(request.scenario)
-    return _scenario_file("--scenario", request.scenario, (RANDOM, *shipped_scenarios()))
+    if name == RANDOM:
+        return draw(rig, seed)
+    if name in shipped_scenarios():
+        return load_shipped(name)
+    return _scenario_file("--scenario", name, (RANDOM, *shipped_scenarios()))
 
 
 def _scenario_file(option: str, name: str, known: Iterable[str]) -> Scenario:
@@ -85,21 +63,36 @@ def wire_faults(name: str | None) -> tuple[WireFault, ...]:
     return scenario.wire_faults
 
 
-def serve_bench(request: BenchRequest) -> None:
-    """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
-    if request.wire not in WIRES:
-        raise InputError(f"--wire {request.wire}: expected one of: {' '.join(WIRES)}")
-    rig = load_bench(request.rig)
-    if request.wire == VALVES:
+def serve_bench(
+    rig_name: str,
+    wire: str,
+    seed: int,
+    scenario_name: str | None,
+    faults_name: str | None,
+    port: int | None,
+    real_time: bool,
+    truth: Path | None,
+    parent: int | None,
+) -> None:
+    """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port.
+
+    `scenario_name`: a file of hidden effects, the name of a shipped one, or ``random``, drawn by
+    `seed`. `faults_name`: a file of faults, or the name of a fault of the wire that then affects
+    one frame in a hundred. `truth`: a file for the true parameters and hidden effects.
+    """
+    if wire not in WIRES:
+        raise InputError(f"--wire {wire}: expected one of: {' '.join(WIRES)}")
+    rig = load_bench(rig_name)
+    if wire == VALVES:
         # The rig's rate is the host's; the valves sample when SYNC arrives, not at fixed ticks.
         rig = rig.model_copy(update={"sample_rate": max(VALVES_RATE, rig.sample_rate)})
-    scenario = scenario_of(request, rig)
-    faults = (*scenario.wire_faults, *wire_faults(request.wire_faults))
-    plant = FaultyPlant(rig, scenario, request.seed)
+    scenario = _scenario(scenario_name, rig, seed)
+    faults = (*scenario.wire_faults, *wire_faults(faults_name))
+    plant = FaultyPlant(rig, scenario, seed)
     # Compiles before the first request, on a second plant so that the served one starts at rest.
-    warm_up(rig, Plant(rig, scenario, request.seed))
-    write_truth(request.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
-    address = _address(request, rig)
+    warm_up(rig, Plant(rig, scenario, seed))
+    write_truth(truth, plant.plant.truth(), scenario.model_dump(mode="json"))
+    address = _address(wire, rig, port)
     links: list[FaultyLink] = []
 
     def ready(endpoint: str) -> None:
@@ -108,7 +101,7 @@ def serve_bench(request: BenchRequest) -> None:
                 faulty_link(
                     endpoint,
                     faults,
-                    seed=request.seed,
+                    seed=seed,
                     seconds=lambda: plant.tick / rig.sample_rate,
                     port=address.get("port", 0),
                 )
@@ -121,10 +114,10 @@ def serve_bench(request: BenchRequest) -> None:
             rig,
             plant,
             **(address | {"port": 0} if faults else address),
-            wire=request.wire,
-            realtime=request.real_time,
+            wire=wire,
+            realtime=real_time,
             on_ready=ready,
-            parent=request.parent,
+            parent=parent,
             faults=scenario.device_faults,
         )
     except EndpointError as error:
@@ -134,25 +127,25 @@ def serve_bench(request: BenchRequest) -> None:
             link.close()
 
 
-def _address(request: BenchRequest, rig: Rig) -> dict[str, Any]:
-    """Return the wire's keywords for `serve`; raises InputError for options it does not have."""
-    if request.wire == VALVES:
-        return {"port": request.port or 0}
-    if request.wire in (CAN, SLCAN):
-        return _bus(request, rig)
+def _address(wire: str, rig: Rig, port: int | None) -> dict[str, Any]:
+    """Return the wire's keywords for `serve`."""
+    if wire == VALVES:
+        return {"port": port or 0}
+    if wire in (CAN, SLCAN):
+        return _bus(rig, port)
     tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
-    return {"host": tcp.host, "port": tcp.port if request.port is None else request.port}
+    return {"host": tcp.host, "port": tcp.port if port is None else port}
 
 
-def _bus(request: BenchRequest, rig: Rig) -> dict[str, Any]:
+def _bus(rig: Rig, port: int | None) -> dict[str, Any]:
     from drivers.can_port import SOCKETCAND, BusPlace
     from drivers.can_stream import CanSettings, can_layout
 
     if rig.wire.kind != CAN:
-        return {"port": request.port or 0}
+        return {"port": port or 0}
     settings = CanSettings.of(rig.wire)
     bus = BusPlace.of(settings.bus)
     address = {"host": bus.host, "port": bus.port} if bus.interface == SOCKETCAND else {}
-    if request.port is not None:
-        address["port"] = request.port
+    if port is not None:
+        address["port"] = port
     return {**address, "layout": can_layout(settings, rig), "bitrate": settings.bitrate}

@@ -55,8 +55,6 @@ def sim(
     # it the bench starts in three quarters of the time.
     if "aiohttp" not in sys.modules:
         sys.modules["aiohttp"] = None  # type: ignore[assignment]
-    from rig.cli.simulated.simulator import BenchRequest, serve_bench
+    from rig.cli.simulated.simulator import serve_bench
 
-    serve_bench(
-        BenchRequest(rig, seed, scenario, port, real_time, truth, parent, wire, wire_faults)
-    )
+    serve_bench(rig, wire, seed, scenario, wire_faults, port, real_time, truth, parent)
