@@ -39,12 +39,11 @@ HIDDEN = "worn-seal"  # effects of the demo's bench, unknown to the analysis
 class Experiment:
     """Runs of one simulated bench and their analysis; `truth` are the bench's true parameters.
 
-    `hold_out_runs` are further ones for the trace, beside `validation_runs`.
+    `held_out`: runs to judge a trace by, the last of them that of the validation.
     """
 
-    runs: tuple[Run, ...]
-    validation_runs: tuple[Run, ...]
-    hold_out_runs: tuple[Run, ...]
+    run: Run
+    held_out: tuple[Run, ...]
     identification: Identification
     validation: Sequence[RecordValidation]
     truth: Mapping[str, float]
@@ -76,9 +75,8 @@ def experiment(
     identification = identify([run])
     say("validating the model on the second run, which is held out")
     results = validate(identification.model, [validation_run])
-    return Experiment(
-        (run,), (validation_run,), tuple(others), identification, results, read_truth(truth)
-    )
+    held_out = (*others, validation_run)
+    return Experiment(run, held_out, identification, results, read_truth(truth))
 
 
 def run_demo(out: Path, seed: int, repeats: int | None) -> None:
@@ -89,13 +87,12 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     write_json(folder / "identify.json", identification_json(done.identification))
     write_json(folder / "validate.json", validation_json(done.validation))
     progress("tracing missing effects, judged on held-out runs")
-    held_out = (*done.hold_out_runs, *done.validation_runs)
-    traced = trace(done.runs, held_out, seed=seed, progress=Countdown("tracing"))
+    traced = trace([done.run], done.held_out, seed=seed, progress=Countdown("tracing"))
     write_json(folder / "trace.json", trace_json(traced))
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
     write_experiment(folder / "report.html", done, command, seed)
-    write_trace(folder / "trace.html", held_out, traced)
+    write_trace(folder / "trace.html", done.held_out, traced)
     for name in ("report.html", "trace.html"):
         shutil.copyfile(folder / name, out / name)
     print(identification_text(done.identification, done.truth))
@@ -116,10 +113,10 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
 def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
     """Write the report of a whole loop on a simulated bench."""
     text = render_report(
-        runs=done.runs,
+        runs=[done.run],
         identification=done.identification,
         validation=done.validation,
-        validation_runs=done.validation_runs,
+        validation_runs=done.held_out[-1:],
         truth=done.truth,
         title="A simulated bench, identified and validated",
         provenance=provenance(command, {"simulated bench": seed}),

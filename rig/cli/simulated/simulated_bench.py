@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from analysis.workers.pool import environment
 from rig.bench.latch import STATE_VARIABLE
 from rig.cli.errors import WorkError
 from rig.cli.text.output import write_json
@@ -21,23 +22,6 @@ _START = "from rig.cli.main import run; run()"
 _END_SECONDS = 10.0
 
 SCENARIO: Final = "scenario"  # key beside the parameters' names
-
-
-@contextmanager
-def _temporary_state_folder() -> Iterator[None]:
-    """Keep a bench's stored state (`rig.bench.latch`) in a temporary folder.
-
-    A trip latched by an earlier simulated bench on the same port must not block a new one.
-    """
-    previous = os.environ.get(STATE_VARIABLE)
-    with scratch_folder() as folder:
-        os.environ[STATE_VARIABLE] = str(folder)
-        try:
-            yield
-        finally:
-            os.environ.pop(STATE_VARIABLE)
-            if previous is not None:
-                os.environ[STATE_VARIABLE] = previous
 
 
 @contextmanager
@@ -60,7 +44,9 @@ def simulated_bench(
     words += ["--real-time"] if real_time else []
     words += [] if scenario is None else ["--scenario", str(scenario)]
     with (
-        _temporary_state_folder(),
+        scratch_folder() as folder,
+        # A trip latched by an earlier simulated bench on the same port must not block this one.
+        environment({STATE_VARIABLE: str(folder)}),
         subprocess.Popen(
             [sys.executable, "-c", _START, *words],
             stdout=subprocess.PIPE,
