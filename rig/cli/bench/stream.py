@@ -15,7 +15,9 @@ from analysis.identify.streams.out_of_core import identify_folders
 from analysis.regression.solve import Accumulator
 from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import ONE_THREAD, Processes, environment
+from rig.cli.bench.figure import Figure
 
+GROUP = "stream"
 COLUMNS = 9  # columns of the two-joint bench's fluid rows
 READ_ROWS = 16_384
 WRITE_ROWS = 100_000
@@ -26,8 +28,6 @@ WORKER_ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": "268435456",
     "MALLOC_MMAP_THRESHOLD_": "33554432",
 }
-
-
 _TRIES = 3  # repetitions, of which the fastest counts
 
 
@@ -92,7 +92,7 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
     path = folder / "rows.f64"
     write_rows(path, rows)
     estimates = []
-    for function, repeats in ((streamed, 3), (in_memory, 1)):
+    for function, repeats in ((streamed, _TRIES), (in_memory, 1)):
         with Processes(1) as pool:
             results = list(pool.map(function, [str(path)] * repeats))
             estimates.append(min(results, key=lambda result: float(result["seconds"])))
@@ -110,10 +110,11 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
     }
 
 
-def cluster_figures(folders: Sequence[str]) -> dict[str, float]:
-    """Return the speed-up of two Dask workers over one in identifying run folders, on this machine.
+def cluster_figures(folders: Sequence[str]) -> list[Figure]:
+    """Measure two Dask workers against one in identifying run folders, on this machine.
 
-    Each worker is a process with one thread. Raises ImportError without dask.distributed.
+    Each worker is a process with one thread. The speed-up of two processes in plain arithmetic is
+    the machine's limit. Raises ImportError without dask.distributed.
     """
     distributed: Any = importlib.import_module("distributed")
     best: dict[int, float] = {1: np.inf, 2: np.inf}
@@ -143,17 +144,19 @@ def cluster_figures(folders: Sequence[str]) -> dict[str, float]:
             values.append([estimate.value for estimate in result.estimates.values()])
     reference = identify_folders(folders)
     expected = np.array([estimate.value for estimate in reference.estimates.values()])
-    return {
-        "one_seconds": best[1],
-        "two_seconds": best[2],
-        "speedup": best[1] / best[2],
-        "processor_ratio": busiest[1] / busiest[2],
-        "difference": float(np.abs(np.array(values) / expected - 1.0).max()),
-    }
+    difference = float(np.abs(np.array(values) / expected - 1.0).max())
+    ratio = busiest[1] / busiest[2]
+    return [
+        Figure(GROUP, "one Dask worker", best[1], "s"),
+        Figure(GROUP, "two Dask workers", best[2], "s"),
+        Figure(GROUP, "two workers over one", best[1] / best[2], "x", 1.6, True),
+        Figure(GROUP, "two processes over one, bare arithmetic", _spin_speedup(), "x"),
+        Figure(GROUP, "one's processor time over the busier of two", ratio, "x"),
+        Figure(GROUP, "archive: largest relative difference", difference, "", 1e-10),
+    ]
 
 
-def spin_figures() -> float:
-    """Return the speed-up of two processes over one in plain arithmetic: the machine's limit."""
+def _spin_speedup() -> float:
     best = {1: np.inf, 2: np.inf}
     for workers in (1, 2) * _TRIES:
         with Processes(workers) as pool:

@@ -14,7 +14,7 @@ from analysis.identify.streams.online import Tracker, track
 from drivers.base import SampleBlock
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.speed.figures import bench_run
-from rig.cli.bench.stream import cluster_figures, row_figures, spin_figures
+from rig.cli.bench.stream import GROUP, cluster_figures, row_figures
 from rig.cli.execution.tracking import Tracking
 from rig.cli.text.output import Say
 from rig.model.records import Record
@@ -26,7 +26,6 @@ from rig.runs.rigs import load_rig
 RIG = "shinshu-2dof"
 BLOCK = 10  # samples: 10 ms
 RUNS, RECORD_SECONDS = 8, 20.0  # length of the archive: 144 records
-GROUP = "stream"
 
 
 def stream_figures(folder: Path, say: Say) -> list[Figure]:
@@ -49,19 +48,8 @@ def _cluster(folder: Path, say: Say) -> list[Figure]:
     say("stream: an archive on one and on two Dask workers")
     run = bench_run(load_rig(RIG), repeats=6, seconds=RECORD_SECONDS)
     folders = [str(write_run(folder / f"run-{number}", run)) for number in range(RUNS)]
-    measured = cluster_figures(folders)
-    plain = spin_figures()
-    return [
-        Figure(GROUP, f"archive: records of {RECORD_SECONDS:g} s", RUNS * len(run.records)),
-        Figure(GROUP, "one Dask worker", measured["one_seconds"], "s"),
-        Figure(GROUP, "two Dask workers", measured["two_seconds"], "s"),
-        Figure(GROUP, "two workers over one", measured["speedup"], "x", 1.6, True),
-        Figure(GROUP, "two processes over one, bare arithmetic", plain, "x"),
-        Figure(
-            GROUP, "one's processor time over the busier of two", measured["processor_ratio"], "x"
-        ),
-        Figure(GROUP, "archive: largest relative difference", measured["difference"], "", 1e-10),
-    ]
+    records = Figure(GROUP, f"archive: records of {RECORD_SECONDS:g} s", RUNS * len(run.records))
+    return [records, *cluster_figures(folders)]
 
 
 def _tracking(folder: Path, say: Say) -> list[Figure]:
