@@ -31,14 +31,10 @@ class WorkError(Exception):
     """The work could not be done; the message gives the reason in one line (exit code 1)."""
 
 
-def coloured() -> bool:
-    """Return whether standard error is a terminal and NO_COLOR is not set."""
-    return is_terminal(sys.stderr) and not os.environ.get("NO_COLOR")
-
-
 def alarm(text: str) -> str:
-    """Return a text in white on red if standard error shows colour."""
-    return f"\033[1;37;41m{text}\033[0m" if coloured() else text
+    """Return a text in white on red if standard error is a terminal and NO_COLOR is not set."""
+    coloured = is_terminal(sys.stderr) and not os.environ.get("NO_COLOR")
+    return f"\033[1;37;41m{text}\033[0m" if coloured else text
 
 
 class LogFormatter(logging.Formatter):

@@ -76,7 +76,6 @@ class Loop:
     """A running loop: finished `rounds`; `stopped`, the reason of its end ('' while it runs)."""
 
     def __init__(self, request: LoopRequest, say: Callable[[str], None]) -> None:
-        refuse_used_folder(request.out)
         self.request, self.say = request, say
         self.rig: Rig = load_bench(request.rig)
         self.rounds: list[Round] = []

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -53,12 +51,10 @@ def _path(queue: Path | None) -> Path:
     return (queue or state_folder() / "queue.sqlite").absolute()
 
 
-@contextmanager
-def _open_queue(queue: Path | None, *, create: bool = False) -> Iterator[QueueStore]:
+def _open_queue(queue: Path | None, *, create: bool = False) -> QueueStore:
     from rig.queue.store import QueueStore
 
-    with QueueStore(_path(queue), create=create) as store:
-        yield store
+    return QueueStore(_path(queue), create=create)
 
 
 def _print_item(item: Item, json: Path | None, outcome: str) -> None:

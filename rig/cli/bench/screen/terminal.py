@@ -31,7 +31,6 @@ class Screen:
     """
 
     runtime: Path
-    size: tuple[int, int] = SIZE
     drawn: list[tuple[float, bytes]] = field(default_factory=list)
     _closing: threading.Event = field(default_factory=threading.Event)
 
@@ -39,7 +38,7 @@ class Screen:
         environment = {**os.environ, "XDG_RUNTIME_DIR": str(self.runtime), "TERM": "xterm-256color"}
         environment.pop("NO_COLOR", None)
         self._terminal, outer = pty.openpty()
-        columns, rows = self.size
+        columns, rows = SIZE
         fcntl.ioctl(outer, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
         command = [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor"]
         self._process = subprocess.Popen(
