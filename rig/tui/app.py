@@ -33,8 +33,7 @@ from rig.tui.pages.parts import joints_in
 from rig.tui.pages.whole import compose
 from rig.tui.words import LINGER, Stop
 
-SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
-LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
+SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0)  # of plots [s of device time]
 LEAST_CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
 SLOW: Final = 0.2  # interval of redrawing ages while nothing arrives [s]
 BLINK: Final = 0.5  # half a period of an unacknowledged alarm [s]
@@ -77,7 +76,7 @@ def with_early_keys(kind: type[Driver], early: Callable[[events.Key], None]) -> 
 def automatic_span(speed: float) -> float:
     """Return the shortest span in which a curve moves slowly enough to be read."""
     # A run in real time has a speed around 1, which must not alternate between two spans.
-    return next((s for s in LONG_SPANS[2:] if s / speed > LEAST_CROSSING), LONG_SPANS[-1])
+    return next((s for s in SPANS[2:] if s / speed > LEAST_CROSSING), SPANS[-1])
 
 
 class Monitor(Starts, App[int]):
@@ -372,9 +371,8 @@ class Monitor(Starts, App[int]):
         self.look = replace(self.look, zoomed=not self.look.zoomed)
 
     def _step_span(self, step: int) -> None:
-        spans = LONG_SPANS
-        index = spans.index(self.look.seconds) + step
-        self._span = spans[min(max(index, 0), len(spans) - 1)]
+        index = SPANS.index(self.look.seconds) + step
+        self._span = SPANS[min(max(index, 0), len(SPANS) - 1)]
 
     def act_longer(self) -> None:
         """Show more of the past."""

@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Final
@@ -89,10 +90,8 @@ def _watch(
     with output, errors:
         code = None
         while code is None:
-            try:
+            with suppress(subprocess.TimeoutExpired):
                 code = process.wait(POLL)
-            except subprocess.TimeoutExpired:
-                code = None
             text = _text(errors)
             lines = tuple(text.splitlines()[-TAIL:])
             if code is None and lines == job.lines:

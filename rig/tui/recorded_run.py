@@ -202,8 +202,9 @@ def _event(line: bytes) -> dict[str, Any] | None:
 def _time(event: dict[str, Any], before: float) -> float:
     """Return an event's time [s since the run began]; the previous one's where it has none."""
     at = event.get("t")
-    known = isinstance(at, int | float) and not isinstance(at, bool) and math.isfinite(at)
-    return float(at) if known and at is not None else before
+    if isinstance(at, int | float) and not isinstance(at, bool) and math.isfinite(at):
+        return float(at)
+    return before
 
 
 def _printable(text: str) -> str:
