@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.design.lateness import LatenessCost
 from analysis.design.moves import Tone
 from analysis.design.optimise import Design, improve
 from analysis.design.predict import Prediction, predict, to_json
@@ -26,7 +27,6 @@ from protocols.language.waveforms import Waveform
 from protocols.signals.lines import chosen_lines
 from protocols.steps.excite import Step
 from protocols.steps.parts import CLOSED
-from protocols.steps.plans import StepPlan
 from rig.cli.proof.twin_choice import TwinParameters
 from rig.cli.text.output import condition_text, progress, table
 from rig.model.parse import InputError
@@ -40,26 +40,28 @@ CHECKED = 0.4  # share of the total time that the check of the limits takes
 def planned_steps(
     plan: Plan, biases: Mapping[str, Mapping[int, float]] | None = None
 ) -> list[TwinStep]:
-    """Return a plan's steps for the twin; `biases` [V] by step and 1-based joint, if known."""
-    return [planned_step(step, (biases or {}).get(step.name, {})) for step in plan.steps]
+    """Return a plan's steps for the twin, waveforms repeated to the step's common period.
 
-
-def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
-    """Return one step, its waveforms repeated to the step's common period."""
-    return TwinStep(
-        name=step.name,
-        waves={e.joint: np.resize(e.wave.samples, step.period) for e in step.excite},
-        lines=step.lines,
-        held={k.joint: k.piston for k in step.locks if k.at != CLOSED},
-        closed={k.joint: k.piston for k in step.locks if k.at == CLOSED},
-        centres={e.joint: e.centre for e in step.excite},
-        biases={joint - 1: bias for joint, bias in biases.items()},
-        samples=step.record,
-        repeats=step.repeats,
-        yields={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
-        offsets={e.joint: e.settings.centring.offset for e in step.excite},
-        where=step.where,
-    )
+    `biases` [V] by step and 1-based joint, if known.
+    """
+    known = biases or {}
+    return [
+        TwinStep(
+            name=step.name,
+            waves={e.joint: np.resize(e.wave.samples, step.period) for e in step.excite},
+            lines=step.lines,
+            held={k.joint: k.piston for k in step.locks if k.at != CLOSED},
+            closed={k.joint: k.piston for k in step.locks if k.at == CLOSED},
+            centres={e.joint: e.centre for e in step.excite},
+            biases={joint - 1: bias for joint, bias in known.get(step.name, {}).items()},
+            samples=step.record,
+            repeats=step.repeats,
+            yields={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
+            offsets={e.joint: e.settings.centring.offset for e in step.excite},
+            where=step.where,
+        )
+        for step in plan.steps
+    ]
 
 
 def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
@@ -105,12 +107,15 @@ def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
 
 @dataclass(frozen=True)
 class CheckedForecast:
-    """Limits of a protocol on the twin, and its predicted errors; None for a `reason`."""
+    """Limits of a protocol on the twin, and its predicted errors; None for a `reason`.
+
+    `wire` is that of the rig file, which may state the jitter of the samples' times.
+    """
 
     limits: CheckReport
     prediction: Prediction | None
     reason: str = ""
-    stated: Wire | None = None
+    wire: Wire | None = None
 
 
 def jitter_of(rig: Rig) -> float | None:
@@ -120,12 +125,8 @@ def jitter_of(rig: Rig) -> float | None:
     return DESIGN.jitter if rig.wire.jitter is None else rig.wire.jitter
 
 
-def lateness_text(forecast: CheckedForecast) -> str:
+def _lateness_text(cost: LatenessCost, wire: Wire) -> str:
     """Return the effect of late samples on the estimate of b, and its assumption, in one line."""
-    p, wire = forecast.prediction, forecast.stated
-    if p is None or p.lateness is None or wire is None:
-        return ""
-    cost = p.lateness
     origin = (
         "assumed, since the rig file states no wire.jitter; `bramah probe` measures it"
         if wire.jitter is None
@@ -163,7 +164,7 @@ def of_plan(
     try:
         steps = planned_steps(plan, biases)
         predicted = predict(rig, steps, jitter=jitter_of(rig), progress=stage(CHECKED, 1.0))
-        return CheckedForecast(limits, predicted, stated=rig.wire)
+        return CheckedForecast(limits, predicted, wire=rig.wire)
     except InputError as error:
         return CheckedForecast(limits, None, str(error))
 
@@ -200,7 +201,8 @@ def prediction_text(forecast: CheckedForecast) -> str:
         lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
     lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]
     lines.append(f"worst known: {p.worst}")
-    lines += [lateness_text(forecast)] if p.lateness is not None else []
+    if p.lateness is not None and forecast.wire is not None:
+        lines.append(_lateness_text(p.lateness, forecast.wire))
     return "\n".join(lines)
 
 

@@ -91,7 +91,16 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     write_json(folder / "trace.json", trace_json(traced))
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
-    write_experiment(folder / "report.html", done, command, seed)
+    page = render_report(
+        runs=[done.run],
+        identification=done.identification,
+        validation=done.validation,
+        validation_runs=done.held_out[-1:],
+        truth=done.truth,
+        title="A simulated bench, identified and validated",
+        provenance=provenance(command, {"simulated bench": seed}),
+    )
+    write(folder / "report.html", page)
     write_trace(folder / "trace.html", done.held_out, traced)
     for name in ("report.html", "trace.html"):
         shutil.copyfile(folder / name, out / name)
@@ -108,17 +117,3 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     print(f"report: {out / 'report.html'}")
     print(f"trace: {out / 'trace.html'}")
     progress(f"the whole loop took {time.monotonic() - started:.0f} s")
-
-
-def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
-    """Write the report of a whole loop on a simulated bench."""
-    text = render_report(
-        runs=[done.run],
-        identification=done.identification,
-        validation=done.validation,
-        validation_runs=done.held_out[-1:],
-        truth=done.truth,
-        title="A simulated bench, identified and validated",
-        provenance=provenance(command, {"simulated bench": seed}),
-    )
-    write(path, text)

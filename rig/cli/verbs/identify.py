@@ -92,13 +92,24 @@ def _terms(
     return (terms if shape_fit is None else shape_fit.terms), shape_fit
 
 
-def _shapes_in(result: Identification) -> dict[str, Estimate]:
-    """Return the shapes of the model's effects by name, without errors; most models have none."""
-    if not any(used.shape for used in result.model.terms):
-        return {}
+def _with_shapes(
+    result: Identification, shape_fit: ShapeFit | None
+) -> tuple[Identification, dict[str, Estimate]]:
+    """Return the result and the shapes of its effects by name; most models have none.
+
+    Shapes that were fitted have errors, which the returned model holds as well.
+    """
+    if shape_fit is None and not any(used.shape for used in result.model.terms):
+        return result, {}
     from analysis.trace.search.refinement import shapes_in  # loads scipy.optimize, slowly
 
-    return shapes_in(result.model.rig, result.model.terms)
+    shapes = shapes_in(result.model.rig, result.model.terms)
+    if shape_fit is None:
+        return result, shapes
+    from analysis.trace.judge.inference import with_shape_errors
+
+    model, fitted = with_shape_errors(shape_fit, result.model)
+    return replace(result, model=model), shapes | fitted
 
 
 def _shape_json(shape: Estimate) -> dict[str, Any]:
@@ -107,16 +118,6 @@ def _shape_json(shape: Estimate) -> dict[str, Any]:
 
     shape_fit = math.isfinite(shape.std)
     return estimate_json(shape) if shape_fit else {"value": shape.value, "unit": shape.unit}
-
-
-def _with_shape_errors(
-    result: Identification, shape_fit: ShapeFit
-) -> tuple[Identification, dict[str, Estimate]]:
-    """Return the result with the errors of shapes that were fitted, and these shapes."""
-    from analysis.trace.judge.inference import with_shape_errors
-
-    model, shapes = with_shape_errors(shape_fit, result.model)
-    return replace(result, model=model), shapes
 
 
 def identify(
@@ -222,10 +223,7 @@ def identify(
             search=SearchOptions(evaluations=evaluations),
             progress=Countdown("identifying"),
         )
-    shapes = _shapes_in(result)
-    if shape_fit is not None:
-        result, fitted = _with_shape_errors(result, shape_fit)
-        shapes |= fitted
+    result, shapes = _with_shapes(result, shape_fit)
     document: dict[str, Any] = {}
     appendix = shapes_text(shapes) + method_text(result)
     if shapes:
