@@ -24,8 +24,8 @@ class Canvas(Widget):
         self.rows: tuple[Row, ...] = ()
         self._background = Style.null()
 
-    def show(self, rows: Sequence[Row]) -> int:
-        """Show these rows; return how many have changed."""
+    def show(self, rows: Sequence[Row]) -> None:
+        """Show these rows."""
         previous, self.rows = self.rows, tuple(rows)
         self._background = self.rich_style
         padded = [*previous, *[BLANK] * (len(rows) - len(previous))]
@@ -40,7 +40,6 @@ class Canvas(Widget):
                 lines = [y for _, y in members]
                 regions.append(Region(0, lines[0], self.size.width, len(lines)))
             self.refresh(*regions)
-        return len(changed)
 
     def render_line(self, y: int) -> Strip:
         """Return one line of the terminal."""

@@ -28,7 +28,7 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return one joint: every channel as a curve if there is room, and as a bar."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
-    joints = list(joints_in(snapshot.channels))
+    joints = joints_in(snapshot.channels)
     if not joints:
         return block([row((" this run has no joints", DIM))], width, height)
     joint = joints[min(max(view.look.joint, 1), len(joints)) - 1]
@@ -66,7 +66,7 @@ def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
             f" Refused while a protocol runs ({snapshot.run or snapshot.step}): wait for its end."
         )
         return block(wrapped(text, width, WARN_TEXT), width, height)
-    joints = list(joints_in(snapshot.channels))
+    joints = joints_in(snapshot.channels)
     joint = joints[min(max(view.look.joint, 1), len(joints)) - 1] if joints else 1
     keys = f"hold ↑ to extend joint {joint}, ↓ to retract: it stops when you let go"
     head = [

@@ -27,7 +27,7 @@ def overview(view: PlotView, width: int, height: int) -> list[Row]:
     rows += [_step_line(view, snapshot, width), _margin_line(margin, width)]
     rows += alarm_lines(view, width, GLANCE if height < 30 else 2 * GLANCE)
     bars = bench_bars(view, width)
-    joints = list(joints_in(snapshot.channels))
+    joints = joints_in(snapshot.channels)
     return [*rows, *_joints(view, joints, width, height - len(rows) - len(bars)), *bars]
 
 

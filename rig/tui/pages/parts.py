@@ -18,7 +18,7 @@ from rig.tui.look import PlotView
 from rig.tui.units import limit, shown
 from rig.tui.words import Freshness, role_of, value
 
-_JOINT_CHANNEL = re.compile(r"^(?P<kind>.+)_(?P<joint>[1-9]\d*)$")
+_JOINT_CHANNEL = re.compile(r"^.+_(?P<joint>[1-9]\d*)$")
 NAMES: Final = {ch.CAP: "cap", ch.ROD: "rod", ch.SUPPLY: "supply", ch.TEMPERATURE: "oil"}
 # Drawn as curves in this order, as many as fit; all are gauges as well.
 CURVES: Final = (ch.CAP, ch.ROD, ch.PISTON, ch.COMMAND, ch.SPOOL, ch.POSITION, ch.DRIVE)
@@ -50,14 +50,10 @@ def list_with_detail(
     return block([*shown, *detail(width, height - above)], width, height)
 
 
-def joints_in(channels: Iterable[str]) -> dict[int, list[str]]:
-    """Return the channels of every joint, joints in order: {1: ["spool_1", ...], ...}."""
-    by_joint: dict[int, list[str]] = {}
-    for name in channels:
-        match = _JOINT_CHANNEL.match(name)
-        if match is not None:
-            by_joint.setdefault(int(match["joint"]), []).append(name)
-    return dict(sorted(by_joint.items()))
+def joints_in(channels: Iterable[str]) -> list[int]:
+    """Return the numbers of the joints with a channel, in order."""
+    matches = map(_JOINT_CHANNEL.match, channels)
+    return sorted({int(match["joint"]) for match in matches if match is not None})
 
 
 def short_name(kind: str) -> str:
