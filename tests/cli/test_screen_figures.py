@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rig.cli.bench.screen.arrival import age_quantile, ages_on_screen
-from rig.cli.bench.screen.runs import RunPlace, RunTimes, played
+from rig.cli.bench.screen.runs import RunTimes, played
 from rig.cli.bench.screen.stops import many_stops
 from rig.cli.bench.screen.terminal import Screen
 from rig.cli.simulated.simulated_bench import simulated_bench
@@ -63,7 +63,7 @@ def test_keys_in_a_terminal_stop_real_runs_and_are_timed_by_the_device(runtime: 
 def test_a_run_that_nobody_stops_loses_nothing_when_its_screen_is_killed(runtime: Path) -> None:
     with (
         simulated_bench("digger-3dof", seed=1, real_time=True) as endpoint,
-        played(RunPlace(endpoint, runtime, runtime / "run"), driven=False) as run,
+        played(endpoint, runtime, runtime / "run", driven=False) as run,
     ):
         with Screen(runtime):
             assert run.has_sent("watched", 60.0)

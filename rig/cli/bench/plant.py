@@ -24,25 +24,21 @@ PEAK = 1.6  # amplitude of the command of each joint [V]
 LINES = (1, 3, 5, 7, 9, 13, 19)  # odd multiples of 0.5 Hz
 
 
-def hard_waves(rig: Rig) -> list[Array]:
-    """Return one 2 s multisine per joint [V], 0.5 to 9.5 Hz with random phases, (period,) each."""
+def hard_laws(rig: Rig) -> list[Law]:
+    """Return laws that play a 2 s multisine [V], 0.5 to 9.5 Hz, on all joints at once, open loop.
+
+    Each joint has its own random phases.
+    """
     rng = np.random.default_rng(1)
     t = np.arange(round(2.0 * rig.sample_rate)) / rig.sample_rate
-    waves = []
-    for _ in rig.joints:
+    laws = []
+    for joint in rig.joints:
         phases = rng.uniform(0.0, 2.0 * math.pi, len(LINES))
         lines = zip(LINES, phases, strict=True)
         wave = sum(np.sin(math.pi * k * t + phase) for k, phase in lines)
-        waves.append(PEAK * np.asarray(wave) / np.max(np.abs(wave)))
-    return waves
-
-
-def hard_laws(rig: Rig) -> list[Law]:
-    """Return the laws that play `hard_waves` on all joints at once, open loop."""
-    return [
-        Law(wave=wave, gain=1.0, limit=joint.limits.command)
-        for wave, joint in zip(hard_waves(rig), rig.joints, strict=True)
-    ]
+        scaled = PEAK * np.asarray(wave) / np.max(np.abs(wave))
+        laws.append(Law(wave=scaled, gain=1.0, limit=joint.limits.command))
+    return laws
 
 
 def signals(plant: Plant) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,9 +15,9 @@ from rig.bench.latch import STATE_VARIABLE
 from rig.cli.errors import WorkError
 from rig.cli.text.output import write_json
 from rig.model.parse import InputError
+from rig.queue.processes import BRAMAH
 from rig.runs.files import scratch_folder
 
-_START = "from rig.cli.main import run; run()"
 _END_SECONDS = 10.0
 
 SCENARIO: Final = "scenario"  # key beside the parameters' names
@@ -48,7 +47,7 @@ def simulated_bench(
         # A trip latched by an earlier simulated bench on the same port must not block this one.
         environment({STATE_VARIABLE: str(folder)}),
         subprocess.Popen(
-            [sys.executable, "-c", _START, *words],
+            [*BRAMAH, *words],
             stdout=subprocess.PIPE,
             stdin=subprocess.DEVNULL,
             text=True,

@@ -106,8 +106,7 @@ def validation_text(results: Sequence[RecordValidation]) -> str:
     rows = []
     for result in results:
         for name, fit in result.fit.items():
-            si = result.units.get(name, "m" if name.startswith("piston") else "Pa")
-            unit = RESIDUALS[si]
+            unit = RESIDUALS[result.units[name]]
             rows.append(
                 [
                     f"{result.record} {name}",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rig.cli.bench.acquisition import lateness
 from rig.cli.bench.figure import Figure
-from rig.cli.bench.screen.runs import RIG, RunPlace, RunTimes, played
+from rig.cli.bench.screen.runs import RIG, RunTimes, played
 from rig.cli.bench.screen.stops import ATTACH, SEED
 from rig.cli.bench.screen.terminal import Screen
 from rig.cli.errors import WorkError
@@ -102,20 +102,21 @@ def arrival_figures(runtime: Path, say: Callable[[str], None], seconds: float) -
         time.sleep(seconds)
         phases.append(Phase(name, first, time.monotonic(), screen is not None))
 
-    with simulated_bench(RIG, seed=SEED, real_time=True) as endpoint:
-        place = RunPlace(endpoint, runtime, runtime / "watched")
-        with played(place, driven=False) as run:
-            measure("closed", None)
-            drawn: list[list[tuple[float, str]]] = []  # drawn text of each screen
-            for name, after in (("open", "killed"), ("restarted", "closed again")):
-                with Screen(runtime) as screen:
-                    if not run.has_sent("watched", ATTACH):
-                        raise WorkError("bench --only screen: the screen did not attach")
-                    screen.press(PAGE)
-                    measure(name, screen)
-                    drawn.append(screen.texts(phases[-1].first, phases[-1].last))
-                measure(after, None)
-            times = run.end()
+    with (
+        simulated_bench(RIG, seed=SEED, real_time=True) as endpoint,
+        played(endpoint, runtime, runtime / "watched", driven=False) as run,
+    ):
+        measure("closed", None)
+        drawn: list[list[tuple[float, str]]] = []  # drawn text of each screen
+        for name, after in (("open", "killed"), ("restarted", "closed again")):
+            with Screen(runtime) as screen:
+                if not run.has_sent("watched", ATTACH):
+                    raise WorkError("bench --only screen: the screen did not attach")
+                screen.press(PAGE)
+                measure(name, screen)
+                drawn.append(screen.texts(phases[-1].first, phases[-1].last))
+            measure(after, None)
+        times = run.end()
     return [*_lateness_figures(times, phases), *_age_figures(times, drawn)]
 
 

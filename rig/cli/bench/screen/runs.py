@@ -46,15 +46,6 @@ END_TIMEOUT: Final = 20.0  # of a run's process, from the request to its end [s]
 
 
 @dataclass(frozen=True)
-class RunPlace:
-    """Device of a run, parent of the folder of sockets, and the run's folder."""
-
-    endpoint: str
-    runtime: Path
-    out: Path
-
-
-@dataclass(frozen=True)
 class RunTimes:
     """Blocks of a run: `ends` [s of device time], `arrivals` [monotonic s], each shape (blocks,).
 
@@ -113,18 +104,17 @@ class StampedDriver:
         return RunTimes(ends, arrivals, lost, zeroed, tuple(self.zeroings), reason, held)
 
 
-def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
-    """Play one run in this process until it is stopped or `pipe` receives anything.
+def play(endpoint: str, runtime: Path, out: Path, driven: bool, pipe: Connection) -> None:
+    """Play one run into `out` in this process until it is stopped or `pipe` receives anything.
 
-    `driven` puts a square wave on the first joint. Sends "watched" once a screen is attached,
-    "held" once it is in command, and the RunTimes at the end.
+    `runtime` holds the folder of sockets. `driven` puts a square wave on the first joint. Sends
+    "watched" once a screen is attached, "held" once it is in command, and the RunTimes at the end.
     """
-    rig = load_rig(RIG)
-    rig = reached_at(rig, place.endpoint)
+    rig = reached_at(load_rig(RIG), endpoint)
     driver = StampedDriver(make_driver(rig.wire, rig), len(rig.channels), rig.sample_rate)
-    publisher = Publisher(rig.name, place.runtime / SESSIONS)
-    state = BenchState(rig.wire, place.runtime)
-    recorder = Recorder(place.out, rig)
+    publisher = Publisher(rig.name, runtime / SESSIONS)
+    state = BenchState(rig.wire, runtime)
+    recorder = Recorder(out, rig)
     reason, lost, held = "", 0, False
     try:
         with Bench(rig, cast("Driver", driver), recorder, publisher, state=state) as bench:
@@ -191,12 +181,12 @@ class PlayedRun:
 
 
 @contextmanager
-def played(place: RunPlace, *, driven: bool) -> Iterator[PlayedRun]:
-    """Play a run in a separate process, and end the process afterwards."""
+def played(endpoint: str, runtime: Path, out: Path, *, driven: bool) -> Iterator[PlayedRun]:
+    """Play a run in a separate process (see `play`), and end the process afterwards."""
     context = get_context("forkserver")  # starts a process with all imports in 20 ms
     context.set_forkserver_preload([__name__])
     pipe, run_pipe = context.Pipe()
-    process = context.Process(target=play, args=(place, run_pipe), kwargs={"driven": driven})
+    process = context.Process(target=play, args=(endpoint, runtime, out, driven, run_pipe))
     process.start()
     run_pipe.close()
     try:

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from rig.cli.bench.figure import Figure
-from rig.cli.bench.screen.runs import RIG, RunPlace, played
+from rig.cli.bench.screen.runs import RIG, PlayedRun, played
 from rig.cli.bench.screen.terminal import Screen
 from rig.cli.errors import WorkError
 from rig.cli.simulated.simulated_bench import simulated_bench
@@ -47,25 +47,24 @@ def busy_cores(count: int) -> Iterator[None]:
             process.wait()
 
 
-def one_stop(screen: Screen, place: RunPlace, wait: float) -> tuple[float, float]:
+def one_stop(screen: Screen, run: PlayedRun, wait: float) -> tuple[float, float]:
     """Return the delays [s] from a stop key to the run's zero command and to zero outputs.
 
-    Starts a run, takes control by the screen and presses the key `wait` [s] later. Both delays
-    are infinite if the key did not stop the run. Raises RunFailed if the run ends before the key.
+    Takes control of a new run by the screen and presses the key `wait` [s] later. Both delays are
+    infinite if the key did not stop the run. Raises RunFailed if the run ends before the key.
     """
-    with played(place, driven=True) as run:
-        if not run.has_sent("watched", ATTACH) and run.times is None:
-            raise WorkError("bench --only screen: the screen did not attach to the run")
-        time.sleep(SOON)
-        deadline = time.monotonic() + ATTACH
+    if not run.has_sent("watched", ATTACH) and run.times is None:
+        raise WorkError("bench --only screen: the screen did not attach to the run")
+    time.sleep(SOON)
+    deadline = time.monotonic() + ATTACH
+    screen.press("t")
+    while not run.has_sent("held", AGAIN) and run.times is None and time.monotonic() < deadline:
         screen.press("t")
-        while not run.has_sent("held", AGAIN) and run.times is None and time.monotonic() < deadline:
-            screen.press("t")
-        run.has_sent("nothing", wait)  # returns early only at the run's end
-        if run.times is not None:
-            raise RunFailed(run.times.reason)
-        pressed = screen.press(" ")
-        times = run.ended()
+    run.has_sent("nothing", wait)  # returns early only at the run's end
+    if run.times is not None:
+        raise RunFailed(run.times.reason)
+    pressed = screen.press(" ")
+    times = run.ended()
     if not times.held or FROM_SCREEN not in times.reason:
         return math.inf, math.inf
     acted = min(at for at in times.zeroings if at > pressed)
@@ -89,7 +88,8 @@ def many_stops(
                     out = runtime / f"stop-{failed}-{len(delays)}"
                     failed += 1  # taken back below if the key stopped it
                     wait = float(rng.uniform(SOON, LATE))
-                    delays.append(one_stop(screen, RunPlace(endpoint, runtime, out), wait))
+                    with played(endpoint, runtime, out, driven=True) as run:
+                        delays.append(one_stop(screen, run, wait))
                     failed -= 1
                     shutil.rmtree(out)
                     if len(delays) % 20 == 0:

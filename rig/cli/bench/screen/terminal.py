@@ -9,13 +9,14 @@ import re
 import select
 import struct
 import subprocess
-import sys
 import termios
 import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Self
+
+from rig.queue.processes import BRAMAH
 
 SIZE: Final = (120, 40)
 SESSIONS: Final = "bramah"  # the folder of sockets within $XDG_RUNTIME_DIR
@@ -40,9 +41,8 @@ class Screen:
         self._terminal, outer = pty.openpty()
         columns, rows = SIZE
         fcntl.ioctl(outer, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
-        command = [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor"]
         self._process = subprocess.Popen(
-            command, stdin=outer, stdout=outer, stderr=outer, env=environment,
+            [*BRAMAH, "monitor"], stdin=outer, stdout=outer, stderr=outer, env=environment,
             start_new_session=True,
         )  # fmt: skip
         os.close(outer)

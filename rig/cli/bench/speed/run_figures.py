@@ -55,24 +55,14 @@ class _Cost:
     wall: float
 
 
-@dataclass(frozen=True)
-class _Conversation:
-    """Requests of a host before, during and after the measurement, and the blocks during it."""
-
-    before: list[bytes]
-    measured: list[bytes]
-    after: list[bytes]
-    blocks: int
-
-
 def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
     """Measure a run in virtual time, `seconds` of streaming in real time, and pymodbus in both."""
     say(f"run: {PROTOCOL}, {STEP}, in virtual time, {ROUNDS} times")
     rig = load_rig(RIG)
     pairs = []
     for number in range(ROUNDS):
-        bramah, conversation = _protocol_run(rig, folder / f"run-{number}")
-        pairs.append((bramah, _repeated(rig, conversation)))
+        bramah, requests, blocks = _protocol_run(rig, folder / f"run-{number}")
+        pairs.append((bramah, _repeated(rig, requests, blocks)))
     figures = _figures("virtual time", pairs, 1.3)
     say(f"run: streaming in real time for {ROUNDS} times {seconds / ROUNDS:g} s")
     count = max(10, round(seconds / ROUNDS * rig.sample_rate / 10))
@@ -158,8 +148,12 @@ def _recording_driver(rig: Rig) -> tuple[ModbusTcpDriver, list[bytes]]:
     return Driver(rig.wire, rig), requests
 
 
-def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
-    """Run one step with guard, journal and publisher, as `bramah run` does."""
+def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, list[list[bytes]], int]:
+    """Run one step with guard, journal and publisher, as `bramah run` does.
+
+    Return its cost, the requests before, during and after the measurement, and the number of
+    blocks during it.
+    """
     plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
     with simulated_bench(RIG, seed=0) as endpoint:
         reached = reached_at(rig, endpoint)
@@ -177,24 +171,21 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
 
             cost, blocks = _cost(work)
             ended = len(requests)
-    return cost, _Conversation(requests[:before], requests[before:ended], requests[ended:], blocks)
+    return cost, [requests[:before], requests[before:ended], requests[ended:]], blocks
 
 
-def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
+def _repeated(rig: Rig, requests: list[list[bytes]], blocks: int) -> _Cost:
     """Send the same requests with pymodbus alone."""
     with simulated_bench(RIG, seed=0) as endpoint:
         at = TcpSettings.of(reached_at(rig, endpoint).wire)
         client: Any = ModbusTcpClient(at.host, port=at.port, timeout=2.0)
         client.connect()
-        calls = [
-            [_pymodbus_call(client, request) for request in part]
-            for part in (conversation.before, conversation.measured, conversation.after)
-        ]
+        calls = [[_pymodbus_call(client, request) for request in part] for part in requests]
 
         def ask(part: int) -> int:
             for call in calls[part]:
                 call()
-            return conversation.blocks
+            return blocks
 
         ask(0)
         cost, _ = _cost(lambda: ask(1))
