@@ -63,9 +63,7 @@ def regroup(minimum: Array, maximum: Array, count: int) -> tuple[Array, Array]:
     n = len(minimum)
     if n == 0:
         return np.full(count, np.nan), np.full(count, np.nan)
-    if n <= count:
-        index = np.arange(count) * n // count
-        return minimum[index], maximum[index]
+    # Of equal edges, `reduceat` takes the bucket at the edge.
     edges = np.arange(count) * n // count
     return np.fmin.reduceat(minimum, edges), np.fmax.reduceat(maximum, edges)
 
