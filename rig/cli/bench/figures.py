@@ -13,10 +13,9 @@ from typing import Any, Final
 
 from analysis.report import paper
 from analysis.trace.engine import trace
-from drivers import make_driver, wire_at
 from protocols.files.plan import Overrides
 from rig.cli.bench import plant
-from rig.cli.bench.acquisition import measure_acquisition
+from rig.cli.bench.acquisition import acquisition_figures, wire_figures
 from rig.cli.bench.faults.figures import fault_figures
 from rig.cli.bench.figure import Figure, processor_time
 from rig.cli.bench.screen.arrival import arrival_figures
@@ -30,9 +29,7 @@ from rig.cli.bench.speed.figures import (
 )
 from rig.cli.bench.speed.run_figures import run_figures
 from rig.cli.bench.stream_figures import stream_figures
-from rig.cli.bench.wire_figures import wire_figures
 from rig.cli.simulated.experiment import HIDDEN, RIG, Experiment, experiment
-from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.cli.text.output import Say, clock_text, table
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -126,26 +123,6 @@ def demo_figures(folder: Path, say: Say, seeds: int) -> list[Figure]:
     return figures
 
 
-def acquisition_figures(_: Path, say: Say, minutes: float) -> list[Figure]:
-    """Stream every channel in real time over the wire; count lost and late samples."""
-    say(f"acquisition: {minutes:g} min in real time over the wire")
-    rig = load_rig(RIG)
-    with simulated_bench(RIG, seed=JUDGING_SEED, real_time=True) as endpoint:
-        driver = make_driver(wire_at(endpoint, rig.wire), rig)
-        try:
-            measured = measure_acquisition(driver, driver.connect(), 60.0 * minutes)
-        finally:
-            driver.close()
-    return [
-        Figure("acquisition", "samples of every channel", measured["samples"]),
-        Figure("acquisition", "samples lost", measured["lost_samples"], "", 0.0),
-        Figure("acquisition", "blocks out of order", measured["out_of_order_blocks"], "", 0.0),
-        Figure("acquisition", "lateness, mean", 1e3 * measured["lateness_mean_s"], "ms"),
-        Figure("acquisition", "lateness, 99 %", 1e3 * measured["lateness_p99_s"], "ms"),
-        Figure("acquisition", "lateness, worst", 1e3 * measured["lateness_max_s"], "ms"),
-    ]
-
-
 def screen_figures(say: Say, seconds: float, *, quick: bool) -> list[Figure]:
     """Measure the screen, `seconds` per part; `quick` measures fewer parts and repetitions."""
     # A socket's address holds about 100 bytes: the folder's name must be short.
@@ -179,7 +156,7 @@ def measure(
         "demo": lambda folder, progress: demo_figures(folder, progress, seeds),
         "growth": lambda _, progress: growth_figures(progress),
         "run": lambda folder, progress: run_figures(folder, progress, streamed),
-        "acquisition": lambda folder, progress: acquisition_figures(folder, progress, minutes),
+        "acquisition": lambda _, progress: acquisition_figures(progress, minutes),
         "wires": lambda _, progress: wire_figures(progress, minutes),
         "faults": fault_figures,
         "screen": lambda _, progress: screen_figures(

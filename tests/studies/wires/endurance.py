@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from hil_sim.device.server import VALVES, WIRES
-from rig.cli.bench.wire_figures import stream_of
+from rig.cli.bench.acquisition import stream_of
 from rig.model.parse import InputError
 from rig.model.trips import SafetyTrip
 

@@ -30,8 +30,8 @@ from protocols.files.plan import Overrides, resolve
 from rig.bench.guard import GuardSettings
 from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
+from rig.cli.bench.acquisition import bare_modbus
 from rig.cli.bench.figure import Figure
-from rig.cli.bench.wire_figures import bare_modbus
 from rig.cli.execution.device import reached_at
 from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.cli.text.output import Say
