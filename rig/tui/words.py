@@ -129,11 +129,13 @@ def nearest_margin(frame: Frame) -> Margin | None:
     The piston of a joint that moves freely may touch its ends and does not count.
     """
     snapshot = frame.snapshot
+    if snapshot is None:
+        return None
     best: Margin | None = None
-    for name, view in snapshot.channels.items() if snapshot is not None else ():
+    for name, view in snapshot.channels.items():
         low, high = limit(view.low), limit(view.high)
         kind, joint = place_of(name)
-        free = snapshot is not None and joint is not None and role_of(snapshot, joint) == "free"
+        free = joint is not None and role_of(snapshot, joint) == "free"
         if low is None or high is None or not high > low or (kind == ch.PISTON and free):
             continue
         extremes = frame.window.span(name, frame.device_time - RECENT) or (view.last, view.last)

@@ -24,7 +24,7 @@ from rig.cli.options import (
     time_since,
     writable_file,
 )
-from rig.cli.text.output import print_result, progress, table, write_json
+from rig.cli.text.output import print_result, progress, table
 
 if TYPE_CHECKING:
     from rig.queue.items import Item, QueueJob
@@ -281,25 +281,18 @@ def list_items(
     shown = [item for item in items if not state or item.state in state]
     pid = runner_of(_path(queue))
     document = {"paused": paused, "runner": pid, "items": [item.as_dict() for item in shown]}
-    write_json(json, document)
-    if json == Path("-"):
-        return
-    if shown:
-        header = ("item", "priority", "state", "name", "min", "reason or condition")
-        typer.echo(
-            table(
-                header,
-                [_line(item) for item in shown],
-                left=("name", "state", "reason or condition"),
-            )
-        )
+    header = ("item", "priority", "state", "name", "min", "reason or condition")
+    rows = [_line(item) for item in shown]
+    left = ("name", "state", "reason or condition")
+    lines = [table(header, rows, left)] if shown else []
     pending = [item for item in items if not item.over]
     minutes = sum(item.proof.get("seconds") or 0.0 for item in pending) / 60.0
     runner = f"run by process {pid}" if pid else "no process runs the queue"
-    typer.echo(
+    lines.append(
         f"{len(pending)} of {len(items)} items have not ended, about {minutes:.0f} min of the "
         f"device's time; {paused or runner}"
     )
+    print_result(json, document, "\n".join(lines))
 
 
 def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
@@ -312,32 +305,30 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
     from rig.queue.runner import log_of
 
     with _open_queue(queue) as store:
-        entry, lines = store.item(item), store.history(item)
+        entry, history = store.item(item), store.history(item)
     log = log_of(_path(queue), entry)
     document: dict[str, Any] = entry.as_dict()
-    document |= {"history": [asdict(line) for line in lines], "log": str(log)}
-    write_json(json, document)
-    if json == Path("-"):
-        return
+    document |= {"history": [asdict(line) for line in history], "log": str(log)}
     job = entry.job
-    typer.echo(f"item {entry.id} {job.name}: {entry.state}")
+    lines = [f"item {entry.id} {job.name}: {entry.state}"]
     fields = {
         "reason": entry.reason, "protocol": job.protocol, "rig": job.rig,
         "endpoint": job.endpoint, "options": " ".join(job.options), "run": entry.run or job.out,
         "log": str(log) if log.exists() else "",
     }  # fmt: skip
-    for key, value in fields.items():
-        if value:
-            typer.echo(f"  {key:9s} {value}")
-    for line in lines:
-        typer.echo(f"  {_local(line.time)}  {line.event}{': ' if line.reason else ''}{line.reason}")
+    lines += [f"  {key:9s} {value}" for key, value in fields.items() if value]
+    lines += [
+        f"  {_local(line.time)}  {line.event}{': ' if line.reason else ''}{line.reason}"
+        for line in history
+    ]
     if entry.results.get("parameters"):
         rows = [
             (name, f"{p['value']:.5g}", f"{p['std']:.2g}" if p.get("std") else "—", p["unit"])
             for name, p in entry.results["parameters"].items()
             if p.get("value") is not None
         ]
-        typer.echo(table(("parameter", "value", "std", "unit"), rows))
+        lines.append(table(("parameter", "value", "std", "unit"), rows))
+    print_result(json, document, "\n".join(lines))
 
 
 def run(

@@ -42,10 +42,8 @@ KEYS: Final = {
     "log": "↑↓ scroll  / search  f filter  e end",
     "run log": "↑↓ scroll  / search  f filter  e end  0 runs",
     "run trace": "↑↓ scroll  ←→ channel  0 runs",
-    "estimates": "",
     "manual": "hold ↑ ↓ jog  ←→ joint  l lock  u unlock  x end",
     "runs": "← → tabs  ↑ ↓ mark  Enter what can be done",
-    "diagnostics": "",
 }
 
 
@@ -66,15 +64,14 @@ def compose(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def _page(view: PlotView, width: int, height: int) -> list[Row]:
-    always = OF_THE_DISK.get(view.look.page)
-    if always is not None:
-        return always(view, width, height)
-    page = OF_A_RUN.get(view.look.page)
-    if view.newest.stage is LinkStage.CHOOSING:
-        return chooser(view, width, height)
-    if page is not None and view.frame.snapshot is None:
-        return waiting(view, width, height)
-    return page(view, width, height) if page is not None else []
+    page = OF_THE_DISK.get(view.look.page)
+    if page is None:
+        page = OF_A_RUN[view.look.page]
+        if view.newest.stage is LinkStage.CHOOSING:
+            page = chooser
+        elif view.frame.snapshot is None:
+            page = waiting
+    return page(view, width, height)
 
 
 def too_small(view: PlotView, width: int, height: int) -> list[Row]:
