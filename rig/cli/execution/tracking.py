@@ -130,8 +130,6 @@ class Tracking:
     """
 
     def __init__(self, rig: Rig, out: Path, say: Say, memory: float = math.inf) -> None:
-        if not memory > 0.0:
-            raise InputError(f"--memory {memory:g}: expected more than 0 s")
         self.parameters: dict[str, Any] = {}
         # By family: rms of the prediction error of new rows, and of their right side.
         self.residuals: dict[str, list[float]] = {}
