@@ -6,7 +6,7 @@ Pages are plain functions that return rows. Only rows that changed are drawn aga
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from textwrap import wrap
 
@@ -159,6 +159,35 @@ def wrapped(text: str, width: int, style: str = PLAIN) -> list[Row]:
     lines = [part for line in text.splitlines() for part in wrap(line, max(width, 8)) or [""]]
     rows = [row((line, style)) for line in lines]
     return [fit(line, width, style) for line in rows] if " on " in style else rows
+
+
+def marked(mark: Part, text: str, width: int, style: str = PLAIN) -> list[Row]:
+    """Return a text as rows up to `width` wide behind a mark; further rows are indented."""
+    sign, sign_style = mark
+    lines = wrapped(text, max(width - len(sign), 1), style) or [row()]
+    return [row((sign if k == 0 else " " * len(sign), sign_style), *line)
+            for k, line in enumerate(lines)]  # fmt: skip
+
+
+def grid(
+    boxes: Sequence[Callable[[int, int], list[Row]]],
+    across: int,
+    least: int,
+    width: int,
+    height: int,
+) -> tuple[list[Row], int]:
+    """Return boxes drawn by (width, height) in rows of `across`, and how many are hidden.
+
+    There are as many rows as fit, each of at least `least` lines, but one in any case.
+    """
+    down = max(min(-(-len(boxes) // across), height // least), 1)
+    each = (width - (across - 1)) // across
+    rows: list[Row] = []
+    for k in range(down):
+        share = (height - len(rows)) // (down - k)
+        in_row = boxes[across * k : across * (k + 1)]
+        rows += hstack([(draw(each, share), each) for draw in in_row], share)
+    return rows, max(len(boxes) - across * down, 0)
 
 
 def columns(rows: Iterable[Sequence[str | Part]], gap: int = 2) -> list[Row]:

@@ -6,17 +6,18 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 
 from rig.model.units import plain, with_interval
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
-from rig.tui.drawing.rows import Row, block, box, fit, hstack, row, wrapped
+from rig.tui.drawing.rows import Row, block, box, fit, grid, marked, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
 from rig.tui.following.link import TrackedPoint
 from rig.tui.look import PlotView
-from rig.tui.pages.parts import freshness_label
+from rig.tui.pages.parts import WIDTH, freshness_label
 from rig.tui.units import clock_text, shown
 from rig.tui.words import Freshness
 
@@ -133,28 +134,17 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
         return block(wrapped(f" {text}", width, DIM), width, height)
     head: list[Row] = []
     for text in warnings_of(series):
-        lines = wrapped(text, width - 3)
-        marks = ["▲", *" " * (len(lines) - 1)]
-        head += [
-            fit(row((f" {mark} ", WARN_TEXT), *((part, WARN_TEXT) for part, _ in line)), width)
-            for mark, line in zip(marks, lines, strict=True)
-        ]
+        lines = marked((" ▲ ", WARN_TEXT), text, width, WARN_TEXT)
+        head += [fit(line, width) for line in lines]
     unknown = ", ".join(name for name in newest if name not in names)
     foot = [fit(row((f" not known yet: {unknown}", DIM)), width)] if unknown else []
-    boxes = [*((_residual, family) for family in families(series)),
-             *((_estimate, name) for name in names)]  # fmt: skip
+    boxes = {family: partial(_residual, view, family) for family in families(series)}
+    boxes |= {name: partial(_estimate, view, name) for name in names}
     room = height - len(head) - len(foot)
-    across = max(min(width // 38, len(boxes)), 1)
-    down = min(-(-len(boxes) // across), max(room // LEAST_PLOT, 1))
-    hidden = len(boxes) - across * down
-    each = (width - (across - 1)) // across
-    rows: list[Row] = []
-    for k in range(down):
-        share = (room - len(rows)) // (down - k)
-        in_row = boxes[across * k : across * (k + 1)]
-        rows += hstack([(draws(view, name, each, share), each) for draws, name in in_row], share)
+    across = max(min(width // WIDTH, len(boxes)), 1)
+    rows, hidden = grid(list(boxes.values()), across, LEAST_PLOT, width, room)
     if hidden > 0:
-        text = ", ".join(name for _, name in boxes[-hidden:])
+        text = ", ".join(list(boxes)[-hidden:])
         foot = [fit(row((f" a larger terminal also shows {text}", DIM)), width)]
     return block([*head, *rows, *foot], width, height)
 

@@ -43,12 +43,9 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
         above = hstack(sides, room, gap=2)
     else:
         above = curves(view, names, inner, room)
-    title = f"{joint_title(view, joint)} of {len(joints)}  ← →"
-    remark = freshness_label(view)
+    title = joint_title(view, joint, f" of {len(joints)}  ← →")
     note = f"last {view.look.seconds:g} s  + − ="
-    return box(
-        f"{title} · {remark}" if remark else title, [*above, *bars], width, height, DIM, note
-    )
+    return box(title, [*above, *bars], width, height, DIM, note)
 
 
 def manual_page(view: PlotView, width: int, height: int) -> list[Row]:

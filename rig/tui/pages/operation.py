@@ -8,7 +8,7 @@ from functools import partial
 
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw
-from rig.tui.drawing.rows import Row, block, box, columns, fit, row, window, wrapped
+from rig.tui.drawing.rows import Row, block, box, columns, fit, marked, row, window, wrapped
 from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.following.event_lines import EventLine
 from rig.tui.look import PlotView
@@ -152,10 +152,8 @@ def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
     head = [fit(row((f" log of {log.folder}", STRONG), (state, DIM)), width)]
     if log.reading:
         return block([*head, row((" reading ...", DIM))], width, height)
-    head += [
-        row(((" ▲ " if k == 0 else "   "), WARN_TEXT), *line)
-        for k, line in enumerate(wrapped(log.trouble, width - 3, WARN_TEXT) if log.trouble else ())
-    ]
+    if log.trouble:
+        head += marked((" ▲ ", WARN_TEXT), log.trouble, width, WARN_TEXT)
     return [*head, *log_rows(log.lines, view, width, max(height - len(head), 1))]
 
 
@@ -167,7 +165,11 @@ def log_rows(
     room = height - 1
     scrolled = view.look.offset
     # A line has at least one row: lines above the window need not be wrapped.
-    rows = [line for entry in lines[-(room + scrolled) :] for line in _log_line(entry, width)]
+    rows = [
+        line
+        for entry in lines[-(room + scrolled) :]
+        for line in marked((f"{entry.time:10.2f} s  ", DIM), entry.text, width, entry.style)
+    ]
     offset = min(scrolled, max(len(rows) - room, 0))
     search = f"  search: {view.look.search}" if view.look.search else ""
     where = f"  {offset} rows back" if offset else ""
@@ -175,11 +177,3 @@ def log_rows(
     head = row((f" {view.look.only}{search}", STRONG), (count, DIM))
     shown_rows = rows[max(len(rows) - room - offset, 0) : len(rows) - offset]
     return block([head, *shown_rows], width, height)
-
-
-def _log_line(line: EventLine, width: int) -> list[Row]:
-    moment = f"{line.time:10.2f} s  "
-    texts = wrapped(line.text, max(width - len(moment), 1), line.style) or [row()]
-    return [
-        row((moment if k == 0 else " " * len(moment), DIM), *text) for k, text in enumerate(texts)
-    ]

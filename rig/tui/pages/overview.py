@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from rig.bench.screens.sockets import Snapshot
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.large import ROWS, large, large_width
-from rig.tui.drawing.rows import Row, block, fit, hstack, row
+from rig.tui.drawing.rows import Row, block, fit, grid, hstack, row
 from rig.tui.drawing.styles import ALARM, ALARM_TEXT, DIM, LEVELS, STRONG, WARN, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import WIDTH, bench_bars, joint_box, joints_in
@@ -15,6 +17,7 @@ from rig.tui.words import Headline, Margin, headline, nearest_margin, time_left
 NEAR = 0.10  # a margin below this share of its band is yellow
 BIG = (150, 45)  # terminal of this size: letters twice as large
 GLANCE = 3  # alarms listed
+JOINT_ROWS = 9  # least height of a joint
 
 
 def overview(view: PlotView, width: int, height: int) -> list[Row]:
@@ -118,22 +121,15 @@ def _joints(view: PlotView, joints: list[int], width: int, height: int) -> list[
     if not joints or height < 3:
         return block([], width, max(height, 0))
     across = max(min(width // WIDTH, len(joints)), 1)
-    if len(joints) > across * max(height // 9, 1):
+    if len(joints) > across * max(height // JOINT_ROWS, 1):
         snapshot = view.frame.snapshot
         roles = snapshot.roles if snapshot is not None else []
         locked = {joint for joint, role in enumerate(roles, 1) if role == "locked"}
         joints = sorted(joints, key=lambda joint: joint in locked)
     first = min(view.look.offset, max(len(joints) - across, 0))
-    chosen = joints[first:]
-    rows_of = [chosen[k : k + across] for k in range(0, len(chosen), across)]
-    fits = max(min(len(rows_of), height // 9), 1)
-    rows: list[Row] = []
-    for k, group in enumerate(rows_of[:fits]):
-        share = (height - len(rows)) // (fits - k)
-        each = (width - (across - 1)) // across
-        blocks = [(joint_box(view, joint, each, share), each) for joint in group]
-        rows += hstack(blocks, share)
-    hidden = len(joints) - sum(map(len, rows_of[:fits]))
+    boxes = [partial(joint_box, view, joint) for joint in joints[first:]]
+    rows, below = grid(boxes, across, JOINT_ROWS, width, height)
+    hidden = first + below
     if hidden > 0:
         rows[-1] = fit(row((f" {hidden} more joints: ↑ ↓ ", DIM)), width)
     return block(rows, width, height)

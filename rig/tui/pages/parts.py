@@ -203,11 +203,13 @@ def curves(view: PlotView, names: dict[str, str], width: int, height: int) -> li
     return rows
 
 
-def joint_title(view: PlotView, joint: int) -> str:
-    """Return a joint's name with its present activity."""
+def joint_title(view: PlotView, joint: int, note: str = "") -> str:
+    """Return a joint's name with its present activity, a note, and the label of its picture."""
     snapshot = view.frame.snapshot
     role = ROLES.get(role_of(snapshot, joint), "") if snapshot is not None else ""
-    return f"joint {joint} {role}".rstrip()
+    title = f"joint {joint} {role}".rstrip() + note
+    label = freshness_label(view)
+    return f"{title} · {label}" if label else title
 
 
 def joint_channels(view: PlotView, joint: int, width: int) -> tuple[list[Row], dict[str, str]]:
@@ -222,14 +224,12 @@ def joint_channels(view: PlotView, joint: int, width: int) -> tuple[list[Row], d
 
 def joint_box(view: PlotView, joint: int, width: int, height: int) -> list[Row]:
     """Return one joint in a frame: curves if there is room, bars always."""
-    title = joint_title(view, joint)
-    remark = freshness_label(view)
-    style = DIM if not remark or remark in ("last picture", "held") else WARN_TEXT
-    title = f"{title} · {remark}" if remark else title
+    style = WARN_TEXT if view.fresh in (Freshness.STALE, Freshness.DISCONNECTED) else DIM
     inner = width - 4
     bars, names = joint_channels(view, joint, inner)
     above = curves(view, names, inner, height - 2 - len(bars))
-    return box(title, [*above, *bars], width, height, style, f"last {view.look.seconds:g} s")
+    title, note = joint_title(view, joint), f"last {view.look.seconds:g} s"
+    return box(title, [*above, *bars], width, height, style, note)
 
 
 def bench_bars(view: PlotView, width: int) -> list[Row]:
