@@ -129,6 +129,12 @@ ModelOption = Annotated[
 NominalOption = Annotated[
     bool, typer.Option("--nominal", help="Use the rig file's nominal values for the twin instead.")
 ]
+ReportOption = Annotated[
+    Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
+]
+ProtocolFileOption = Annotated[
+    Path | None, typer.Option(help="Write the protocol file here.", callback=writable_file)
+]
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
 
 

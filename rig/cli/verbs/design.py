@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -12,17 +11,15 @@ from rig.cli.options import (
     ModelOption,
     NominalOption,
     ProtocolArgument,
+    ProtocolFileOption,
     RigOption,
-    writable_file,
 )
 
 
 def design(
     protocol: ProtocolArgument,
     rig: RigOption,
-    out: Annotated[
-        Path | None, typer.Option(help="Write the protocol file here.", callback=writable_file)
-    ] = None,
+    out: ProtocolFileOption = None,
     criterion: Annotated[
         str, typer.Option(help="D, E, or the name of the parameter to improve.")
     ] = "E",

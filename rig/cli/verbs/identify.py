@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import JsonOption, RunsArgument, writable_file
+from rig.cli.options import JsonOption, ReportOption, RunsArgument, writable_file
 from rig.cli.text.output import Countdown, printed_at_end, progress, write_json
 
 if TYPE_CHECKING:
@@ -157,9 +157,7 @@ def identify(
     model: Annotated[
         Path | None, typer.Option(help="Write the model file here.", callback=writable_file)
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
-    ] = None,
+    report: ReportOption = None,
     truth: Annotated[
         Path | None,
         typer.Option(help="Compare with the true parameters in this file of `bramah sim --truth`."),

@@ -8,15 +8,13 @@ from typing import Annotated
 import typer
 
 from rig.cli.errors import WorkError
-from rig.cli.options import JsonOption, RigOption, writable_file
+from rig.cli.options import JsonOption, ProtocolFileOption, RigOption, writable_file
 from rig.cli.text.output import print_result
 
 
 def plan(
     rig: RigOption,
-    out: Annotated[
-        Path | None, typer.Option(help="Write the protocol file here.", callback=writable_file)
-    ] = None,
+    out: ProtocolFileOption = None,
     validation: Annotated[
         Path | None,
         typer.Option(help="Write a protocol for validation data here.", callback=writable_file),

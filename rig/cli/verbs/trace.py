@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from rig.cli.options import JsonOption, writable_file
+from rig.cli.options import JsonOption, ReportOption, writable_file
 from rig.cli.text.output import Countdown, printed_at_end, progress, write_json
 
 FAMILIES_OF: Final = {
@@ -36,9 +36,7 @@ def trace(
         Path | None,
         typer.Option(help="Start from this model file and take its effects as known."),
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
-    ] = None,
+    report: ReportOption = None,
     equations: Annotated[
         str, typer.Option(help="Equations to trace: all, torque or flow.")
     ] = "all",
