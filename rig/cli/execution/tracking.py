@@ -7,7 +7,6 @@ do not fit into the tracker's queue are lost samples for the tracker alone.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
@@ -16,7 +15,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from types import TracebackType
@@ -204,7 +202,7 @@ class Tracking:
         """Wait for the last estimates and write all estimates into the run folder."""
         written = len(self._history)
         self._notes, self._shows = [], []  # the bench is closed, so waiting is safe
-        self._send([b"stop"])
+        self._send("stop")
         deadline = time.monotonic() + FINISH_SECONDS
         ended = False
         while not ended and self._process.is_alive() and time.monotonic() < deadline:
@@ -229,8 +227,7 @@ class Tracking:
     def block(self, block: SampleBlock) -> None:
         """Send a block to the tracker and read its answers; never waits."""
         started = time.perf_counter()
-        tick = str(block.tick).encode()
-        self._send([b"block", tick, np.ascontiguousarray(block.data, dtype="<f8").tobytes()])
+        self._send("block", block.tick, block.data)
         self._receive()
         self.worst_handover = max(self.worst_handover, time.perf_counter() - started)
 
@@ -240,17 +237,15 @@ class Tracking:
             meta.name, meta.step, meta.locked, meta.repeat, self._rig.sample_rate, 0,
             tuple(self._rig.recorded), start / self._rig.sample_rate, meta.period, meta.lines,
         )  # fmt: skip
-        span = json.dumps([start, ticks]).encode()
-        self._send([b"begin", span, json.dumps(asdict(head)).encode()])
+        self._send("begin", head, start, ticks)
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
         """Announce the end of a record."""
-        fields = [str(start), str(ticks), state, meta.name]
-        self._send([b"end", *(field.encode() for field in fields)])
+        self._send("end", meta.name, start, ticks, state == "complete")
 
-    def _send(self, parts: list[bytes]) -> None:
+    def _send(self, *message: object) -> None:
         try:
-            self._socket.send_multipart(parts, zmq.NOBLOCK)
+            self._socket.send_pyobj(message, zmq.NOBLOCK)
         except zmq.Again:
             self._dropped += 1
             if self._dropped == 1:
@@ -262,7 +257,7 @@ class Tracking:
         """Read the tracker's messages; return whether the last one is among them."""
         while True:
             try:
-                reply = json.loads(self._socket.recv(zmq.NOBLOCK))
+                reply: Any = self._socket.recv_json(zmq.NOBLOCK)
             except zmq.Again:
                 return False
             if reply["kind"] == "failed":
@@ -305,40 +300,33 @@ def track_run(rig: Rig, memory: float, endpoint: str) -> None:
     try:
         _serve(rig, Tracker(rig, memory=memory), socket)
     except InputError as error:
-        socket.send_string(json.dumps({"kind": "failed", "message": str(error)}))
+        socket.send_json({"kind": "failed", "message": str(error)})
     finally:
         socket.close()
         context.term()
 
 
 def _serve(rig: Rig, tracker: Tracker, socket: zmq.Socket[bytes]) -> None:
-    follower, width, parent = Follower(rig, tracker), len(rig.recorded), parent_process()
+    follower, parent = Follower(rig, tracker), parent_process()
     while True:
         if not socket.poll(1000):
             if parent is not None and not parent.is_alive():
                 return
             continue
-        kind, *fields = socket.recv_multipart()
-        if kind == b"block":
-            data = np.frombuffer(fields[1], dtype="<f8").reshape(-1, width)
-            if follower.block(int(fields[0]), data):
+        kind, *fields = socket.recv_pyobj()
+        if kind == "block":
+            if follower.block(*fields):
                 _reply(socket, "now", tracker)
-        elif kind == b"begin":
-            follower.begins(_head(json.loads(fields[1])), *json.loads(fields[0]))
-        elif kind == b"end":
-            start, ticks, state, name = (field.decode() for field in fields)
-            follower.ends(int(start), int(ticks), state == "complete")
-            if state == "complete":
+        elif kind == "begin":
+            follower.begins(*fields)
+        elif kind == "end":
+            name, start, ticks, complete = fields
+            follower.ends(start, ticks, complete)
+            if complete:
                 _reply(socket, "record", tracker, record=name, rows=tracker.record_rows)
         else:
             _reply(socket, "last", tracker)
             return
-
-
-def _head(data: dict[str, Any]) -> RecordHead:
-    lists = ("locked", "channels", "lines")
-    fields: dict[str, Any] = {k: tuple(v) if k in lists else v for k, v in data.items()}
-    return RecordHead(**fields)
 
 
 def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **fields: str | int) -> None:
@@ -351,6 +339,6 @@ def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **fields: str
     }
     message = {"kind": kind, "parameters": parameters, "residuals": residuals, **fields}
     try:
-        socket.send_string(json.dumps(message), zmq.NOBLOCK)
+        socket.send_json(message, zmq.NOBLOCK)
     except zmq.Again:
         log.debug("the run does not read the estimates; they are dropped")
