@@ -48,8 +48,8 @@ class Headline:
         return SYMBOLS[self.level]
 
 
-class KeyAnswer(Enum):
-    """Result of a stop."""
+class StopAnswer(Enum):
+    """What became of a stop that the operator sent."""
 
     SENDING = 0
     TAKEN = 1
@@ -63,7 +63,7 @@ class Stop:
 
     at: float
     endpoint: Endpoint | None
-    answer: KeyAnswer = KeyAnswer.SENDING
+    answer: StopAnswer = StopAnswer.SENDING
 
 
 @dataclass(frozen=True)
@@ -225,15 +225,15 @@ def alarm_notices(snapshot: Snapshot) -> list[Notice]:
 
 def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
     """Return the result of the operator's stop; only the run itself confirms it."""
-    if stop.answer is KeyAnswer.NOWHERE:
+    if stop.answer is StopAnswer.NOWHERE:
         return Notice("alarm", "STOP: NOTHING SENT, no run is attached to this screen.")
-    if stop.answer is KeyAnswer.NONE:
+    if stop.answer is StopAnswer.NONE:
         if frame.snapshot is not None and frame.snapshot.state in ENDED_STATES:
             return Notice("warn", f"STOP: no answer, the run had ended ({frame.snapshot.state})")
         return Notice("alarm", f"STOP: NO ANSWER from the run. {EMERGENCY}")
     if stop.endpoint is not None and stop.endpoint != frame.endpoint:
         session = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
-        result = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
+        result = "sending ..." if stop.answer is StopAnswer.SENDING else "taken"
         return Notice("warn", f"STOP to {session}, which is not the run shown: {result}")
     return _stop_of_shown_run(frame, stop, now)
 
@@ -241,7 +241,7 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
 def _stop_of_shown_run(frame: Frame, stop: Stop, now: float) -> Notice:
     if frame.snapshot is not None and _zeroed(frame.snapshot):
         return Notice("normal", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
-    if stop.answer is KeyAnswer.SENDING:
+    if stop.answer is StopAnswer.SENDING:
         return Notice("warn", "STOP: sending ...")
     if frame.over:
         message = frame.snapshot.message if frame.snapshot is not None else ""

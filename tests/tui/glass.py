@@ -14,7 +14,7 @@ from rig.bench.screens.commands import Command
 from rig.bench.screens.snapshot import PastMinute
 from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.tui.app import Monitor
-from rig.tui.words import KeyAnswer
+from rig.tui.words import StopAnswer
 
 
 def endpoint(rig: str = "shinshu-2dof", pid: int = 4711) -> Endpoint:
@@ -98,7 +98,7 @@ class Glass:
 
     async def answered(self) -> None:
         """Wait until the stop that was pressed has an answer, and draw."""
-        while self.app.stop_asked is None or self.app.stop_asked.answer is KeyAnswer.SENDING:
+        while self.app.stop_asked is None or self.app.stop_asked.answer is StopAnswer.SENDING:
             await self.pilot.pause(0.005)
         await self.watch()
 

@@ -20,8 +20,8 @@ from rig.tui.units import Band, age_text, band, clock_text, limit, shown
 from rig.tui.words import (
     Freshness,
     Headline,
-    KeyAnswer,
     Stop,
+    StopAnswer,
     headline,
     nearest_margin,
     notices,
@@ -123,18 +123,18 @@ def test_the_age_includes_how_late_the_block_already_was() -> None:
 @pytest.mark.parametrize(
     ("answer", "state", "later", "level", "words"),
     [
-        (KeyAnswer.SENDING, "running", 0.1, "warn", "sending"),
-        (KeyAnswer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
-        (KeyAnswer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
-        (KeyAnswer.TAKEN, "tripped", 0.1, "normal", "OUTPUTS ZEROED"),
-        (KeyAnswer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
-        (KeyAnswer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
-        (KeyAnswer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
-        (KeyAnswer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
+        (StopAnswer.SENDING, "running", 0.1, "warn", "sending"),
+        (StopAnswer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
+        (StopAnswer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
+        (StopAnswer.TAKEN, "tripped", 0.1, "normal", "OUTPUTS ZEROED"),
+        (StopAnswer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
+        (StopAnswer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
+        (StopAnswer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
+        (StopAnswer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
     ],
 )
 def test_a_stop_is_called_what_it_is(
-    answer: KeyAnswer, state: str, later: float, level: str, words: str
+    answer: StopAnswer, state: str, later: float, level: str, words: str
 ) -> None:
     frame = replace(LIVE, snapshot=replace(VIEW, state=state), received=100.0 + later)
     notice = next(
@@ -154,7 +154,7 @@ def test_a_stop_is_called_what_it_is(
 )
 def test_only_a_run_that_says_it_stopped_confirms_a_stop(message: str, level: str) -> None:
     frame = replace(LIVE, snapshot=replace(VIEW, state="aborted", message=message))
-    notice = next(n for n in said(frame, Stop(100.0, HERE, KeyAnswer.TAKEN)) if "STOP" in n[1])
+    notice = next(n for n in said(frame, Stop(100.0, HERE, StopAnswer.TAKEN)) if "STOP" in n[1])
     assert notice[0] == level
 
 
@@ -162,14 +162,14 @@ def test_only_a_run_that_says_it_stopped_confirms_a_stop(message: str, level: st
 def test_outputs_that_may_not_be_zero_stand_above_all_else(state: str) -> None:
     message = "the device does not answer; outputs not confirmed at zero"
     frame = replace(LIVE, snapshot=replace(tripped(VIEW), state=state, message=message))
-    level, text = said(frame, Stop(100.0, HERE, KeyAnswer.TAKEN))[0]
+    level, text = said(frame, Stop(100.0, HERE, StopAnswer.TAKEN))[0]
     assert level == "alarm"
     assert text.startswith("OUTPUTS NOT CONFIRMED AT ZERO: ")
     assert "emergency stop" in text
 
 
 def test_a_stop_of_another_run_is_never_confirmed_by_the_one_shown() -> None:
-    elsewhere = Stop(100.0, endpoint("press", 7), KeyAnswer.TAKEN)
+    elsewhere = Stop(100.0, endpoint("press", 7), StopAnswer.TAKEN)
     frame = replace(LIVE, snapshot=stopped(VIEW))
     texts = [text for _, text in said(frame, elsewhere)]
     assert any("press (process 7), which is not the run shown: taken" in text for text in texts)

@@ -136,7 +136,7 @@ def twin_text(source: TwinSource, warning: str = "") -> str:
     return f"the twin uses {source_text(source)}{note}"
 
 
-def _age_text(saved: str, now: datetime | None = None) -> str:
+def _age_text(saved: str, now: datetime | None) -> str:
     try:
         written = datetime.fromisoformat(saved)
         seconds = ((now or datetime.now(UTC)) - written).total_seconds()

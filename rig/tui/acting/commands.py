@@ -16,7 +16,7 @@ from rig.tui.following.link import Link, LinkStage
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
-from rig.tui.words import KeyAnswer, Stop
+from rig.tui.words import Stop, StopAnswer
 
 CHOOSE_KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
 MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort needs no confirmation
@@ -55,8 +55,8 @@ class Commands:
         def answered(where: Endpoint | None, taken: bool) -> None:
             # Called by the sending thread: replacing one attribute needs no lock.
             if self.stop_asked is stop:
-                not_taken = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
-                answer = KeyAnswer.TAKEN if taken else not_taken
+                not_taken = StopAnswer.NOWHERE if where is None else StopAnswer.NONE
+                answer = StopAnswer.TAKEN if taken else not_taken
                 self.stop_asked = replace(stop, endpoint=where, answer=answer)
                 self.redraw()
 
