@@ -107,6 +107,13 @@ async def test_two_operators_one_is_in_command_and_the_other_must_take_over() ->
         assert "in command: process 8 on elsewhere" in shown.text
 
 
+@pytest.mark.parametrize(("key", "word"), [("t", "take"), ("p", "pause"), ("n", "skip")])
+async def test_a_key_that_commands_a_run_says_that_none_is_attached(key: str, word: str) -> None:
+    async with glass(Machine({})) as shown:
+        await shown.press(key)
+        assert shown.app.remark == f"{word}: no run is attached."
+
+
 async def test_nothing_is_asked_of_a_run_that_is_over() -> None:
     record = running(state="done", engine="safe")
     async with glass(Machine({HERE: record})) as shown:

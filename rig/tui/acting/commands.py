@@ -69,7 +69,7 @@ class Commands:
     def command(self, word: str, value: str = "", done: str = "") -> None:
         """Send a command to the run, or show why none can be sent."""
         endpoint = self.link.frame.endpoint
-        if endpoint is not None and self._may_command(word):
+        if self._may_command(word) and endpoint is not None:
             self.remark = f"{word}: asking ..."
             self.link.ask(endpoint, word, value, lambda no: self._show_answer(word, done, no))
 
