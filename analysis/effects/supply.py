@@ -288,7 +288,7 @@ class TankPressure(PortEffect):
         p = rig.supply.pressure
         return (
             Shape("p_tank", "Pa", 0.0, 0.4 * p, (0.02 * p, 0.1 * p), 0.0),
-            Shape("p_back", "Pa", 0.0, 2.0 * p, (0.0, 0.05 * p), 0.0),
+            Shape("p_back", "Pa", 0.0, 0.75 * p, (0.0, 0.05 * p), 0.0),
         )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:

@@ -158,10 +158,10 @@ def test_a_drop_that_no_record_reaches_may_be_that_of_any_line_beyond(
 def test_a_drop_of_the_return_line_that_no_record_reaches_may_be_large(
     rig: Rig, lifting: Signals
 ) -> None:
-    """A tenth of the supply pressure at a third of the pump's flow is 0.9 of it at the whole."""
+    """A tenth of the supply pressure at 0.38 of the pump's flow is 0.7 of it at the whole."""
     p, flow = rig.supply.pressure, float(port_flow(rig, lifting, drawn=False).max())
-    rated = rig.model_copy(update={"supply": rig.supply.model_copy(update={"flow": 3.0 * flow})})
-    shape = (0.1 * p, 0.9 * p)
+    rated = rig.model_copy(update={"supply": rig.supply.model_copy(update={"flow": 7**0.5 * flow})})
+    shape = (0.1 * p, 0.7 * p)
     raised = TankPressure("bench").prepare(rated, lifting, shape).p_tank - lifting.p_tank
     assert raised.max() == pytest.approx(0.2 * p, rel=1e-3)
     assert TankPressure("bench").problem(rated, {}, shape) == ""
