@@ -42,7 +42,7 @@ def test_no_other_file_of_the_product_knows_an_effect_by_name(name: str) -> None
 def test_an_effect_carries_the_smallest_size_of_interest(kind: type[Effect]) -> None:
     if kind.name in ("payload", "sensor_offset"):  # cannot show alone; differs by channel
         return
-    assert kind.least or kind.least_shape
+    assert kind.smallest_coefficients or kind.smallest_shape
 
 
 def test_no_two_public_classes_share_a_name() -> None:

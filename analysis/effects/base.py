@@ -59,8 +59,8 @@ class Shape:
     detail: bool = False
     fixed: bool = False
 
-    def given(self, value: float) -> bool:
-        """Return whether a form has this parameter: a 0 below its bounds means that it does not."""
+    def is_present(self, value: float) -> bool:
+        """Return whether a form has this parameter: 0 outside its bounds marks its absence."""
         return value != 0.0 or self.low <= 0.0
 
     @property
@@ -159,9 +159,9 @@ class Effect(Term):
     effects on the spool and on the oil. `alters` names the families of rows that `prepare` changes:
     others need not be rebuilt for another shape. `adds_to_gains` marks effects whose columns add to
     those of the orifices, under the same gains. `rescales` marks effects that multiply signals and
-    their noise by a factor. `hydraulic` marks effects on oil, valve or
-    cylinder, not for electric joints. `least` and `least_shape` are the coefficients and shapes
-    [SI] of the smallest size of interest on a bench of some kW at some MPa.
+    their noise by a factor. `hydraulic` marks effects on oil, valve or cylinder, not for electric
+    joints. `smallest_coefficients` and `smallest_shape` [SI] are those of the smallest size of
+    interest on a bench of some kW at some MPa.
 
     `amplifies` marks effects whose correction amplifies noise (a lag): such a rival may be true
     although its residual is larger.
@@ -180,8 +180,8 @@ class Effect(Term):
     element: ClassVar[str] = "joint"
     free: ClassVar[bool] = False
     by_data: ClassVar[bool] = False
-    least: ClassVar[tuple[float, ...]] = ()
-    least_shape: ClassVar[tuple[float, ...]] = ()
+    smallest_coefficients: ClassVar[tuple[float, ...]] = ()
+    smallest_shape: ClassVar[tuple[float, ...]] = ()
     variable: ClassVar[str] = ""
     quantity: ClassVar[str] = ""
     confounders: ClassVar[tuple[str, ...]] = ()
@@ -228,13 +228,13 @@ class Effect(Term):
         """Return the least number of moving joints that separates it from other effects."""
         return 1
 
-    def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
+    def limited_shape(self, shape: Sequence[float]) -> tuple[float, ...]:
         """Return the shape limited to bounds that depend on its other numbers."""
         return tuple(shape)
 
-    def least_shapes(self) -> tuple[float, ...]:
+    def shape_of_smallest_size(self) -> tuple[float, ...]:
         """Return the shapes of its smallest size of interest."""
-        return self.least_shape
+        return self.smallest_shape
 
     def absorbed(self, rig: Rig) -> str:
         """Return why the baseline's free parameters hide it completely ('' if they do not)."""
@@ -349,30 +349,30 @@ class Effect(Term):
         """Return whether the effect has memory (a hidden state in use) at a shape."""
         return len(shape) > 0
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the shape with missing details, once for each start of their search."""
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the shape completed by details, once for each starting point of their search."""
         return ((*shape, *(s.middle for s in self.shapes(rig)[len(shape) :])),)
 
-    def instead_of_detail(self) -> tuple[Effect, ...]:
-        """Return effects that are likelier than a detail of the form where both fit as well."""
+    def alternatives_to_detail(self) -> tuple[Effect, ...]:
+        """Return effects preferred to a detail of this one's form where both fit as well."""
         return ()
 
-    def goes_with(self, other: Effect) -> bool:
-        """Return whether either of two effects may take the place of a detail of the other."""
-        return self in other.instead_of_detail() or other in self.instead_of_detail()
+    def is_alternative_to_detail(self, other: Effect) -> bool:
+        """Return whether either of two effects is preferred to a detail of the other's form."""
+        return self in other.alternatives_to_detail() or other in self.alternatives_to_detail()
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return shapes from which a search finds other forms of the same effect."""
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return starting shapes of the search for other forms of the same effect."""
         return ()
 
-    def comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
-        """Return whether the coefficients have the same meaning in the forms of two shapes."""
+    def coefficients_comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
+        """Return whether the coefficients mean the same in the forms of two shapes."""
         return True
 
-    def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
-        """Return the name of the effect of `includes` that this one equals ('' if none).
+    def simpler_equivalent(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
+        """Return the name of the effect in `includes` that this one equals ('' if none).
 
-        `values` holds the effect's linear coefficients; `times` widens the tolerance.
+        `values` holds the effect's linear coefficients; the tolerance is multiplied by `times`.
         """
         return ""
 
@@ -390,7 +390,7 @@ class Effect(Term):
         Details are not tested: their value does not decide whether the effect exists.
         """
         for s, value in zip(self.shapes(rig)[: len(shape)], shape, strict=True):
-            if s.detail or s.fixed or not s.given(value):
+            if s.detail or s.fixed or not s.is_present(value):
                 continue
             margin = 1e-3 * (s.high - s.low)
             allowed = s.resolution or s.neutral == s.low

@@ -60,7 +60,7 @@ class EntrainedAir(Effect):
     mechanism = "bulk_modulus_curve"
     element = "chamber"
     name = "entrained_air"
-    least = (3e-3,)  # of the volume, at one atmosphere
+    smallest_coefficients = (3e-3,)  # of the volume, at one atmosphere
     hydraulic = True
     family = "fluid"
     variable = "the pressure rate at low chamber pressure"
@@ -82,11 +82,11 @@ class EntrainedAir(Effect):
         name = self.shape_names()[0]
         return (Shape(name, "", low, high, (1.2,), resolution=True, detail=True),)
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the form with a variable exponent."""
         return () if len(shape) else ((1.2,),)
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape unchanged: the exponent is not a detail but another form."""
         return (tuple(shape),)
 
@@ -138,7 +138,7 @@ class DeadVolume(SignalEffect):
     mechanism = "chamber_volume"
     element = "chamber"
     name = "dead_volume"
-    least_shape = (20e-6,)  # [m^3]
+    smallest_shape = (20e-6,)  # [m^3]
     prepares = True
     hydraulic = True
     family = "fluid"
@@ -179,7 +179,7 @@ class DeadVolume(SignalEffect):
         volume, _ = self.shapes(rig)
         return tuple((start, HOSE / rig.supply.pressure) for start in volume.grid[1:3])
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the rigid volume of a hose."""
         return (tuple(shape[:1]),) if len(shape) > 1 else ()
 

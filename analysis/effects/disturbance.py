@@ -47,7 +47,7 @@ class PeriodicDisturbance(Effect):
 
     mechanism = "disturbance"
     name = "periodic_disturbance"
-    least = (1.0, 0.0)  # [N m]
+    smallest_coefficients = (1.0, 0.0)  # [N m]
     family = "mechanics"
     variable = "time, at one frequency"
     quantity = "time"

@@ -116,7 +116,7 @@ class FrictionCurve(Friction):
         """Return the middle of the stroke [m]."""
         return 0.5 * float(sum(rig.joints[self.joint].position_range))
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shapes with growths along the stroke from which a search begins.
 
         Viscous friction with the curve's slope, whose levers differ, imitates a growth: a search

@@ -108,13 +108,13 @@ class Friction(Effect):
         spread = (tail(f"tail_{joint}"),) if self.tailed else ()
         return (*distances, *rate, transition(f"transition_{joint}", limits), *spread)
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where the contact has a memory and can stiffen."""
         if self.stiffens and self.remembers(shape) and len(shape) == self.shapes_before + 1:
             return ((*shape, STIFFENING),)
         return (tuple(shape),)
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the contact without memory of a shape with one, else that of the other tail."""
         if not len(shape):
             return ()
@@ -236,7 +236,7 @@ class CoulombFriction(Friction):
     """
 
     name = "coulomb_friction"
-    least = (15.0,)  # [N]
+    smallest_coefficients = (15.0,)  # [N]
     stiffens = True
     tailed = True
     variable = "the sign of the piston's velocity"
@@ -289,7 +289,7 @@ class StribeckFriction(Friction):
     """
 
     name = "stribeck_friction"
-    least = (30.0,)  # [N]
+    smallest_coefficients = (30.0,)  # [N]
     variable = "the piston's velocity near zero"
     confounders = ("coulomb_friction", "asymmetric_friction")
     includes = ("coulomb_friction",)  # at a high Stribeck speed
@@ -325,12 +325,12 @@ class StribeckFriction(Friction):
         )
         return (falling, *super().shapes(rig), exponent)
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the contact without memory, and the fall with the other exponent."""
         falling, (distance, _, speed) = self.shape_of(rig, shape)[0], self.contact_of(shape)
         memory = (distance, 0.0) if self.remembers(shape) else (0.0, speed)
         exponent = () if shape[3:] else (EXPONENTIAL,)
-        return (*super().other_forms(rig, shape), (falling, *memory, *exponent))
+        return (*super().other_form_starts(rig, shape), (falling, *memory, *exponent))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""

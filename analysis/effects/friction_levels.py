@@ -73,7 +73,7 @@ class AsymmetricFriction(Friction):
     hydraulic = True
     tailed = True
     name = "asymmetric_friction"
-    least = (30.0, 10.0)  # [N] either way
+    smallest_coefficients = (30.0, 10.0)  # [N] either way
     variable = "the direction of the piston's motion"
     confounders = (
         "coulomb_friction", "torque_offset", "sensor_offset", "sensor_gain", "base_inclination",
@@ -135,11 +135,11 @@ class AsymmetricFriction(Friction):
             too_large = out_of_range(name, level, "N", limit, least)
             if too_large:
                 return too_large
-        if self.simpler(rig, values):
+        if self.simpler_equivalent(rig, values):
             return "the two directions differ by less than a tenth: this is coulomb_friction"
         return ""
 
-    def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
+    def simpler_equivalent(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
         """Return Coulomb friction where the levels differ by less than `DIFFERENCE` of the mean."""
         extending, retracting = (values[name] for name in self._names())
         equal = abs(extending - retracting) < times * DIFFERENCE * 0.5 * (extending + retracting)
@@ -183,7 +183,7 @@ class PressureDependentFriction(Friction):
 
     hydraulic = True
     name = "pressure_dependent_friction"
-    least = (5e-6,)  # [m^2]
+    smallest_coefficients = (5e-6,)  # [m^2]
     stiffens = True
     shapes_after = 2
     variable = "the chamber pressures, with the velocity's sign"
@@ -219,23 +219,23 @@ class PressureDependentFriction(Friction):
         (distance,) = self.shape_of(rig, ())
         return ((distance, 0.0, 0.0, DIFFERENCE_LOAD),)
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a stiffening where its load is the sum, at constant stiffness."""
-        return (tuple(shape),) if len(shape) > 3 else super().in_detail(rig, shape)
+        return (tuple(shape),) if len(shape) > 3 else super().detailed_shapes(rig, shape)
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the contact without memory or at a constant distance, and the other load."""
         distance, _, speed = self.contact_of(shape)
         memory = (distance, 0.0, 0.0) if self.remembers(shape) else (0.0, 0.0, speed)
         weight, constant = self._weight(shape), tuple(shape[4:])
         forms: tuple[tuple[float, ...], ...] = ()
         if self.remembers(shape) and not constant:
-            forms = (*super().other_forms(rig, shape), (*memory, weight, 1.0))
+            forms = (*super().other_form_starts(rig, shape), (*memory, weight, 1.0))
         if weight == SUM:
             forms = (*forms, (*memory, DIFFERENCE_LOAD, *constant))
         return forms
 
-    def comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
+    def coefficients_comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
         """Return whether both shapes weight the rod pressure alike."""
         return self._weight(shape) == self._weight(other)
 

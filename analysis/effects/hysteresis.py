@@ -54,7 +54,7 @@ class SpoolHysteresis(ValveEffect):
     """
 
     name = "spool_hysteresis"
-    least_shape = (2e-3,)  # [V]
+    smallest_shape = (2e-3,)  # [V]
     mechanism = "spool_dynamics"
     stage = NULL  # before the lag: a pilot has friction, the stage behind it lags
     variable = "the sign of the spool's velocity"
@@ -76,7 +76,7 @@ class SpoolHysteresis(ValveEffect):
             Shape(steepness, "", -0.8, 5.0, (0.5,), detail=True),
         )
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the width with reversals that need travel, from slow to steep."""
         if len(shape) > 1:
             return (tuple(shape),)

@@ -65,7 +65,7 @@ class LaminarOrifice(Effect):
     hydraulic = True
     adds_to_gains = True
     alters = ("fluid",)
-    least_shape = (0.1e6,)  # [Pa]
+    smallest_shape = (0.1e6,)  # [Pa]
     variable = "the pressure drop across the metering edges"
     quantity = "pressure"
     confounders = ("tank_pressure", "supply_sag", "sensor_offset")

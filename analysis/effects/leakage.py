@@ -110,7 +110,7 @@ class InternalLeakage(_Leakage):
     """
 
     name = "internal_leakage"
-    least = (3e-13,)  # [m^3/(s Pa)]
+    smallest_coefficients = (3e-13,)  # [m^3/(s Pa)]
     variable = "the pressure difference across the piston"
     quantity = "pressure difference"
     confounders = ("external_leakage", "underlap_leakage", "spool_offset", "sensor_offset")
@@ -152,7 +152,7 @@ class ExternalLeakage(_Leakage):
 
     name = "external_leakage"
     element = "chamber"
-    least = (3e-13,)  # [m^3/(s Pa)]
+    smallest_coefficients = (3e-13,)  # [m^3/(s Pa)]
     variable = "the chamber's pressure"
     quantity = "pressure"
     confounders = ("internal_leakage", "underlap_leakage", "sensor_offset")

@@ -65,7 +65,7 @@ class ChannelDelay(TimingError):
 
     name = "channel_delay"
     exact = True
-    least_shape = (1e-3,)  # [s]
+    smallest_shape = (1e-3,)  # [s]
     variable = "the channel's rate"
     confounders = ("sensor_lag", "spool_lag", "entrained_air", "dead_volume")
     separated_by = (
@@ -91,7 +91,7 @@ class SensorLag(TimingError):
 
     name = "sensor_lag"
     amplifies = True
-    least_shape = (1e-3,)  # [s]
+    smallest_shape = (1e-3,)  # [s]
     variable = "the channel's rate"
     confounders = ("channel_delay", "spool_lag", "dead_volume")
     separated_by = "a wide band: a lag loses amplitude at high frequencies, a delay only phase"

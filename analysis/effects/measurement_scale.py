@@ -29,7 +29,7 @@ class SensorCrosstalk(Sensor):
     rescales = True
     name = "sensor_crosstalk"
     exact = True
-    least_shape = (0.01,)
+    smallest_shape = (0.01,)
     variable = "the other chamber's pressure"
     confounders = ("sensor_gain", "sensor_offset", "pressure_dependent_friction")
     separated_by = "loads at which one chamber's pressure changes and the other does not"
@@ -89,12 +89,12 @@ class SensorGain(Sensor):
     rescales = True
     name = "sensor_gain"
     exact = True
-    least_shape = (1.01,)
+    smallest_shape = (1.01,)
     variable = "the channel itself"
     confounders = ("sensor_offset", "supply_sag", "tank_pressure", "pressure_dependent_friction")
     separated_by = "two amplitudes and two working points: an offset does not grow with either"
 
-    def instead_of_detail(self) -> tuple[Effect, ...]:
+    def alternatives_to_detail(self) -> tuple[Effect, ...]:
         """Return the channel's offset: a sensor has one more often than it is bent."""
         return (SensorOffset(self.where),)
 
@@ -183,7 +183,7 @@ class SensorOffset(Sensor):
     separated_by = "working points far apart: low and high pressure, both ends of the stroke"
     shape_stems = ("offset",)
 
-    def least_shapes(self) -> tuple[float, ...]:
+    def shape_of_smallest_size(self) -> tuple[float, ...]:
         """Return the offset of interest of a pressure or a piston, none of other channels."""
         kind = ch.kind_of(self.channel)[0]
         return {ch.PISTON: (0.3e-3,), ch.SPOOL: (), ch.TEMPERATURE: ()}.get(kind, (0.03e6,))

@@ -56,7 +56,7 @@ class BaseInclination(SignalEffect):
     element = "base"
     name = "base_inclination"
     exact = True
-    least_shape = (0.017,)  # [rad]
+    smallest_shape = (0.017,)  # [rad]
     prepares = True
     family = "mechanics"
     alters = ("mechanical",)
@@ -103,7 +103,7 @@ class JointSpring(Effect):
 
     mechanism = "position_force"
     name = "joint_spring"
-    least = (20.0,)  # [N m/rad]
+    smallest_coefficients = (20.0,)  # [N m/rad]
     family = "mechanics"
     variable = "the joint's angle"
     quantity = "joint position"
@@ -176,7 +176,7 @@ class TorqueOffset(Effect):
     mechanism = "position_force"
     name = "torque_offset"
     exact = True
-    least = (2.0,)  # [N m]
+    smallest_coefficients = (2.0,)  # [N m]
     family = "mechanics"
     variable = "nothing: it is constant"
     quantity = "joint position"

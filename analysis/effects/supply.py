@@ -147,7 +147,7 @@ class LineDrop(PortEffect):
         dp, *share = self.shape_of(rig, shape)[:2]
         return dp, (share[0] or LAMINAR) if share else 0.0
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the line laminar throughout, or one with an r_t, of equal drop at small flow."""
         dp, share = self.line(rig, shape)
         if share != LAMINAR:
@@ -218,7 +218,7 @@ class SupplySag(LineDrop):
     name = "supply_sag"
     drawn = True
     powers = (2, -1, -1)
-    least_shape = (0.2e6, LEAST_SHARE, 0.0)  # [Pa] at the rated flow
+    smallest_shape = (0.2e6, LEAST_SHARE, 0.0)  # [Pa] at the rated flow
     variable = "the flow drawn from the supply"
     quantity = "flow drawn"
     confounders = ("tank_pressure", "sensor_gain", "sensor_offset")
@@ -273,7 +273,7 @@ class TankPressure(PortEffect):
     mechanism = "return_line"
     element = "tank"
     name = "tank_pressure"
-    least_shape = (0.1e6, 0.0)  # [Pa]
+    smallest_shape = (0.1e6, 0.0)  # [Pa]
     variable = "the pressure left across the edge to the tank"
     quantity = "pressure"
     confounders = ("supply_sag", "sensor_offset", "external_leakage")
@@ -335,7 +335,7 @@ class ReturnLine(LineDrop):
     powers = (2,)
     mechanism = "return_line"
     element = "tank"
-    least_shape = (0.2e6,)  # [Pa] at the rated flow
+    smallest_shape = (0.2e6,)  # [Pa] at the rated flow
     variable = "the flow returned to the tank"
     quantity = "flow returned"
     confounders = ("tank_pressure", "supply_sag")

@@ -64,7 +64,7 @@ class UnderlapLeakage(ValveEffect):
     """
 
     name = "underlap_leakage"
-    least_shape = (4e-3,)  # [V]
+    smallest_shape = (4e-3,)  # [V]
     prepares = False
     adds_to_gains = True
     variable = "the spool near its null and the chamber pressures"

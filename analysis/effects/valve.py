@@ -117,7 +117,7 @@ class ValveDeadband(ValveEffect):
     """
 
     name = "valve_deadband"
-    least_shape = (2e-3, 2e-3)  # [V]
+    smallest_shape = (2e-3, 2e-3)  # [V]
     stage = EDGES
     variable = "the spool near its null"
     confounders = ("spool_offset", "underlap_leakage", "spool_lag")
@@ -136,7 +136,7 @@ class ValveDeadband(ValveEffect):
         later = Shape(tank, "V", -most, most, (0.1 * most,), detail=True)
         return (*laps, rounding(r, stroke), corner(c), later)
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a corner, and with either pair of edges opening later.
 
         The overlaps of a shape without that are the mean of those of both pairs.
@@ -198,7 +198,7 @@ class ValveDeadband(ValveEffect):
             )
         return super().problem(rig, values, shape)
 
-    def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
+    def limited_shape(self, shape: Sequence[float]) -> tuple[float, ...]:
         """Limit the rounding: a valve with a larger one is open at its null."""
         ahead, astern, *form = shape
         return (
@@ -225,7 +225,7 @@ class SpoolOffset(ValveEffect):
 
     name = "spool_offset"
     exact = True
-    least_shape = (1e-3,)  # [V]
+    smallest_shape = (1e-3,)  # [V]
     stage = NULL
     variable = "the spool's sign"
     confounders = ("valve_deadband", "internal_leakage")
@@ -287,7 +287,7 @@ class SpoolLag(ValveEffect):
     mechanism = "spool_dynamics"
     element = "valve"
     name = "spool_lag"
-    least_shape = (1e-3,)  # [s]
+    smallest_shape = (1e-3,)  # [s]
     stage = LAG
     variable = "the spool's velocity"
     quantity = "spool rate"
@@ -306,12 +306,12 @@ class SpoolLag(ValveEffect):
             Shape(held, "", 1.0, 1.0, (1.0,), detail=True, fixed=True),
         )
 
-    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the shape with a damping ratio."""
         tau, zeta, _ = self.full_shape(rig, shape)
         return ((tau, zeta or DAMPING_START, *shape[2:]),)
 
-    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the lag with the other kind of input: held or linear between samples.
 
         A hold, half a sample of delay, is tried only on lags of at least a sample.

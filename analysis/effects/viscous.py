@@ -51,7 +51,7 @@ class AsymmetricViscousFriction(Effect):
     mechanism = "friction_curve"
     element = "piston"
     name = "asymmetric_viscous_friction"
-    least = (50.0, 0.0)  # [N s/m]
+    smallest_coefficients = (50.0, 0.0)  # [N s/m]
     family = "friction"
     variable = "the amount of the piston's velocity"
     quantity = "velocity"

@@ -140,7 +140,7 @@ def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:
     """Return the shapes that the effect has in the model and that a search may change."""
     used = next(u for u in model.terms if u.term == effect)
     shapes = zip(shapes_of(model.rig, used), used.shape, strict=True)
-    return tuple(s for s, value in shapes if s.given(value) and not s.fixed)
+    return tuple(s for s, value in shapes if s.is_present(value) and not s.fixed)
 
 
 def _theta(windows: Windows, model: Model) -> Array:

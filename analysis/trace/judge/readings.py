@@ -176,7 +176,8 @@ def _form_error_energy(
     rig = hypotheses.train_data.rig
     values = other.fit.parameters(rig)
     near = any(
-        (effect.simpler(rig, values, TRACE.near_tolerance), effect.where) in hypothesis.keys
+        (effect.simpler_equivalent(rig, values, TRACE.near_tolerance), effect.where)
+        in hypothesis.keys
         for effect in effects_among(other.effects)
     )
     left = sum(

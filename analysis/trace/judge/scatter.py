@@ -105,14 +105,14 @@ def _row_groups(conditioned: ConditionedRecord, s: Segment, time: Array, by: str
 def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     """Return the possible error of every coefficient and shape by unknown forms, by name.
 
-    Two errors are added as squares. (1) Where an effect has another form (`Effect.other_forms`),
-    that is fitted too and shifts each coefficient, but for its own under another load, where they
-    mean something else. The shift counts by sqrt(E / (E + D)), with E the energy above noise that
-    is left in the rows on which the effect acts, at least `TRACE.form_noise`, and D what the other
-    form leaves more: in full where the other is as good, and not at all where it is physically
-    impossible. (2) An effect may
-    not grow in proportion, with x (1 + e |x| / rms x) in place of its contribution x to the rows.
-    Where e exceeds `TRACE.standard_errors` of its noise, the shift that it makes counts.
+    Two errors are added as squares. (1) Where an effect has another form
+    (`Effect.other_form_starts`), that is fitted too and shifts each coefficient, except those of
+    the effect whose meaning differs between the forms. The shift counts by sqrt(E / (E + D)), with
+    E the energy above noise that is left in the rows on which the effect acts, at least
+    `TRACE.form_noise`, and D what the other form leaves more: in full where the other is as good,
+    not at all where it is physically impossible. (2) An effect may not grow in proportion, with
+    x (1 + e |x| / rms x) in place of its contribution x to the rows. Where e exceeds
+    `TRACE.standard_errors` of its noise, the shift that it makes counts.
     """
     rig, squares = train_data.rig, _growth_shift_squares(train_data, fit)
     for used, other in fits_in_other_forms(train_data, fit):
@@ -137,7 +137,8 @@ def _of_other_meaning(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:
     return {
         c.parameter
         for used, changed in zip(fit.terms, other.terms, strict=True)
-        if isinstance(used.term, Effect) and not used.term.comparable(used.shape, changed.shape)
+        if isinstance(used.term, Effect)
+        and not used.term.coefficients_comparable(used.shape, changed.shape)
         for c in used.term.coefficients(rig)
     }
 

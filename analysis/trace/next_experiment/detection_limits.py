@@ -216,7 +216,7 @@ def is_possible(rig: Rig, model: Model, explanation: Explanation, times: float) 
 
     def problem(used: Used, times: float) -> str:
         effect, shape = effect_in(used), list(used.shape)
-        for k, s in enumerate(shapes_of(rig, used)[: len(effect.least_shapes())]):
+        for k, s in enumerate(shapes_of(rig, used)[: len(effect.shape_of_smallest_size())]):
             neutral = s.neutral or 0.0
             shape[k] = neutral + times * (shape[k] - neutral)
         values = known | {name: times * value for name, value in explanation.beta.items()}

@@ -82,13 +82,13 @@ def smallest_effect(effect: Effect, rig: Rig, shape: tuple[float, ...] = ()) -> 
     With poor excitation an effect of this size may leave no residual: the verdict `clean` does not
     exclude it then.
     """
-    own = effect.least_shapes()
-    if effect.absorbed(rig) or not (own or effect.least):
+    own = effect.shape_of_smallest_size()
+    if effect.absorbed(rig) or not (own or effect.smallest_coefficients):
         return None
     usual = effect.shape_of(rig, shape)
     names = [c.parameter for c in effect.coefficients(rig)]
     used = Used(effect, (*own, *usual[len(own) :]))
-    return Explanation((used,), dict(zip(names, effect.least, strict=False)))
+    return Explanation((used,), dict(zip(names, effect.smallest_coefficients, strict=False)))
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class ComparisonRows:
             blocks += [c[:, None] for c in self.columns(used).values()]
             for j, shape in enumerate(shapes_of(self.train_data.rig, used)):
                 value = used.shape[j]
-                if shape.fixed or not shape.given(value):
+                if shape.fixed or not shape.is_present(value):
                     continue
                 step = EXPERIMENT.shape_step * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step

@@ -199,7 +199,7 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
     own = [c.parameter for c in used.term.coefficients(data.rig)]
     names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
     for j, shape in enumerate(shapes_of(data.rig, used)):
-        if shape.fixed or not shape.given(used.shape[j]):
+        if shape.fixed or not shape.is_present(used.shape[j]):
             continue
         step = 1e-3 * (shape.high - shape.low)
         if is_logarithmic(shape):
@@ -236,7 +236,7 @@ def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
     _, J = jacobian(data, model, used)
     amounts = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(data.rig)]
     for shape, value in zip(shapes_of(data.rig, used), used.shape, strict=True):
-        if not shape.fixed and shape.given(value):
+        if not shape.fixed and shape.is_present(value):
             amounts.append(value if shape.neutral is not None else 0.0)
     return np.asarray(J @ np.array(amounts))
 

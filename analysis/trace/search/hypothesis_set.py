@@ -206,7 +206,7 @@ class HypothesisSet:
         for hypothesis in among:
             values = hypothesis.fit.parameters(rig)
             for used in hypothesis.effects:
-                name, where = effect_in(used).simpler(rig, values), used.term.where
+                name, where = effect_in(used).simpler_equivalent(rig, values), used.term.where
                 if name and (name, where) not in known | hypothesis.keys:
                     simple = at_start(rig, effect_of(name, where))
                     out.append(self.refined([*hypothesis.without(used), simple]))
@@ -361,7 +361,7 @@ class HypothesisSet:
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
         # A sensor's gain alone is fitted far from its size beside an offset, and so is the offset.
         for effect in self.effects if may_grow(now.effects) else ():
-            if effect.key not in {*taken, *out} and any(map(effect.goes_with, own)):
+            if effect.key not in {*taken, *out} and any(map(effect.is_alternative_to_detail, own)):
                 grown = (*now.effects, at_start(self.train_data.rig, effect))
                 with_parts[keys_of(grown)] = grown
         for hypothesis in (now, *filter(self.physical_problem, larger)):

@@ -100,7 +100,7 @@ def _refined(
 def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
     """Return the fit with details of the form of term number `place`, where they remove enough."""
     used = fit.terms[place]
-    starts = effect_in(used).in_detail(data.rig, used.shape)
+    starts = effect_in(used).detailed_shapes(data.rig, used.shape)
     opened = [Used(used.term, start) for start in starts if start != used.shape]
     asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
     # Half, since the linear prediction is less than what a detail removes.
@@ -129,7 +129,9 @@ def _replaces_detail(
     Over part of its range, a sensor with a gain and an offset looks like a bent one.
     """
     present = {u.term for u in fit.terms}
-    others = [effect for effect in effect_in(used).instead_of_detail() if effect not in present]
+    others = [
+        effect for effect in effect_in(used).alternatives_to_detail() if effect not in present
+    ]
     beside = (
         _with_searched_shapes(data, (*fit.terms, at_start(data.rig, effect)), steps)
         for effect in others
@@ -153,7 +155,7 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, before: 
     simpler = shape_values(data.rig, before)
     for shape, value in zip(shapes, used.shape, strict=True):
         larger = abs(value) > abs(simpler.get(shape.parameter, 0.0))
-        if shape.detail or shape.fixed or not shape.given(value) or not larger:
+        if shape.detail or shape.fixed or not shape.is_present(value) or not larger:
             continue
         own = names.index(shape.parameter)
         basis = orthonormal(np.delete(columns, own, axis=1))
@@ -188,7 +190,7 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         used = fit.terms[place]
         others = [
             _with_searched_shapes(data, with_term(fit.terms, used, Used(used.term, shape)), steps)
-            for shape in effect_in(used).other_forms(data.rig, used.shape)
+            for shape in effect_in(used).other_form_starts(data.rig, used.shape)
         ]
         best = min(others, key=priced, default=fit)
         if priced(best) >= priced(fit):
@@ -220,7 +222,7 @@ def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: in
         for value, (k, j, s) in zip(x, free, strict=True):
             shapes[k][j] = _from_unit(float(value), s)
         return tuple(
-            Used(u.term, u.term.bounded(v) if isinstance(u.term, Effect) else tuple(v))
+            Used(u.term, u.term.limited_shape(v) if isinstance(u.term, Effect) else tuple(v))
             for u, v in zip(terms, shapes, strict=True)
         )
 
@@ -241,7 +243,7 @@ def _free_shapes(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int,
         for k, u in enumerate(terms)
         if u not in data.terms
         for j, s in enumerate(shapes_of(data.rig, u))
-        if s.given(u.shape[j]) and not s.fixed
+        if s.is_present(u.shape[j]) and not s.fixed
     ]
 
 
@@ -288,7 +290,7 @@ def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[tuple[Used,
     for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        for shape in used.term.other_forms(data.rig, used.shape):
+        for shape in used.term.other_form_starts(data.rig, used.shape):
             terms = with_term(fit.terms, used, Used(used.term, shape))
             out.append((used, _with_searched_shapes(data, terms, SEARCH.steps)))
     return out
@@ -392,5 +394,5 @@ def shapes_in(rig: Rig, terms: Sequence[Used]) -> dict[str, Estimate]:
         s.parameter: Estimate(value, s.unit, math.nan, (math.nan, math.nan))
         for u in terms
         for value, s in zip(u.shape, shapes_of(rig, u), strict=True)
-        if s.given(value)
+        if s.is_present(value)
     }

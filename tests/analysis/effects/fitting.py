@@ -88,7 +88,7 @@ def fitted(data: Data, effect: Effect, floor: dict[str, float], tries: int = 60)
     shapes = effect.shapes(data.rig)
     found = searched(shapes, cost, tries)
     forms = [found, *effect.further_points(data.rig)]
-    for form in effect.other_forms(data.rig, found):
+    for form in effect.other_form_starts(data.rig, found):
         n, fixed = len(found), form[len(found) :]
         own = searched(shapes[:n], lambda s, fixed=fixed: cost((*s, *fixed)), tries)
         forms.append((*own, *fixed))

@@ -200,11 +200,11 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
     for e in effects(rig):
         if isinstance(e, Sensor):
             continue
-        for start in e.in_detail(rig, e.shape_of(rig, ())):
+        for start in e.detailed_shapes(rig, e.shape_of(rig, ())):
             # The simulation's line follows at once.
             shape = (*start[:2], 0.0) if e.name == "supply_sag" else start
-            others = e.other_forms(rig, shape)
-            others += tuple(form for other in others for form in e.other_forms(rig, other))
+            others = e.other_form_starts(rig, shape)
+            others += tuple(form for other in others for form in e.other_form_starts(rig, other))
             forms += [(e, one) for one in dict.fromkeys((shape, *others))]
     for e, shape in forms:
         signals = consistent(rig, state, e, shape) if e.stage == SUPPLY else state

@@ -89,10 +89,10 @@ def test_a_transition_speed_that_is_not_given_is_the_narrowest() -> None:
 def test_a_level_without_memory_has_either_tail_and_returns_to_the_other(rig: Rig) -> None:
     for effect in (CoulombFriction("joint 1"), AsymmetricFriction("joint 1")):
         normal = (0.0, 0.0, 2e-3)
-        (heavy,) = effect.other_forms(rig, normal)
+        (heavy,) = effect.other_form_starts(rig, normal)
         assert heavy == (*normal, CAUCHY)
         assert effect.shape_names()[-1] == "tail_1"
-        assert effect.other_forms(rig, heavy) == (normal,)
+        assert effect.other_form_starts(rig, heavy) == (normal,)
     assert "tail_1" not in StribeckFriction("joint 1").shape_names()
 
 

@@ -239,7 +239,7 @@ RULES: Final = (
     Rule("simpler name", "an effect that equals a simpler one is refused, and that one not tried",
          ((HypothesisSet, "_simpler_sets", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form only",
-         ((Friction, "other_forms", lambda *_: ()),), refits=True),
+         ((Friction, "other_form_starts", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
          ((in_motion, "searched_in_motion", lambda *given: given[-1]),
           (engine, "joints_with_friction", lambda *_: set()))),
