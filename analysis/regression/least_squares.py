@@ -53,11 +53,16 @@ class ScaledFactors:
         return np.asarray(directions @ self.U[:, determined].T)
 
 
+def column_scale(X: Array) -> Array:
+    """Return the norms (k,) of the columns of X (m, k), 1 for a column of zeros."""
+    size = np.linalg.norm(X, axis=0)
+    return np.where(size > 0.0, size, 1.0)
+
+
 def factored(X: Array) -> ScaledFactors:
     """Decompose rows or a triangle X (m, k), k > 0, with columns scaled to unit norm."""
     m, k = X.shape
-    size = np.linalg.norm(X, axis=0)
-    scale = np.where(size > 0.0, size, 1.0)
+    scale = column_scale(X)
     # With fewer rows than columns, rows of zeros complete the directions Vt.
     filled = np.vstack((X / scale, np.zeros((max(k - m, 0), k))))
     U, sigma, Vt = np.linalg.svd(filled, full_matrices=False)
@@ -74,8 +79,7 @@ def shortest(X: Array, y: Array, rank: float) -> Array:
 
     Directions of the scaled columns below `rank` times the largest singular value get no value.
     """
-    size = np.linalg.norm(X, axis=0)
-    scale = np.where(size > 0.0, size, 1.0)
+    scale = column_scale(X)
     return np.asarray((np.linalg.lstsq(X / scale, y, rcond=rank)[0].T / scale).T)
 
 

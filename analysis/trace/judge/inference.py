@@ -83,7 +83,7 @@ def null_maximum(
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
-    shows = diagonal > candidates.least
+    shows = diagonal > candidates.visibility_limit
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()

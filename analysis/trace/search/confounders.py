@@ -1,4 +1,4 @@
-"""Candidates that are easily confused with an effect, and the sets with them in its place."""
+"""Confounders of an effect, and the sets of effects with one of them in its place."""
 
 from __future__ import annotations
 
@@ -21,53 +21,54 @@ def act_at_one_joint(effect: Effect, other: Effect) -> bool:
     return len({place for place in places if not place.startswith(BENCH)}) <= 1
 
 
-def _is_confusable(effect: Effect, own: Effect) -> bool:
-    """Return whether a candidate is easily confused with an effect of the set.
+def _is_confusable(effect: Effect, member: Effect) -> bool:
+    """Return whether a candidate is easily confused with the `member` of a set.
 
-    It is another name of its mechanism at the same place, or, at its joint or of the bench, the
-    same effect on another channel or chamber or one of its confounders.
+    It is another name of the member's mechanism at the same place, or, at the same joint or of the
+    bench, the same effect on another channel or chamber or one of its confounders.
     """
-    same = effect.mechanism == own.mechanism and effect.where == own.where
-    alike = effect.name in (own.name, *own.confounders) and act_at_one_joint(effect, own)
+    same = effect.mechanism == member.mechanism and effect.where == member.where
+    alike = effect.name in (member.name, *member.confounders) and act_at_one_joint(effect, member)
     return (same or alike) and not effect.free
 
 
 def confusable_sets(
-    data: RegressionData, candidates: Sequence[Effect], now: Hypothesis
+    data: RegressionData, candidates: Sequence[Effect], current: Hypothesis
 ) -> list[tuple[Used, ...]]:
     """Return the sets with one effect exchanged for another candidate or for two."""
-    sets = [effects for used in now.effects for effects in composites(data, candidates, now, used)]
-    for used in now.effects if len(now.effects) > 1 else ():
-        own, others = effect_in(used), now.without(used)
+    sets = [s for used in current.effects for s in composites(data, candidates, current, used)]
+    for used in current.effects if len(current.effects) > 1 else ():
+        member, others = effect_in(used), current.without(used)
         for effect in candidates:
-            if effect.key in now.keys or not _is_confusable(effect, own):
+            if effect.key in current.keys or not _is_confusable(effect, member):
                 continue
             fresh = at_best_point(data, effect, others)
             sets.append((*others, fresh))
-            if is_special_case(own, effect):
-                # Another effect may only have made up for what the simpler law lacks.
-                sets += [(*(u for u in others if u is not one), fresh) for one in others]
+            if is_special_case(member, effect):
+                # One of the others may only have compensated what the simpler law lacks.
+                sets += [(*(u for u in others if u is not left_out), fresh) for left_out in others]
     return sets
 
 
 def composites(
-    data: RegressionData, candidates: Sequence[Effect], now: Hypothesis, used: Used
+    data: RegressionData, candidates: Sequence[Effect], current: Hypothesis, used: Used
 ) -> list[tuple[Used, ...]]:
-    """Return the sets with a simpler name of an effect's law and a confounder in its place.
+    """Return the sets with two effects in place of one: a special case of it and a confounder.
 
-    The confounder has another mechanism and is at the effect's joint. Friction of one level with
-    the offset of a pressure is nearly friction of two levels, but for the flows.
+    The confounder has another mechanism and is at the effect's joint. In the torques, friction of
+    one level with the offset of a pressure is nearly friction of two levels.
     """
-    own = effect_in(used)
-    known = now.keys | {u.term.key for u in data.terms}
-    others = now.without(used)
+    member = effect_in(used)
+    taken = current.keys | {u.term.key for u in data.terms}
+    others = current.without(used)
     if not may_grow(others, by=2):
         return []
-    simpler = [effect_of(n, own.where) for n in own.includes if (n, own.where) not in known]
+    where = member.where
+    simpler = [effect_of(name, where) for name in member.includes if (name, where) not in taken]
     confounders = [
         e for e in candidates
-        if e.name in own.confounders and act_at_one_joint(e, own)
-        and e.mechanism != own.mechanism and e.key not in known
+        if e.name in member.confounders and act_at_one_joint(e, member)
+        and e.mechanism != member.mechanism and e.key not in taken
     ]  # fmt: skip
     return [
         (*others, *(at_start(data.rig, e) for e in (simple, other)))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, Shape, shapes_of
+from analysis.regression.least_squares import column_scale
 from analysis.regression.rows import in_common, matrix_of, parameters_of
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.conditioned_record import acting_on, shared_rows
@@ -41,7 +42,7 @@ class DesignMatrix:
         """Return the residual (M,) under coefficients of the rows.
 
         Where the oil cavitates no flow can be compared. Up to `TRACE.cavitating_share` of an
-        equation's rows such instants keep at most the rms of the others, so that they count
+        equation's rows such instants are limited to the rms of the others, so that they count
         neither for nor against the model: a true gain of a sensor puts some pressures below zero.
         """
         out = self.rhs - self.matrix @ np.array([beta.get(n, 0.0) for n in self.names])
@@ -90,19 +91,19 @@ def parameter_values(
 def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     """Return the whitened rows of a model at the instants of the averaged records.
 
-    Instants that the model masks have the residual of the data's own model, so that no effect
-    removes a residual by moving signals to where the equations do not hold (but see
-    `DesignMatrix.residual`).
+    Instants that the model masks keep the residual of the data's own model (but see
+    `DesignMatrix.residual`): otherwise an effect could remove a residual by moving signals to where
+    the equations do not hold.
     """
     names = _coefficient_names(data.rig, terms)
     X, y = np.zeros((data.base.shape[0], len(names))), np.zeros(data.base.shape[0])
     cavitating: list[tuple[Indices, Indices]] = []
     for family, rows in data.family_rows.items():
-        own = _family_design(data, family, acting_on(data.rig, terms, family, data.cache))
-        columns = np.array([names.index(n) for n in own.names], dtype=np.int64)
-        X[np.ix_(rows, columns)] = own.matrix
-        y[rows] = own.rhs
-        cavitating += [(rows[others], rows[outside]) for others, outside in own.cavitating]
+        of_family = _family_design(data, family, acting_on(data.rig, terms, family, data.cache))
+        columns = np.array([names.index(n) for n in of_family.names], dtype=np.int64)
+        X[np.ix_(rows, columns)] = of_family.matrix
+        y[rows] = of_family.rhs
+        cavitating += [(rows[others], rows[outside]) for others, outside in of_family.cavitating]
     return DesignMatrix(names, X, y, tuple(cavitating))
 
 
@@ -115,54 +116,41 @@ def _family_design(data: RegressionData, family: str, terms: Sequence[Used]) -> 
     """Return `design_matrix` of one family's rows (`RegressionData.family_rows`) and terms."""
     names = parameters_of(data.rig, terms, family)
     built = {
-        record.group: (
-            rows,
-            shared_rows(data.rig, terms, replace(record, families=(family,)), data.cache),
-        )
-        for record, rows in zip(data.records, data.rows, strict=True)
+        c.group: (rows, shared_rows(data.rig, terms, replace(c, families=(family,)), data.cache))
+        for c, rows in zip(data.records, data.rows, strict=True)
     }
-    own_rows = data.family_rows[family]
+    of_family = data.family_rows[family]
     rescaled = data.relative and rescale(data, terms)
-    X, y = np.zeros((len(own_rows), len(names))), data.mean_residual[own_rows]
-    kept: dict[str, list[Indices]] = {}
-    every: dict[str, list[Indices]] = {}
+    X, y = np.zeros((len(of_family), len(names))), data.mean_residual[of_family]
+    valid = np.zeros(len(of_family), dtype=bool)
+    of_equation: dict[str, list[Indices]] = {}
     start = 0
     for segment in data.segments:
         if family_of(segment.equation) != family:
             continue
         before, rows = (side[segment.equation] for side in built[segment.group])
-        here, there = in_common(before, rows)
-        size = 1.0
-        if rescaled and rows.rhs[there].size:  # about the mean, a difference of two large forces
-            size = float(np.std(before.rhs[here])) / max(float(np.std(rows.rhs[there])), 1e-300)
-        weight = np.sqrt(segment.repeats) / segment.noise * size
-        own = np.arange(start, start + len(before.rhs))
-        inside = slice(start, start + len(own))
-        X[inside][here] = matrix_of(rows, names)[there] * weight
-        y[inside][here] = rows.rhs[there] * weight
-        kept.setdefault(segment.equation, []).append(own[here])
-        every.setdefault(segment.equation, []).append(own)
-        start += len(own)
-    return DesignMatrix(names, X, y, _cavitating(kept, every))
-
-
-def _cavitating(
-    kept: Mapping[str, Sequence[Indices]], every: Mapping[str, Sequence[Indices]]
-) -> tuple[tuple[Indices, Indices], ...]:
-    """Return the rows `kept` by a model and the others of all, of equations that have others."""
-    out = []
-    for equation, parts in kept.items():
-        if sum(map(len, parts)) < sum(map(len, every[equation])):  # seldom
-            here = np.concatenate(parts)
-            out.append((here, np.setdiff1d(np.concatenate(every[equation]), here)))
-    return tuple(out)
+        in_before, in_rows = in_common(before, rows)
+        rescaling = 1.0
+        if rescaled and rows.rhs[in_rows].size:  # about the mean, a difference of two large forces
+            old, new = np.std(before.rhs[in_before]), np.std(rows.rhs[in_rows])
+            rescaling = float(old) / max(float(new), 1e-300)
+        weight = np.sqrt(segment.repeats) / segment.noise * rescaling
+        rows_of_segment = slice(start, start + len(before.rhs))
+        X[rows_of_segment][in_before] = matrix_of(rows, names)[in_rows] * weight
+        y[rows_of_segment][in_before] = rows.rhs[in_rows] * weight
+        valid[rows_of_segment][in_before] = True
+        numbers = np.arange(start, rows_of_segment.stop)
+        of_equation.setdefault(segment.equation, []).append(numbers)
+        start = rows_of_segment.stop
+    equations = () if valid.all() else map(np.concatenate, of_equation.values())
+    cavitating = ((n[valid[n]], n[~valid[n]]) for n in equations if not valid[n].all())
+    return DesignMatrix(names, X, y, tuple(cavitating))
 
 
 def _family_fit(data: RegressionData, family: str, terms: tuple[Used, ...]) -> ExactFit:
-    """Return the fit of one family's rows."""
+    """Return the least-squares fit of one family's rows."""
     rows = _family_design(data, family, terms)
-    scale = np.linalg.norm(rows.matrix, axis=0)
-    scale[scale == 0] = 1.0
+    scale = column_scale(rows.matrix)
     Q, R = np.linalg.qr(rows.matrix / scale)
     values = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
     beta = dict(zip(rows.names, values, strict=True))
@@ -172,21 +160,21 @@ def _family_fit(data: RegressionData, family: str, terms: tuple[Used, ...]) -> E
 def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     """Return the least-squares fit of a model's coefficients, with its shapes as given.
 
-    No coefficient is shared between families of rows, so that each family is fitted by itself, and
-    one in which no shape acts is not fitted again.
+    Families of rows share no coefficient: each is fitted separately, and not again where the change
+    of a shape leaves it unchanged.
     """
     names = _coefficient_names(data.rig, terms)
     beta, information = dict.fromkeys(names, 0.0), np.zeros((len(names), len(names)))
     residual = np.zeros(data.base.shape[0])
     for family, rows in data.family_rows.items():
         acting = acting_on(data.rig, terms, family, data.cache)
-        own: ExactFit = data.cache.fits.get(
+        of_family: ExactFit = data.cache.fits.get(
             (family, data.terms, acting, data.relative), partial(_family_fit, data, family, acting)
         )
-        at = [names.index(n) for n in own.beta]
-        beta |= own.beta
-        residual[rows] = own.residual
-        information[np.ix_(at, at)] = own.information
+        places = [names.index(n) for n in of_family.beta]
+        beta |= of_family.beta
+        residual[rows] = of_family.residual
+        information[np.ix_(places, places)] = of_family.information
     return ExactFit(tuple(terms), beta, residual, information)
 
 
@@ -196,8 +184,8 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
     A column is the derivative of the model's side of the rows with respect to the parameter.
     """
     rows = design_matrix(data, model.terms)
-    own = [c.parameter for c in used.term.coefficients(data.rig)]
-    names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
+    coefficients = [c.parameter for c in used.term.coefficients(data.rig)]
+    names, columns = list(coefficients), [rows.matrix[:, rows.names.index(n)] for n in coefficients]
     for j, shape in enumerate(shapes_of(data.rig, used)):
         if shape.fixed or not shape.is_present(used.shape[j]):
             continue
@@ -206,14 +194,14 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
             step = 1e-2 * used.shape[j]
         up = min(used.shape[j] + step, shape.high)
         down = max(used.shape[j] - step, shape.low)
-        ends = []
+        residuals = []
         for value in (up, down):
             changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
-            ends.append(
+            residuals.append(
                 design_matrix(data, with_term(model.terms, used, changed)).residual(model.beta)
             )
         names.append(shape.parameter)
-        columns.append(-(ends[0] - ends[1]) / (up - down))
+        columns.append(-(residuals[0] - residuals[1]) / (up - down))
     stack = np.column_stack(columns) if columns else np.zeros((len(model.residual), 0))
     return tuple(names), stack
 
@@ -224,15 +212,15 @@ def tangent(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Arr
     names, columns = list(rows.names), [rows.matrix]
     for used in model.terms:
         if used.shape and isinstance(used.term, Effect):
-            own, J = jacobian(data, model, used)
-            fresh = [k for k, n in enumerate(own) if n not in names]
-            names += [own[k] for k in fresh]
-            columns.append(J[:, fresh])
+            effect_names, J = jacobian(data, model, used)
+            new = [k for k, n in enumerate(effect_names) if n not in names]
+            names += [effect_names[k] for k in new]
+            columns.append(J[:, new])
     return tuple(names), np.column_stack(columns)
 
 
 def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
-    """Return what an effect adds to the whitened rows (M,): its derivatives times its values."""
+    """Return an effect's part of the whitened rows (M,): its derivatives times its values."""
     _, J = jacobian(data, model, used)
     amounts = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(data.rig)]
     for shape, value in zip(shapes_of(data.rig, used), used.shape, strict=True):
@@ -242,22 +230,22 @@ def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
 
 
 def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
-    """Return regression data whose own model is a fitted model."""
+    """Return the regression data with a fitted model as its own model."""
     rows = design_matrix(data, model.terms)
-    built = []
+    all_rows = []
     for conditioned, before in zip(data.records, data.rows, strict=True):
-        now = shared_rows(data.rig, model.terms, conditioned, data.cache)
-        kept = {}
+        after = shared_rows(data.rig, model.terms, conditioned, data.cache)
+        aligned = {}
         for equation, old in before.items():
-            here, there = in_common(old, now[equation])
-            matrix = np.zeros((len(old.rhs), len(now[equation].names)))
-            rhs = np.zeros(len(old.rhs))
-            matrix[here], rhs[here] = now[equation].matrix[there], now[equation].rhs[there]
-            kept[equation] = replace(now[equation], matrix=matrix, rhs=rhs, time=old.time)
-        built.append(kept)
+            new = after[equation]
+            in_old, in_new = in_common(old, new)
+            matrix, rhs = np.zeros((len(old.rhs), len(new.names))), np.zeros(len(old.rhs))
+            matrix[in_old], rhs[in_old] = new.matrix[in_new], new.rhs[in_new]
+            aligned[equation] = replace(new, matrix=matrix, rhs=rhs, time=old.time)
+        all_rows.append(aligned)
     return replace(
         data, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
-        rows=tuple(built),
+        rows=tuple(all_rows),
     )  # fmt: skip
 
 
@@ -274,5 +262,5 @@ def rescale(data: RegressionData, terms: Sequence[Used]) -> bool:
 
 
 def is_logarithmic(shape: Shape) -> bool:
-    """Return whether the bounds of a shape lie so far apart that its logarithm is searched."""
+    """Return whether a shape's bounds differ by a factor so large that its logarithm is used."""
     return shape.low > 0 and shape.high / shape.low > 20

@@ -1,7 +1,7 @@
-"""Sets found by exact columns, where the search by first-order columns leaves too much.
+"""Search by exact columns, where the search by first-order columns leaves too much.
 
-A sensor's cross-talk of a quarter or a pressure in the return line of a fifth of the supply's is
-far from the sizes for which first-order columns hold.
+First-order columns do not hold for large sizes: a sensor's cross-talk of a quarter, a pressure in
+the return line of a fifth of the supply's.
 """
 
 from __future__ import annotations
@@ -25,60 +25,57 @@ from analysis.trace.settings import SEARCH
 _Trial = tuple[float, tuple[Used, ...]]  # the energy that a set leaves at a point of a shape grid
 
 
-def improved_by_exact_trials(hypotheses: HypothesisSet, now: Hypothesis) -> Hypothesis:
-    """Return the set, or a better one with an effect added or exchanged, of all candidates.
+def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> Hypothesis:
+    """Return the set, or a better one with a candidate added or in place of an effect.
 
-    It is asked while the set leaves more than noise. A set within the tolerance for its forms is
-    left only for one that leaves a tenth, or only noise.
+    Repeated while the set leaves more than noise. A set within the tolerance for its forms is
+    replaced only by one that leaves a tenth, or only noise.
     """
     band = hypotheses.noise_band.by_equation
-    while above := {e for e, v in now.excess_energy.items() if v > band[e]}:
+    while above := {e for e, v in current.excess_energy.items() if v > band[e]}:
         tried = [
             hypotheses.refined_below(energy, effects)
-            for energy, effects in _best_trials(hypotheses, now, above)
+            for energy, effects in _best_trials(hypotheses, current, above)
         ]
-        better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([now, *tried])))
+        better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([current, *tried])))
         to_noise = within_band(better.excess_energy, hypotheses.noise_band)
-        tolerated = hypotheses.within_form_tolerance(now) and not to_noise
+        tolerated = hypotheses.within_form_tolerance(current) and not to_noise
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
-        if log_energy_ratio(now, better, hypotheses.noise_band) < least:
+        if log_energy_ratio(current, better, hypotheses.noise_band) < least:
             break
-        now = better
-    return now
+        current = better
+    return current
 
 
 def _best_trials(
-    hypotheses: HypothesisSet, now: Hypothesis, equations: Collection[str]
+    hypotheses: HypothesisSet, current: Hypothesis, equations: Collection[str]
 ) -> Iterator[_Trial]:
-    """Yield the best candidates' sets, added to the set or in place of one of its effects.
-
-    A candidate must act in one of the `equations`.
-    """
-    starts = [now.without(used) for used in now.effects]
-    if may_grow(now.effects):
-        starts.append(now.effects)
+    """Yield the best sets with a candidate, which acts in `equations`, added or exchanged."""
+    starts = [current.without(used) for used in current.effects]
+    if may_grow(current.effects):
+        starts.append(current.effects)
     for start in starts:
-        yield from _best_additions(hypotheses, now, start, equations)
+        yield from _best_additions(hypotheses, current, start, equations)
 
 
 def _best_additions(
-    hypotheses: HypothesisSet, now: Hypothesis, start: Sequence[Used], equations: Collection[str]
+    hypotheses: HypothesisSet,
+    current: Hypothesis,
+    start: Sequence[Used],
+    equations: Collection[str],
 ) -> list[_Trial]:
-    """Return the sets with one more effect that leave least at a point of its shape grid.
-
-    Sets that are physically impossible there would take the places of others.
-    """
+    """Return the physical sets with one effect beside `start` that leave least on its grid."""
     data = hypotheses.train_data
-    least: dict[Key, _Trial] = {}
-    for used in hypotheses.variants_of(data, now.fit.residual):
+    best_trial: dict[Key, _Trial] = {}
+    for used in hypotheses.variants_of(data, current.fit.residual):
         effect = effect_in(used)
-        fresh = effect.key not in now.keys and not effect.free
-        if fresh and hypotheses.may_act(effect, now, equations):
+        may_join = effect.key not in current.keys and not effect.free
+        if may_join and hypotheses.may_act(effect, current, equations):
             effects = (*start, used)
             energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
-            if energy < least.get(effect.key, (float("inf"), ()))[0]:
-                least[effect.key] = energy, effects
-    ordered = sorted(least.values(), key=lambda trial: trial[0])
+            if energy < best_trial.get(effect.key, (float("inf"), ()))[0]:
+                best_trial[effect.key] = energy, effects
+    ordered = sorted(best_trial.values(), key=lambda trial: trial[0])
     possible = (
         trial for trial in ordered
         if not hypotheses.physical_problem(hypotheses.at_given_shapes(trial[1]))

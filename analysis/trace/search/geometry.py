@@ -1,8 +1,8 @@
 """A smaller set of effects beside a geometry within the tolerances of the rig file.
 
-A wrong area resembles a gain of a pressure, a wrong pipe volume oil that was not stated: on a rig
-whose numbers have tolerances, such effects may be no more than these. Beside each set that was
-fitted, the likeliest numbers g [sigma] minimise, to first order,
+A wrong area resembles a gain of a pressure sensor, a wrong pipe volume a dead volume: on a rig
+whose numbers have tolerances, the tolerances alone may explain such effects. Beside each fitted
+set, the likeliest deviations g [sigma] of the numbers minimise, to first order,
 
     w |r + X db + D g|^2 + |g|^2,   |g_j| <= `SEARCH.most_deviations`,
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from analysis.regression.least_squares import shortest
 from analysis.signals.conditioning import of_other_geometry
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.regression_data import RegressionData
@@ -45,33 +46,33 @@ class Geometry:
 def geometry_for_smaller_set(
     hypotheses: HypothesisSet, winner: Hypothesis, explained: bool
 ) -> Geometry | None:
-    """Return the geometry beside which a set simpler than `winner` leaves as little, None without.
+    """Return the geometry with which a set simpler than `winner` leaves as little, None if none.
 
-    `explained`: the `winner` explains the records, and no equation may keep more than with it or
-    than noise. Where it does not, the other set may be of any size, and form error may remain.
+    `explained`: the `winner` explains the records; then no equation may keep more than with it or
+    than noise. Otherwise the other set may be of any size, and form error may remain.
     """
     data = hypotheses.train_data
     numbers = data.rig.uncertain_numbers
     if not numbers or not (winner.effects or not explained):
         return None
     changes = residual_changes(data, winner.fit, numbers)
-    most = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
+    limit = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
     best: tuple[Hypothesis, Array] | None = None
     for hypothesis in (hypotheses.empty, *hypotheses.fitted.values()):
         if explained and hypothesis.size >= winner.size:
             continue
         deviations, left = _likeliest(data, hypothesis, changes)
-        if float(deviations @ deviations) > most:  # chi square with J degrees of freedom
+        if float(deviations @ deviations) > limit:  # chi square with J degrees of freedom
             continue
-        beside = replace(hypothesis, excess_energy=left)
-        little = all(
-            v <= max(hypotheses.noise_band.by_equation[e], winner.excess_energy[e])
+        moved, band = replace(hypothesis, excess_energy=left), hypotheses.noise_band
+        is_as_small = all(
+            v <= max(band.by_equation[e], winner.excess_energy[e])
             if explained
             else hypotheses.negligible(e, v)
             for e, v in left.items()
         )
-        if little and (best is None or is_preferred(beside, best[0], hypotheses.noise_band)):
-            best = beside, deviations
+        if is_as_small and (best is None or is_preferred(moved, best[0], band)):
+            best = moved, deviations
     return None if best is None else Geometry(data.rig.with_deviations(best[1].tolist()), best[1])
 
 
@@ -81,17 +82,19 @@ def residual_changes(
     """Return the changes (M, J) of a fit's whitened residual by one sigma of each number."""
     beta = np.array(list(fit.beta.values()))
 
-    def residual(of: RegressionData) -> Array:
-        rows = design_matrix(of, fit.terms)
+    def residual(with_rig: RegressionData) -> Array:
+        rows = design_matrix(with_rig, fit.terms)
         return np.asarray(rows.rhs - rows.matrix @ beta)
 
-    own, columns = residual(data), []
+    stated, columns = residual(data), []
     for number in numbers:
         other = data.rig.with_moved(number)
         records = tuple(
             replace(c, signals=of_other_geometry(data.rig, c.signals, other)) for c in data.records
         )
-        columns.append(residual(replace(data, rig=other, records=records, cache=RowCache())) - own)
+        columns.append(
+            residual(replace(data, rig=other, records=records, cache=RowCache())) - stated
+        )
     return np.column_stack(columns)
 
 
@@ -101,11 +104,8 @@ def shape_errors(data: RegressionData, fit: ExactFit) -> dict[str, float]:
     if not numbers:
         return {}
     names, columns = tangent(data, fit)
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    changes = residual_changes(data, fit, numbers)
-    shifts = np.linalg.lstsq(columns / scale, changes, rcond=TRACE.rank_limit)[0].T / scale
-    errors = dict(zip(names, map(float, np.linalg.norm(shifts, axis=0)), strict=True))
+    shifts = shortest(columns, residual_changes(data, fit, numbers), TRACE.rank_limit)
+    errors = dict(zip(names, map(float, np.linalg.norm(shifts.T, axis=0)), strict=True))
     return {name: error for name, error in errors.items() if name not in fit.beta}
 
 
@@ -114,10 +114,10 @@ def _likeliest(
 ) -> tuple[Array, dict[str, float]]:
     """Return the deviations (J,) [sigma] beside a set, and the energy above noise they leave."""
     basis = orthonormal(design_matrix(data, hypothesis.fit.terms).matrix)
-    free = changes - basis @ (basis.T @ changes)
-    Q, R = np.linalg.qr(free)
-    weight, most = math.sqrt(SEARCH.independent_rows), SEARCH.most_deviations
+    projected = changes - basis @ (basis.T @ changes)
+    Q, R = np.linalg.qr(projected)
+    weight, bound = math.sqrt(SEARCH.independent_rows), SEARCH.most_deviations
     stacked = np.vstack((weight * R, np.eye(R.shape[1])))
-    wanted = np.concatenate((-weight * (Q.T @ hypothesis.fit.residual), np.zeros(R.shape[1])))
-    found = np.asarray(lsq_linear(stacked, wanted, bounds=(-most, most)).x)
-    return found, energy_above_noise(data, hypothesis.fit.residual + free @ found)
+    right_side = np.concatenate((-weight * (Q.T @ hypothesis.fit.residual), np.zeros(R.shape[1])))
+    deviations = np.asarray(lsq_linear(stacked, right_side, bounds=(-bound, bound)).x)
+    return deviations, energy_above_noise(data, hypothesis.fit.residual + projected @ deviations)

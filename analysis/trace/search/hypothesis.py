@@ -80,7 +80,7 @@ def of_one_law(effect: Effect, other: Effect) -> bool:
 
 @dataclass(frozen=True)
 class NoiseBand:
-    """Energy above noise `by_equation` that counts as nothing."""
+    """The energy above noise, `by_equation`, up to which a residual counts as noise."""
 
     by_equation: dict[str, float]
 
@@ -93,15 +93,15 @@ class NoiseBand:
 def negative_body(rig: Rig, fit: ExactFit, baseline: ExactFit) -> str:
     """Return in words which inertia M or weight W of a fit is negative ('' if none is).
 
-    It must be so beyond the noise and by `SEARCH.negative_share` of its value in the `baseline`
-    fit, which must not be negative itself: a rig with a counterweight, or with angles counted the
-    other way, has negative weights in both fits or states them.
+    It must be negative beyond the noise and by `SEARCH.negative_share` of its value in the
+    `baseline` fit, which must not be negative itself: a rig with a counterweight, or with angles
+    counted the other way, has negative weights in both fits or states them.
     """
     share = SEARCH.negative_share
     for k, (name, value) in enumerate(fit.beta.items()):
-        before = baseline.beta.get(name, 0.0)
+        baseline_value = baseline.beta.get(name, 0.0)
         is_body = name[0] in "MW" and name[1:].isdigit() and rig.nominal.get(name, 0.0) >= 0.0
-        if is_body and value < -share * abs(before) and before > share * value:
+        if is_body and value < -share * abs(baseline_value) and baseline_value > share * value:
             scale = np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
             unit = fit.information / np.outer(scale, scale)
             inverse = np.linalg.pinv(unit, hermitian=True)
@@ -151,29 +151,30 @@ def log_energy_ratio(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand
 def is_preferred(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand) -> bool:
     """Return whether a set leaves much less than `other`, or about as little and is simpler.
 
-    Of two equally simple ones that leave about the same in all, that is preferred which leaves
-    less for its equations: what one effect leaves elsewhere may hide what another spoils.
+    Of two equally simple sets that leave about the same in total, the one with the smaller
+    `log_energy_ratio` is preferred: the total may hide a small equation that one of them disturbs.
     """
     slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
-    more, near = log_energy_ratio(hypothesis, other, limit), float(np.log(SEARCH.simpler_ratio))
+    log_ratio = log_energy_ratio(hypothesis, other, limit)
+    log_tolerance = float(np.log(SEARCH.simpler_ratio))
     if hypothesis.size < other.size:
-        return more <= near or hypothesis.total <= other.total + slack
+        return log_ratio <= log_tolerance or hypothesis.total <= other.total + slack
     if hypothesis.size > other.size:
-        return more < -near and hypothesis.total < other.total - slack
-    about = hypothesis.total / SEARCH.simpler_ratio, hypothesis.total * SEARCH.simpler_ratio
-    if abs(more) > near and about[0] <= other.total <= about[1]:
-        return more < 0.0
+        return log_ratio < -log_tolerance and hypothesis.total < other.total - slack
+    similar = hypothesis.total / SEARCH.simpler_ratio, hypothesis.total * SEARCH.simpler_ratio
+    if abs(log_ratio) > log_tolerance and similar[0] <= other.total <= similar[1]:
+        return log_ratio < 0.0
     return hypothesis.total < other.total
 
 
-def spoils_equation(hypothesis: Hypothesis, now: Hypothesis, limit: NoiseBand) -> bool:
-    """Return whether an equation keeps more than under `now`, by more than noise."""
-    band, before = limit.by_equation, now.excess_energy
-    return any(v > before[e] + band[e] for e, v in hypothesis.excess_energy.items())
+def spoils_equation(hypothesis: Hypothesis, reference: Hypothesis, limit: NoiseBand) -> bool:
+    """Return whether an equation keeps more than under `reference`, by more than noise."""
+    band, reference_energy = limit.by_equation, reference.excess_energy
+    return any(v > reference_energy[e] + band[e] for e, v in hypothesis.excess_energy.items())
 
 
 def removes_too_little(without: Hypothesis, hypothesis: Hypothesis, limit: NoiseBand) -> bool:
-    """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
+    """Return whether the effect missing in `without` removes less than `SEARCH.add_share`."""
     least = -float(np.log(1.0 - SEARCH.add_share))
     return log_energy_ratio(without, hypothesis, limit) < least
 

@@ -64,7 +64,7 @@ class HypothesisSet:
 
     `base` are the model's own terms, `effects` the candidates, `fitted` all sets fitted so far by
     names and places, `empty` the set without effects (the baseline), `noise_band` the energy that
-    counts as nothing. `columns` and `candidates` are set by `run`.
+    counts as noise. `columns` and `candidates` are set by `run`.
     """
 
     def __init__(self, train_data: RegressionData, effects: Sequence[Effect]) -> None:
@@ -77,12 +77,8 @@ class HypothesisSet:
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.train_data.rig
-        return Hypothesis(
-            effects,
-            fit,
-            energy_above_noise(self.train_data, fit.residual),
-            complexity(rig, effects),
-        )
+        excess_energy = energy_above_noise(self.train_data, fit.residual)
+        return Hypothesis(effects, fit, excess_energy, complexity(rig, effects))
 
     def at_given_shapes(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the fit of a set of effects with the shapes that they have."""
@@ -90,23 +86,23 @@ class HypothesisSet:
         return self._hypothesis(fit.terms[len(self.base) :], fit)
 
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
-        """Return a copy with further candidates; sets that were fitted already are shared."""
-        wide = copy.copy(self)
-        wide.effects = tuple(effects)
+        """Return a copy with further candidates, which shares the sets fitted so far."""
+        extended = copy.copy(self)
+        extended.effects = tuple(effects)
         data = self.train_data
-        more = variant_columns(data, wide.variants_of(data, data.mean_residual))
-        wide.columns = [*self.columns, *more]
-        wide.candidates = self._candidate_columns(data, wide.columns)
-        wide.effects = (*self.effects, *effects)
-        return wide
+        new_columns = variant_columns(data, extended.variants_of(data, data.mean_residual))
+        extended.columns = [*self.columns, *new_columns]
+        extended.candidates = self._candidate_columns(data, extended.columns)
+        extended.effects = (*self.effects, *effects)
+        return extended
 
     def variants_of(self, data: RegressionData, residual: Array) -> list[Used]:
         """Return the candidates at every point of their shape grids.
 
         `residual` (M,) of the data places the points of effects whose grid depends on the data.
         """
-        seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
-        return variants(data.rig, self.effects, seen)
+        grid_evidence = evidence(data, residual) if any(e.by_data for e in self.effects) else None
+        return variants(data.rig, self.effects, grid_evidence)
 
     def physical_problem(
         self,
@@ -116,7 +112,7 @@ class HypothesisSet:
     ) -> str:
         """Return in words which number of a set is physically impossible ('' if none is).
 
-        The effect `first` is asked first, and its number is stated without its name. Shapes of the
+        The effect `first` is tested first, and its problem stated without its name. Shapes of the
         effects `may_be_at_bounds` (name, where) may lie at their bounds.
         """
         rig = self.train_data.rig
@@ -135,40 +131,39 @@ class HypothesisSet:
                 return problem if used is first else whose + problem
         return negative_body(rig, hypothesis.fit, self.empty.fit)
 
-    def refined(self, effects: Sequence[Used], instead_of: Hypothesis | None = None) -> Hypothesis:
+    def refined(self, effects: Sequence[Used], rival: Hypothesis | None = None) -> Hypothesis:
         """Return the exact fit of a set of effects, computed once for its names and places.
 
-        The search of its shapes ends early where it is no better than the set `instead_of`.
+        The search of its shapes ends early where it promises no improvement on the set `rival`.
         """
         if not effects:
             return self.empty
         key = keys_of(effects)
         if key not in self.fitted:
-            rival = None if instead_of is None else instead_of.fit
-            fit = refine(self.train_data, (*self.base, *effects), rival)
+            rival_fit = None if rival is None else rival.fit
+            fit = refine(self.train_data, (*self.base, *effects), rival_fit)
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
     def _refined_anew(self, effects: Sequence[Used]) -> Hypothesis:
-        """Return the exact fit of a set of effects, from these shapes too where it had others.
+        """Return the best exact fit of a set: the earlier one, or one that starts at these shapes.
 
-        A search of shapes may end in a local minimum, which a further effect then seems to mend.
+        Otherwise a further effect could seem to remove what a local minimum has left.
         """
-        known = self.refined(effects)
-        if set(effects) != set(known.effects):
-            del self.fitted[known.keys]
-            if self.refined(effects).total > known.total:
-                self.fitted[known.keys] = known
-        return self.fitted[known.keys]
+        earlier = self.refined(effects)
+        if set(effects) != set(earlier.effects):
+            del self.fitted[earlier.keys]
+            if self.refined(effects).total > earlier.total:
+                self.fitted[earlier.keys] = earlier
+        return self.fitted[earlier.keys]
 
     def refined_below(self, energy: float, effects: Sequence[Used]) -> Hypothesis:
-        """Return the exact fit of a set, searched anew where an earlier one leaves over `energy`.
+        """Return the exact fit of a set whose shapes in `effects` leave `energy`, or less.
 
-        The earlier search began elsewhere and ended in a local minimum: the set leaves `energy`
-        with the shapes of `effects` already.
+        An earlier fit that leaves more ended in a local minimum and is repeated from these shapes.
         """
-        known = self.refined(effects)
-        return known if known.fit.energy <= energy else self._refined_anew(effects)
+        earlier = self.refined(effects)
+        return earlier if earlier.fit.energy <= energy else self._refined_anew(effects)
 
     def replacements(self, winner: Hypothesis, used: Used) -> Iterator[tuple[Hypothesis, Used]]:
         """Yield the fitted sets with one other effect in the place of `used`, and that effect."""
@@ -180,34 +175,34 @@ class HypothesisSet:
                 yield hypothesis, fresh[0]
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the simplest physical set of those that leave about the least, else `empty`.
+        """Return the simplest physical set `among` those that leave about the least, else `empty`.
 
         Where an effect equals a simpler one that it includes, the set with that one is tried too.
         """
-        allowed = [o for o in (*among, *self._simpler_sets(among)) if not self.physical_problem(o)]
-        if not allowed:
+        physical = [o for o in (*among, *self._simpler_sets(among)) if not self.physical_problem(o)]
+        if not physical:
             return self.empty
 
         def preferred(one: Hypothesis, other: Hypothesis) -> Hypothesis:
             return other if is_preferred(other, one, self.noise_band) else one
 
-        least = min(allowed, key=lambda o: o.total)
-        least = functools.reduce(preferred, (o for o in allowed if o.size == least.size), least)
-        near = [o for o in allowed if o is least or is_preferred(o, least, self.noise_band)]
-        simplest = min((sum(o.size), o.size[0]) for o in near)
+        best = min(physical, key=lambda o: o.total)
+        best = functools.reduce(preferred, (o for o in physical if o.size == best.size), best)
+        similar = [o for o in physical if o is best or is_preferred(o, best, self.noise_band)]
+        least_size = min((sum(o.size), o.size[0]) for o in similar)
         return functools.reduce(
-            preferred, (o for o in near if (sum(o.size), o.size[0]) == simplest)
+            preferred, (o for o in similar if (sum(o.size), o.size[0]) == least_size)
         )
 
     def _simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return sets with an effect replaced by a simpler one that it equals."""
+        """Return the sets with an effect replaced by a simpler one that it equals."""
         rig, out = self.train_data.rig, []
-        known = {u.term.key for u in self.base}
+        in_model = {u.term.key for u in self.base}
         for hypothesis in among:
             values = hypothesis.fit.parameters(rig)
             for used in hypothesis.effects:
                 name, where = effect_in(used).simpler_equivalent(rig, values), used.term.where
-                if name and (name, where) not in known | hypothesis.keys:
+                if name and (name, where) not in in_model | hypothesis.keys:
                     simple = at_start(rig, effect_of(name, where))
                     out.append(self.refined([*hypothesis.without(used), simple]))
         return out
@@ -221,65 +216,60 @@ class HypothesisSet:
         self.columns = variant_columns(data, self.variants_of(data, r), progress)
         candidates = self.candidates = self._candidate_columns(data, self.columns)
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        found = self.exchanged(self._searched(candidates, r))
-        return self.fitted.get(found.keys, found)  # a later start may have found better shapes
+        result = self.exchanged(self._searched(candidates, r))
+        return self.fitted.get(result.keys, result)  # a later start may have found better shapes
 
     def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
         band = self.noise_band
         singles = [self.refined(effects) for effects in self._singles(candidates, r)]
-        now = self.prune(self.best([self.empty, *singles]))
-        if within_band(now.excess_energy, band):
-            return now
+        current = self.prune(self.best([self.empty, *singles]))
+        if within_band(current.excess_energy, band):
+            return current
         pairs = [
             self.refined([candidates.entries[m].used for m in pair.members])
             for pair in linear_fit.best_pairs(candidates, r)
         ]
-        if self.within_form_tolerance(now):
-            others = [o for o in pairs if not now.keys & o.keys]
-            far = [
-                o
-                for o in others
-                if log_energy_ratio(o, now, self.noise_band) < -SEARCH.far_log_gain
-            ]
-            return self.completed_to_noise(self.prune(self.best([now, *far])))
-        now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within_band(now.excess_energy, band) and may_grow(now.effects):
-            grown = self.prune(self.best([now, *self.extensions(now)]))
+        if self.within_form_tolerance(current):
+            others = [o for o in pairs if not current.keys & o.keys]
+            far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]
+            return self.completed_to_noise(self.prune(self.best([current, *far])))
+        current = self.prune(self.best([self.empty, *singles, *pairs]))
+        while not within_band(current.excess_energy, band) and may_grow(current.effects):
+            grown = self.prune(self.best([current, *self.extensions(current)]))
             if (
-                grown.keys == now.keys
-                or log_energy_ratio(now, grown, self.noise_band) < SEARCH.least_log_gain
+                grown.keys == current.keys
+                or log_energy_ratio(current, grown, self.noise_band) < SEARCH.least_log_gain
             ):
                 break
-            now = grown
-            if self.within_form_tolerance(now):
-                return self.completed_to_noise(now)
-        return now
+            current = grown
+            if self.within_form_tolerance(current):
+                return self.completed_to_noise(current)
+        return current
 
     def within_form_tolerance(self, hypothesis: Hypothesis) -> bool:
         """Return whether every equation keeps no more than noise or the effects' form error."""
-        return all(self.negligible(e, residual) for e, residual in hypothesis.excess_energy.items())
+        return all(self.negligible(e, energy) for e, energy in hypothesis.excess_energy.items())
 
-    def negligible(self, equation: str, residual: float) -> bool:
-        """Return whether an equation may keep so much energy above noise.
+    def negligible(self, equation: str, energy: float) -> bool:
+        """Return whether an equation's energy above noise is within noise or form error.
 
-        It may keep noise of `SEARCH.residual_limit`, or `SEARCH.form_share` of what the baseline
-        leaves.
+        That is `SEARCH.residual_limit` as an rms over the noise, or `SEARCH.form_share` of what the
+        baseline leaves.
         """
         allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band.by_equation[equation]
-        return residual <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
+        return energy <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
-    def completed_to_noise(self, now: Hypothesis) -> Hypothesis:
-        """Return the set with one more effect if that leaves only noise, else the set itself.
+    def completed_to_noise(self, current: Hypothesis) -> Hypothesis:
+        """Return a set within form error, with one more effect if that leaves only noise.
 
-        The set leaves no more than form error already: an effect that leaves less, but not only
-        noise, would just fit that error.
+        An effect that leaves less, but more than noise, would only fit the form error.
         """
-        if within_band(now.excess_energy, self.noise_band) or not may_grow(now.effects):
-            return now
-        more = [o for o in self.extensions(now) if within_band(o.excess_energy, self.noise_band)]
-        best = self.best(more) if more else now
-        return best if best.effects and self.prune(best).keys == best.keys else now
+        if within_band(current.excess_energy, self.noise_band) or not may_grow(current.effects):
+            return current
+        larger = self.extensions(current)
+        best = self.best([o for o in larger if within_band(o.excess_energy, self.noise_band)])
+        return best if best.effects and self.prune(best).keys == best.keys else current
 
     def _candidate_columns(
         self, data: RegressionData, columns: Sequence[VariantColumns], mask: Array | None = None
@@ -288,16 +278,16 @@ class HypothesisSet:
         values = parameter_values(rig, data.terms, data.beta)
 
         def allowed(entry: VariantColumns, coefficients: Array) -> bool:
-            own = dict(zip(entry.names, map(float, coefficients), strict=True))
+            sizes = dict(zip(entry.names, map(float, coefficients), strict=True))
             # No lower bound: a size below that of the grid's first point is fitted exactly later.
-            if not 0.0 <= own.get("", 0.0) <= SEARCH.size_ratio:
+            if not 0.0 <= sizes.get("", 0.0) <= SEARCH.size_ratio:
                 return False
             effect = effect_in(entry.used)
             if effect.free:  # its curve may be physical only with the details of its form
                 return True
             for c in effect.coefficients(rig):
-                own.setdefault(c.parameter, 0.0)
-            return not effect.problem(rig, {**values, **own}, entry.used.shape)
+                sizes.setdefault(c.parameter, 0.0)
+            return not effect.problem(rig, {**values, **sizes}, entry.used.shape)
 
         def size(entry: VariantColumns) -> int:
             return complexity(rig, [entry.used])[1]
@@ -306,7 +296,7 @@ class HypothesisSet:
 
     def _singles(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         g = linear_fit.gains(
-            candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least
+            candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
         )
         out: dict[Key, tuple[Used, ...]] = {}
         least = SEARCH.near_gain * float(np.max(g, initial=0.0))
@@ -321,96 +311,92 @@ class HypothesisSet:
         return list(out.values())
 
     def extensions(
-        self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
+        self, current: Hypothesis, equations: Collection[str] = (), free: bool = False
     ) -> list[Hypothesis]:
         """Return the best sets with one more effect, found on data with the set in their model.
 
         `equations` restricts the search to their rows, `free` to free mechanisms. A free mechanism
-        and a name of it are not combined at one place: one would be the other's form error.
+        and a name of it are not combined at one place: one would fit the other's form error.
         """
-        data, taken, laws = rebased(self.train_data, now.fit), now.keys, now.laws
-        own = effects_among(now.effects)
-        curves = {law_of(e) for e in own if e.free}
+        data, taken, laws = rebased(self.train_data, current.fit), current.keys, current.laws
+        members = effects_among(current.effects)
+        curves = {law_of(e) for e in members if e.free}
         tried = [
             used
-            for used in self.variants_of(data, now.fit.residual)
+            for used in self.variants_of(data, current.fit.residual)
             for effect in (effect_in(used),)
             if effect.key not in taken and (not free or effect.free)
             and law_of(effect) not in (laws if effect.free else curves)
-            and self.may_act(effect, now, equations)
+            and self.may_act(effect, current, equations)
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
-        asked = equations or data.row_counts
-        mask = data.in_equations(asked).astype(np.float64)
-        # The set's shapes are fitted again with another effect: energy that they can remove
+        mask = data.in_equations(equations or data.row_counts).astype(np.float64)
+        # The set's shapes are fitted again beside a new effect: energy that they can remove
         # themselves is no gain of that effect.
-        moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
-        candidates = self._candidate_columns(
-            replace(data, base=np.hstack((data.base, *moves))), columns, mask
-        )
-        r = now.fit.residual * mask
+        moves = (jacobian(self.train_data, current.fit, used)[1] for used in current.effects)
+        absorbing = replace(data, base=np.hstack((data.base, *moves)))
+        candidates = self._candidate_columns(absorbing, columns, mask)
+        r = current.fit.residual * mask
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        out: dict[Key, tuple[Used, ...]] = {}
+        best_starts: dict[Key, tuple[Used, ...]] = {}
         for trial in linear_fit.sets_with_one_more(candidates, (), r):
             used = candidates.entries[trial.members[0]].used
-            if len(out) < SEARCH.refined_extensions:
-                out.setdefault(used.term.key, (*now.effects, used))
-        larger = [self._extended(now, effects) for effects in out.values()]
+            if len(best_starts) < SEARCH.refined_extensions:
+                best_starts.setdefault(used.term.key, (*current.effects, used))
+        larger = [self._extended(current, effects) for effects in best_starts.values()]
         if free:
             return larger
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
-        # A sensor's gain alone is fitted far from its size beside an offset, and so is the offset.
-        for effect in self.effects if may_grow(now.effects) else ():
-            if effect.key not in {*taken, *out} and any(map(effect.is_alternative_to_detail, own)):
-                grown = (*now.effects, at_start(self.train_data.rig, effect))
+        # Alone, a sensor's gain is fitted far from its size beside an offset, and the reverse.
+        for effect in self.effects if may_grow(current.effects) else ():
+            goes_with = any(map(effect.is_alternative_to_detail, members))
+            if goes_with and effect.key not in {*taken, *best_starts}:
+                grown = (*current.effects, at_start(self.train_data.rig, effect))
                 with_parts[keys_of(grown)] = grown
-        for hypothesis in (now, *filter(self.physical_problem, larger)):
+        for hypothesis in (current, *filter(self.physical_problem, larger)):
             for effects in self.with_parts_beside(hypothesis, equations):
                 with_parts.setdefault(keys_of(effects), effects)
-        return larger + [self._extended(now, effects) for effects in with_parts.values()]
+        return larger + [self._extended(current, effects) for effects in with_parts.values()]
 
     def with_parts_beside(
         self, hypothesis: Hypothesis, equations: Collection[str] = ()
     ) -> Iterator[tuple[Used, ...]]:
-        """Yield the set with another part of an effect's law beside it, with both at their start.
+        """Yield the sets with another part of an effect's law beside it, both at their start.
 
-        A breakaway alone is fitted far from its size beside Coulomb friction, so that columns of
-        first order do not show that, and each of the two alone may be physically impossible.
+        Alone, a breakaway is fitted far from its size beside Coulomb friction: first-order columns
+        do not show the pair, and each alone may be physically impossible.
         """
         rig = self.train_data.rig
         if not may_grow(hypothesis.effects):
             return
         for used in hypothesis.effects:
-            own = effect_in(used)
+            member = effect_in(used)
             for effect in self.effects:
-                part = of_one_law(effect, own) and (effect.beside or own.beside)
-                acts = not equations or not self._acting.get(effect.key, set()).isdisjoint(
-                    equations
-                )
+                part = of_one_law(effect, member) and (effect.beside or member.beside)
+                acts = not equations or self._acting.get(effect.key, set()) & set(equations)
                 if part and acts and effect.key not in hypothesis.keys:
-                    yield (*hypothesis.without(used), at_start(rig, own), at_start(rig, effect))
+                    yield (*hypothesis.without(used), at_start(rig, member), at_start(rig, effect))
 
-    def _extended(self, now: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
-        """Return the exact fit of a set that extends `now`, with its shapes as starting points.
+    def _extended(self, current: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
+        """Return the exact fit of a set that extends `current`, with its shapes as starting points.
 
-        A new effect begins at the size that leaves least. Where an equation keeps more than under
-        `now`, an earlier search of the shapes, which had begun elsewhere, ended in a local minimum.
+        A new effect starts at the size that leaves least. Where an equation keeps more than under
+        `current`, an earlier fit of the same set ended in a local minimum and is repeated.
         """
-        fresh = [u for u in effects if u.term.key not in now.keys]
-        others = [u for u in effects if u not in fresh]
-        effects = [*others, *(at_best_size(self.train_data, u, others) for u in fresh)]
-        known = self.refined(effects)
-        return (
-            self._refined_anew(effects) if spoils_equation(known, now, self.noise_band) else known
-        )
+        added = [u for u in effects if u.term.key not in current.keys]
+        others = [u for u in effects if u not in added]
+        effects = [*others, *(at_best_size(self.train_data, u, others) for u in added)]
+        earlier = self.refined(effects)
+        spoils = spoils_equation(earlier, current, self.noise_band)
+        return self._refined_anew(effects) if spoils else earlier
 
-    def may_act(self, effect: Effect, now: Hypothesis, equations: Collection[str]) -> bool:
-        """Return whether a candidate may have columns in some of the equations (any if none).
+    def may_act(self, effect: Effect, current: Hypothesis, equations: Collection[str]) -> bool:
+        """Return whether a candidate may have columns in some of `equations`, true without any.
 
-        It has them where it has under the baseline. Only an effect of the bench couples the joints'
-        flows, so that a candidate may act in further ones.
+        They are those in which it has columns under the baseline. Beside an effect of the bench,
+        which couples the joints' flows, it may act in any.
         """
-        coupled = any(u.term.where.startswith(BENCH) for u in now.effects)
+        coupled = any(u.term.where.startswith(BENCH) for u in current.effects)
         if not equations or coupled or effect.key not in self._acting:
             return True
         return not self._acting[effect.key].isdisjoint(equations)
@@ -427,61 +413,60 @@ class HypothesisSet:
             out.setdefault(entry.used.term.key, set()).update(entry.touched)
         return out
 
-    def exchanged(self, now: Hypothesis) -> Hypothesis:
-        """Return the set, or a better one with an effect exchanged for one that is easily confused.
+    def exchanged(self, current: Hypothesis) -> Hypothesis:
+        """Return the set, or a better one with an effect exchanged for a confounder or for two.
 
         An effect that was chosen before the last one was added may be wrong beside it, and one
-        effect may be chosen in place of two (`confounders.composites`).
+        effect may have been chosen in place of two (`confounders.composites`).
         """
-        seen = {now.keys}
-        while sets := confusable_sets(self.train_data, self.effects, now):
-            pruned = self.prune(self.best([now, *(self.refined(s, now) for s in sets)]))
-            other = self.best([now, pruned])  # one that lost an effect again may be worse
+        seen = {current.keys}
+        while sets := confusable_sets(self.train_data, self.effects, current):
+            pruned = self.prune(self.best([current, *(self.refined(s, current) for s in sets)]))
+            other = self.best([current, pruned])  # one that lost an effect again may be worse
             if other.keys in seen:
                 break
-            now = other
-            seen.add(now.keys)
-        return now
+            current = other
+            seen.add(current.keys)
+        return current
 
-    def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
-        """Return the set with the effect that removes most from `equations`, None where none does.
+    def extended_in(self, current: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
+        """Return the set with the effect that removes most from `equations`, None if none does.
 
-        Counted over all equations, the form error of a large effect in one equation would hide a
-        small effect in another. A set that leaves as little there with fewer effects is returned
-        in its place.
+        Other equations do not count: the form error of a large effect there would hide a small one
+        here. A set that leaves as little in `equations` with fewer effects is returned instead.
         """
-        if not may_grow(now.effects):
+        if not may_grow(current.effects):
             return None
 
-        def residual(hypothesis: Hypothesis) -> float:
+        def remaining(hypothesis: Hypothesis) -> float:
             return sum(hypothesis.excess_energy[e] for e in equations)
 
-        def earned(hypothesis: Hypothesis) -> bool:
-            drop = {e: now.excess_energy[e] - hypothesis.excess_energy[e] for e in equations}
-            here = [e for e, v in drop.items() if v >= SEARCH.acting_share * max(drop.values())]
-            start = sum(max(0.0, now.excess_energy[e]) for e in here)
-            least = SEARCH.number_price * (hypothesis.size[1] - now.size[1])
-            return sum(drop[e] for e in here) > max(least, SEARCH.add_share * start)
+        def removes_enough(hypothesis: Hypothesis) -> bool:
+            drop = {e: current.excess_energy[e] - hypothesis.excess_energy[e] for e in equations}
+            acting = [e for e, v in drop.items() if v >= SEARCH.acting_share * max(drop.values())]
+            start = sum(max(0.0, current.excess_energy[e]) for e in acting)
+            least = SEARCH.number_price * (hypothesis.size[1] - current.size[1])
+            return sum(drop[e] for e in acting) > max(least, SEARCH.add_share * start)
 
-        tried = self.extensions(now, equations)
+        tried = self.extensions(current, equations)
         tried += self._simpler_sets(tried)
-        tried += self._smaller_sets(now, tried)
-        more = [o for o in tried if earned(o) and not self.physical_problem(o)]
-        if not more:
+        tried += self._smaller_sets(current, tried)
+        useful = [o for o in tried if removes_enough(o) and not self.physical_problem(o)]
+        if not useful:
             return None
-        best = min(map(residual, more))
-        slack = max((SEARCH.simpler_ratio - 1.0) * max(0.0, best), SEARCH.number_price)
-        near = [o for o in more if residual(o) <= best + slack]
-        return min(near, key=lambda o: (sum(o.size), residual(o)))
+        least = min(map(remaining, useful))
+        slack = max((SEARCH.simpler_ratio - 1.0) * max(0.0, least), SEARCH.number_price)
+        similar = [o for o in useful if remaining(o) <= least + slack]
+        return min(similar, key=lambda o: (sum(o.size), remaining(o)))
 
-    def _smaller_sets(self, now: Hypothesis, tried: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return the fitted sets of fewer effects than `tried`, no larger in all, none worse."""
+    def _smaller_sets(self, current: Hypothesis, tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the fitted sets of fewer effects than `tried`, none larger, none spoiling one."""
         least = min(((o.size[0], sum(o.size)) for o in tried), default=(0, 0))
         return [
             o
             for o in self.fitted.values()
             if 0 < o.size[0] < least[0] and sum(o.size) <= least[1]
-            and not spoils_equation(o, now, self.noise_band)
+            and not spoils_equation(o, current, self.noise_band)
         ]  # fmt: skip
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:

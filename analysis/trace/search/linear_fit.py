@@ -1,7 +1,7 @@
-"""Linear fit: candidates, alone and in pairs, by the energy that their columns remove.
+"""Linear fit: the energy that the columns of candidates remove, alone and in pairs.
 
-All columns are made orthogonal to the baseline's, since the baseline's fit can absorb any part of
-them along its own. On the projected columns D (M, V) and residual r (M,), with K = D'D and c = D'r,
+All columns are made orthogonal to the baseline's, whose coefficients absorb the part of them along
+its own columns. On the projected columns D (M, V) and residual r (M,), with K = D'D and c = D'r,
 the energy that a candidate with columns j removes (its gain) is c_j' K_jj^-1 c_j. Beside another
 candidate K and c change by a Schur complement, so that pairs of the whole catalogue cost products
 of small matrices only. Of candidates that leave about the same energy, the one with the fewest free
@@ -30,10 +30,9 @@ class CandidateColumns:
     """Candidates (`entries`) with columns orthogonal to the data's own.
 
     `columns` (M, V), `K` (V, V) their products, `basis` (M, r) of the data's own columns, `groups`
-    the column numbers of each entry, `least` (V,) the squared lengths from which columns show,
-    `rows` the row numbers of each equation, `band` its noise band, `size` the free numbers of each
-    entry.
-    `admissible(entry, coefficients)` says whether physics allows these sizes.
+    the column numbers of each entry, `visibility_limit` (V,) the squared lengths from which columns
+    count, `rows` the row numbers of each equation, `band` its noise band, `size` the free numbers
+    of each entry. `admissible(entry, coefficients)` says whether physics allows these sizes.
     """
 
     entries: tuple[VariantColumns, ...]
@@ -41,7 +40,7 @@ class CandidateColumns:
     K: Array
     basis: Array
     groups: tuple[tuple[int, ...], ...]
-    least: Array
+    visibility_limit: Array
     rows: dict[str, Array]
     band: dict[str, float]
     size: tuple[int, ...]
@@ -73,14 +72,14 @@ def project(
 
     `mask` (M,) is 0 for rows that are not used.
     """
-    keep = np.ones(data.base.shape[0]) if mask is None else mask
-    basis = orthonormal(data.base * keep[:, None])
+    used = np.ones(data.base.shape[0]) if mask is None else mask
+    basis = orthonormal(data.base * used[:, None])
     groups, start = [], 0
     for entry in columns:
         groups.append(tuple(range(start, start + entry.columns.shape[1])))
         start += entry.columns.shape[1]
-    stack = np.column_stack([e.columns for e in columns]) if columns else np.zeros((len(keep), 0))
-    stack = stack * keep[:, None]
+    stack = np.column_stack([e.columns for e in columns]) if columns else np.zeros((len(used), 0))
+    stack = stack * used[:, None]
     names = [name for entry in columns for name in entry.names]
     shows = (SEARCH.least_exact_length if n else SEARCH.least_projected_length for n in names)
     least = np.square(list(shows)) * np.sum(stack**2, axis=0)
@@ -89,7 +88,7 @@ def project(
     band: dict[str, float] = {}
     for segment in data.segments:
         where = np.arange(segment.where.start, segment.where.stop)
-        where = where[keep[where] > 0]
+        where = where[used[where] > 0]
         rows.setdefault(segment.equation, []).append(where)
         noise = SEARCH.band**2 * segment.repeats * len(where)
         band[segment.equation] = band.get(segment.equation, 0.0) + noise
@@ -106,19 +105,19 @@ def orthonormal(columns: Array, rank: float = TRACE.rank_limit) -> Array:
     Directions of the scaled columns below `rank` times the largest singular value are left out.
     """
     scale = np.linalg.norm(columns, axis=0)
-    kept = columns[:, scale > 0] / scale[scale > 0]
-    U, sigma, _ = np.linalg.svd(kept, full_matrices=False)
+    scaled = columns[:, scale > 0] / scale[scale > 0]
+    U, sigma, _ = np.linalg.svd(scaled, full_matrices=False)
     return np.asarray(U[:, sigma > rank * sigma[0]]) if len(sigma) else U
 
 
-def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], least: Array) -> Array:
-    """Return the energy that each group of columns removes, 0 for groups that do not show.
+def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], visibility_limit: Array) -> Array:
+    """Return the energy that each group of columns removes, 0 for groups without a visible column.
 
-    `least` (V,) holds the squared lengths from which columns show.
+    `visibility_limit` (V,) holds the squared lengths from which columns count.
     """
     out = np.zeros(len(groups))
     for g, group in enumerate(groups):
-        shown = [j for j in group if K[j, j] > least[j]]
+        shown = [j for j in group if K[j, j] > visibility_limit[j]]
         if len(shown) == 1:
             out[g] = c[shown[0]] ** 2 / K[shown[0], shown[0]]
         elif shown:
@@ -128,7 +127,7 @@ def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], least: Array) -
 
 
 def schur_complement(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
-    """Return K (V, V) and c (V,) without the columns of `group`, which have joined the set."""
+    """Return K (V, V) and c (V,) after the fit of the columns of `group`."""
     j = list(group)
     inverse = np.linalg.pinv(K[np.ix_(j, j)], rcond=1e-8, hermitian=True)
     return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])
@@ -142,10 +141,10 @@ def fit_members(candidates: CandidateColumns, members: Sequence[int], r: Array) 
         D = candidates.columns[:, columns]
         fit = shortest(D, r, 1e-6)
         residual = r - D @ fit
-        at = 0
+        start = 0
         for m in members:
-            parts.append(fit[at : at + len(candidates.groups[m])])
-            at += len(candidates.groups[m])
+            parts.append(fit[start : start + len(candidates.groups[m])])
+            start += len(candidates.groups[m])
     excess_energy = {
         e: float(residual[w] @ residual[w]) - len(w) for e, w in candidates.rows.items()
     }
@@ -157,22 +156,22 @@ def sets_with_one_more(
 ) -> list[LinearFit]:
     """Return the sets with one more entry that removes enough energy, the best set first.
 
-    Sets that leave about the least come first, by number of free numbers; then the others by the
-    energy that they leave.
+    Sets that leave about the least come first, ordered by their count of free numbers; then the
+    others by the energy that they leave.
     """
-    now = fit_members(candidates, members, r)
+    current = fit_members(candidates, members, r)
     K, c = candidates.K, candidates.columns.T @ r
     for m in members:
         K, c = schur_complement(K, c, candidates.groups[m])
-    g = gains(K, c, candidates.groups, candidates.least)
+    g = gains(K, c, candidates.groups, candidates.visibility_limit)
     taken = {candidates.entries[m].used.term.key for m in members}
     trials: list[LinearFit] = []
     for i in _best_of_each(candidates, g):
         entry = candidates.entries[i]
         if g[i] <= 0 or entry.used.term.key in taken:
             continue
-        left = sum(max(0.0, now.excess_energy.get(e, 0.0)) for e in entry.touched)
-        if g[i] < SEARCH.add_share * left:
+        remaining = sum(max(0.0, current.excess_energy.get(e, 0.0)) for e in entry.touched)
+        if g[i] < SEARCH.add_share * remaining:
             continue
         trial = fit_members(candidates, (*members, i), r)
         sizes = zip(trial.members, trial.coefficients, strict=True)
@@ -186,14 +185,14 @@ def sets_with_one_more(
     def size(trial: LinearFit) -> int:
         return sum(candidates.size[m] for m in trial.members)
 
-    near = sorted((t for t in trials if t.total <= limit), key=lambda t: (size(t), t.total))
-    return near + sorted((t for t in trials if t.total > limit), key=lambda t: t.total)
+    similar = sorted((t for t in trials if t.total <= limit), key=lambda t: (size(t), t.total))
+    return similar + sorted((t for t in trials if t.total > limit), key=lambda t: t.total)
 
 
 def _best_of_each(candidates: CandidateColumns, g: Array) -> list[int]:
-    """Return the entries with the largest gains g (V,), a few shapes of each effect.
+    """Return the entries with the largest gains g (V,), at most a few shapes of each effect.
 
-    All shapes of an effect that fits with an impossible number would leave no room for others.
+    Otherwise the shapes of one effect, fitted with an impossible number, could fill the list.
     """
     fitted: Counter[Key] = Counter()
     best: list[int] = []
@@ -208,15 +207,16 @@ def _best_of_each(candidates: CandidateColumns, g: Array) -> list[int]:
 
 
 def best_pairs(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
-    """Return the pairs of different candidates that leave least."""
-    # None of a pair need remove enough alone.
-    g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.least)
-    starts: dict[Key, int] = {}
+    """Return the pairs of different candidates that leave least; each alone may remove little."""
+    g = gains(
+        candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
+    )
+    best_variant: dict[Key, int] = {}
     for i in map(int, np.argsort(-g)[: 6 * SEARCH.pair_starts]):
         if g[i] > 0:
-            starts.setdefault(candidates.entries[i].used.term.key, i)
+            best_variant.setdefault(candidates.entries[i].used.term.key, i)
     pairs: dict[frozenset[Key], LinearFit] = {}
-    for first in list(starts.values())[: SEARCH.pair_starts]:
+    for first in list(best_variant.values())[: SEARCH.pair_starts]:
         for pair in sets_with_one_more(candidates, (first,), r)[:3]:
             keys = frozenset(candidates.entries[m].used.term.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:

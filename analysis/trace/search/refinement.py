@@ -2,9 +2,9 @@
 
 The rows of the averaged records are computed again at every shape, the linear coefficients are
 solved for, and only the shapes are searched (Golub and Pereyra, 1973). An effect that rescales the
-right side (a sensor's gain) must not seem to explain it by that: while its shapes are searched,
-rows are scaled back to the size of the right side before the change. What a fit leaves is compared
-with noise in the rows as they are.
+right side (a sensor's gain) would reduce the residual by the scaling alone: while its shapes are
+searched, rows are scaled back to the size of the right side before the change. The residual of the
+final fit is of rows without that scaling.
 """
 
 from __future__ import annotations
@@ -46,52 +46,52 @@ Array = NDArray[np.float64]
 def refine(
     data: RegressionData,
     terms: Sequence[Used],
-    instead_of: ExactFit | None = None,
+    rival: ExactFit | None = None,
     steps: int = SEARCH.steps,
 ) -> ExactFit:
-    """Return the fit with the shapes of all effects that are not among the data's own terms.
+    """Return the fit with searched shapes of all effects that are not among the data's own terms.
 
     The search starts from the shapes given. Of the forms of an effect the one that leaves least, at
     a price for each free number, is used. Then details of the form are added that remove more than
     chance (`SEARCH.number_price`) and more than `SEARCH.detail_share` of the remaining energy above
     noise.
 
-    A set that may only replace the fit `instead_of` is not searched further where it leaves over
+    With a fit `rival` to be replaced, the search ends early where it leaves over
     `SEARCH.unpromising_ratio` times as much and little less than `SEARCH.first_steps` before. Where
-    it leaves more than that fit, its terms that are in it keep the forms that they have.
+    it leaves more than the rival, the terms in both keep their forms.
 
     Shapes of effects that rescale signals are searched in rows of unchanged size
     (`RegressionData.relative`). The fit returned is of rows over their noise.
     """
     if not rescale(data, terms):
-        return _refined(data, terms, instead_of, steps)
-    found = _refined(replace(data, relative=True), terms, instead_of, steps)
-    return fit_coefficients(data, found.terms)
+        return _refined(data, terms, rival, steps)
+    relative_fit = _refined(replace(data, relative=True), terms, rival, steps)
+    return fit_coefficients(data, relative_fit.terms)
 
 
 def _refined(
-    data: RegressionData, terms: Sequence[Used], instead_of: ExactFit | None, steps: int
+    data: RegressionData, terms: Sequence[Used], rival: ExactFit | None, steps: int
 ) -> ExactFit:
-    """Return the fit of `refine`, its rows of the size that `data` asks for."""
-    shared: Sequence[int] = ()
-    enough = math.inf
-    if instead_of is not None:
-        shared = [k for k, used in enumerate(terms) if used in instead_of.terms]
-        enough = instead_of.energy
-        limit = SEARCH.unpromising_ratio * enough
-        first = _with_searched_shapes(data, terms, SEARCH.first_steps)
-        terms = first.terms
-        if first.energy > limit:
-            second = _with_searched_shapes(data, terms, SEARCH.first_steps)
-            if second.energy > max(limit, SEARCH.promising_drop * first.energy):
-                return second
-            terms = second.terms
+    """Return the fit of `refine` to rows of the size that `data.relative` states."""
+    in_rival: Sequence[int] = ()
+    rival_energy = math.inf
+    if rival is not None:
+        in_rival = [k for k, used in enumerate(terms) if used in rival.terms]
+        rival_energy = rival.energy
+        limit = SEARCH.unpromising_ratio * rival_energy
+        start = _with_searched_shapes(data, terms, SEARCH.first_steps)
+        terms = start.terms
+        if start.energy > limit:
+            continued = _with_searched_shapes(data, terms, SEARCH.first_steps)
+            if continued.energy > max(limit, SEARCH.promising_drop * start.energy):
+                return continued
+            terms = continued.terms
     fit = _with_searched_shapes(data, terms, steps)
     for k in range(len(terms)):
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        if k in shared and fit.energy > enough:
+        if k in in_rival and fit.energy > rival_energy:
             continue
         fit = _with_details(data, _in_best_form(data, fit, k, steps), k, steps)
     return fit
@@ -102,23 +102,23 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -
     used = fit.terms[place]
     starts = effect_in(used).detailed_shapes(data.rig, used.shape)
     opened = [Used(used.term, start) for start in starts if start != used.shape]
-    asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
+    least_gain = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
     # Half, since the linear prediction is less than what a detail removes.
     promising = [
         fit_coefficients(data, with_term(fit.terms, used, start))
         for start in opened
-        if _predicted_gain(data, fit, used, start) >= 0.5 * asked
+        if _predicted_gain(data, fit, used, start) >= 0.5 * least_gain
     ]
     nearest = sorted(promising, key=lambda model: model.energy)[: SEARCH.detail_starts]
     searched = [_with_searched_shapes(data, model.terms, steps) for model in nearest]
-    more = min(searched, key=lambda model: model.energy, default=fit)
-    if fit.energy - more.energy <= asked:
+    detailed = min(searched, key=lambda model: model.energy, default=fit)
+    if fit.energy - detailed.energy <= least_gain:
         return fit
     # A form that fitted better without the details need not do so with them.
-    more = _in_best_form(data, more, place, steps)
-    earned = fit.energy - more.energy > asked
-    sure = earned and _determines_shapes(data, more, more.terms[place], used)
-    return more if sure and not _replaces_detail(data, fit, more, used, steps) else fit
+    detailed = _in_best_form(data, detailed, place, steps)
+    earned = fit.energy - detailed.energy > least_gain
+    sure = earned and _determines_shapes(data, detailed, detailed.terms[place], used)
+    return detailed if sure and not _replaces_detail(data, fit, detailed, used, steps) else fit
 
 
 def _replaces_detail(
@@ -126,7 +126,7 @@ def _replaces_detail(
 ) -> bool:
     """Return whether another effect beside `used` leaves as little as details of its form.
 
-    Over part of its range, a sensor with a gain and an offset looks like a bent one.
+    Over part of its range, a gain and an offset of a sensor resemble a curved characteristic.
     """
     present = {u.term for u in fit.terms}
     others = [
@@ -139,28 +139,28 @@ def _replaces_detail(
     return any(model.energy <= detailed.energy + SEARCH.number_price for model in beside)
 
 
-def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, before: Used) -> bool:
+def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, undetailed: Used) -> bool:
     """Return whether the rows determine an effect's shapes beside the details of its form.
 
-    Each shape that is larger than `before`, without the details, must have a relative standard
+    Each shape that is larger than `undetailed`, without the details, must have a relative standard
     error of at most `SEARCH.shape_error`, and no shape or detail may lie at its bound. Otherwise
-    the detail fits something else: noise that reverses a contact at rest looks like a long
-    presliding distance that shrinks with speed.
+    the detail fits something else: noise that reverses a contact at rest resembles a long
+    presliding distance that decreases with speed.
     """
     shapes = shapes_of(data.rig, used)
     if any(map(_at_end, shapes, used.shape)) or effect_in(used).outside(data.rig, used.shape):
         return False
     names, columns = tangent(data, fit)
     misfit = math.sqrt(max(1.0, fit.energy / len(fit.residual)))
-    simpler = shape_values(data.rig, before)
+    undetailed_values = shape_values(data.rig, undetailed)
     for shape, value in zip(shapes, used.shape, strict=True):
-        larger = abs(value) > abs(simpler.get(shape.parameter, 0.0))
+        larger = abs(value) > abs(undetailed_values.get(shape.parameter, 0.0))
         if shape.detail or shape.fixed or not shape.is_present(value) or not larger:
             continue
-        own = names.index(shape.parameter)
-        basis = orthonormal(np.delete(columns, own, axis=1))
-        left = columns[:, own] - basis @ (basis.T @ columns[:, own])
-        if misfit > SEARCH.shape_error * abs(value) * float(np.linalg.norm(left)):
+        column = names.index(shape.parameter)
+        basis = orthonormal(np.delete(columns, column, axis=1))
+        projected = columns[:, column] - basis @ (basis.T @ columns[:, column])
+        if misfit > SEARCH.shape_error * abs(value) * float(np.linalg.norm(projected)):
             return False
     return True
 
@@ -175,9 +175,9 @@ def _at_end(shape: Shape, value: float) -> bool:
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
     """Return the fit with the term number `place` in the form that leaves least.
 
-    Each further free number that a form has must be significant (`TRACE.standard_errors`): an
-    exponent that is not would widen the interval of the size tenfold. A form within its physical
-    bounds is preferred to one at them.
+    Each further free number of a form must be significant (`TRACE.standard_errors`): an exponent
+    that is not would widen the interval of the size tenfold. A form within its physical bounds is
+    preferred to one at them.
     """
     price = TRACE.standard_errors**2
 
@@ -217,7 +217,7 @@ def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: in
     terms = _on_better_side(data, terms, free)
     start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
 
-    def at(x: Array) -> tuple[Used, ...]:
+    def terms_at(x: Array) -> tuple[Used, ...]:
         shapes = [list(u.shape) for u in terms]
         for value, (k, j, s) in zip(x, free, strict=True):
             shapes[k][j] = _from_unit(float(value), s)
@@ -226,18 +226,18 @@ def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: in
             for u, v in zip(terms, shapes, strict=True)
         )
 
-    # Scaled by the derivatives: an edge of a thousandth of the spool's range would take tiny steps
-    # beside a shape in the middle of its own.
+    # Scaled by the derivatives: a dead band of a thousandth of the spool's range would otherwise
+    # take tiny steps beside a shape in the middle of its range.
     search = minimise(
-        lambda x: fit_coefficients(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6),
+        lambda x: fit_coefficients(data, terms_at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6),
         bounds=(0.0, 1.0), diff_step=1e-3, x_scale="jac", xtol=SEARCH.shape_tolerance,
         ftol=SEARCH.tolerance, gtol=1e-12, max_nfev=steps,
     )  # fmt: skip
-    return fit_coefficients(data, at(search.x))
+    return fit_coefficients(data, terms_at(search.x))
 
 
 def _free_shapes(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
-    """Return the shapes to be searched: number of the term, number of the shape in it, shape."""
+    """Return the searched shapes: number of the term, number of the shape in it, shape."""
     return [
         (k, j, s)
         for k, u in enumerate(terms)
@@ -255,7 +255,7 @@ def _on_better_side(
     The linear search gives the size, not the sign, and from the wrong side the search of shapes
     runs to the bound instead of through the neutral value.
     """
-    terms, least = tuple(terms), np.nan
+    terms, least_energy = tuple(terms), np.nan
     for k, j, s in free:
         if s.neutral is None or not s.low < s.neutral < s.high:
             continue
@@ -263,11 +263,11 @@ def _on_better_side(
         mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))
         shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
         other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
-        if np.isnan(least):  # fitted only if a shape has two sides, which few have
-            least = fit_coefficients(data, terms).energy
+        if np.isnan(least_energy):  # fitted only if a shape has two sides, which few have
+            least_energy = fit_coefficients(data, terms).energy
         energy = fit_coefficients(data, other).energy
-        if energy < least:
-            terms, least = other, energy
+        if energy < least_energy:
+            terms, least_energy = other, energy
     return terms
 
 
@@ -297,10 +297,7 @@ def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[tuple[Used,
 
 
 def at_best_size(data: RegressionData, used: Used, others: Sequence[Used]) -> Used:
-    """Return an effect with its shapes at that share of their size which leaves least.
-
-    `others` are the effects beside it. The shares are `SEARCH.start_shares`.
-    """
+    """Return an effect scaled in size by the best of `SEARCH.start_shares`, beside `others`."""
     shapes = shapes_of(data.rig, used)
     if all(s.neutral is None for s in shapes):
         return used
@@ -343,53 +340,53 @@ class ShapeFit:
 
 
 def fit_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> ShapeFit | None:
-    """Fit the open shapes of a model's terms to the runs' rows; return None where none is open.
+    """Fit the missing shapes of a model's terms to the runs' rows; return None if none is missing.
 
-    By variable projection: effects are added one after another, each from the points of its shape
-    grid that leave least. Then each is searched anew beside the others until none leaves less:
-    without its lag, the flow of one joint would spoil b for the lag of another. Given shapes are
-    kept. Raises InputError for unusable records.
+    Effects are added one after another, each from the points of its shape grid that leave least.
+    Then each is searched again beside the others until none leaves less: the lag of one joint's
+    spool biases b, and with it the lag of another joint's. Shapes that the terms have are kept.
+    Raises InputError for unusable records.
     """
     runs = with_common_bandwidth(runs)
     rig = ck.common_rig(runs)
-    wanted = [u for u in terms if open_shapes(rig, u)]
-    if not wanted:
+    open_terms = [u for u in terms if open_shapes(rig, u)]
+    if not open_terms:
         return None
-    known = [u for u in terms if u not in wanted]
+    other_terms = [u for u in terms if u not in open_terms]
     data = regression_data(
-        rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
+        rig, (*other_terms, *temperature_terms(other_terms, runs)), conditioned_records(rig, runs)
     )
-    seen = evidence(data, data.mean_residual)
+    grid_evidence = evidence(data, data.mean_residual)
 
     def searched(effect: Term, others: Sequence[Used], place: int) -> ExactFit:
         assert isinstance(effect, Effect)
         trials = [
             (*data.terms, *others[:place], Used(effect, point), *others[place:])
-            for point in shape_grid(effect, rig, seen)
+            for point in shape_grid(effect, rig, grid_evidence)
         ]
         # Several starts, since the best point may be one from which no search leads on: a metering
         # edge that no spool reaches has no derivative.
-        near = sorted(trials, key=lambda trial: fit_coefficients(data, trial).energy)
-        starts = near[: SEARCH.shape_starts]
+        nearest = sorted(trials, key=lambda trial: fit_coefficients(data, trial).energy)
+        starts = nearest[: SEARCH.shape_starts]
         return min((refine(data, trial) for trial in starts), key=lambda fit: fit.energy)
 
     best = fit_coefficients(data, data.terms)
-    for k, used in enumerate(wanted):
+    for k, used in enumerate(open_terms):
         best = searched(used.term, best.terms[len(data.terms) :], k)
-    improved = len(wanted) > 1
+    improved = len(open_terms) > 1
     while improved:
         improved = False
-        for k, used in enumerate(wanted):
-            own = best.terms[len(data.terms) :]
-            again = searched(used.term, (*own[:k], *own[k + 1 :]), k)
-            if again.energy < best.energy - SEARCH.number_price:
-                best, improved = again, True
-    shaped = dict(zip(wanted, best.terms[len(data.terms) :], strict=True))
+        for k, used in enumerate(open_terms):
+            effects = best.terms[len(data.terms) :]
+            refit = searched(used.term, (*effects[:k], *effects[k + 1 :]), k)
+            if refit.energy < best.energy - SEARCH.number_price:
+                best, improved = refit, True
+    shaped = dict(zip(open_terms, best.terms[len(data.terms) :], strict=True))
     return ShapeFit(tuple(shaped.get(u, u) for u in terms), data, best)
 
 
 def shapes_in(rig: Rig, terms: Sequence[Used]) -> dict[str, Estimate]:
-    """Return the shapes that a model's forms have, by name, with no error (NaN)."""
+    """Return a model's shapes by name, without standard errors and intervals (NaN)."""
     return {
         s.parameter: Estimate(value, s.unit, math.nan, (math.nan, math.nan))
         for u in terms

@@ -1,8 +1,8 @@
 """Find the records that carry a load which others lack, where no record states it.
 
 A load of mass m at the tip adds m p to the torque rows: p = X g, of the baseline's columns X and
-the growth g of its coefficients per kilogram. Of records that all carry it M, R and W absorb it; of
-records of which only some carry it they do not. Two fits alternate to find which do:
+the growth g of its coefficients per kilogram. M, R and W absorb a load that all records carry, but
+not one that only some carry. Two fits alternate to find these records:
  coefficients and m by least squares, with p in the rows of the records that carry the load;
  the state of each record, by whether r or r - m p is smaller in its rows (r: residual without m).
 The first guess is of whole steps: from each single step on, one step after the other changes its
@@ -41,7 +41,7 @@ Key = tuple[int, str]  # number of the run, name of the record
 
 @dataclass(frozen=True)
 class UndeclaredLoad:
-    """Runs with every record's load stated as its torque rows show it, and a note on that.
+    """Runs with every record's load stated by its torque rows, and a note on that.
 
     `shows_inertia` as in `LoadFit`.
     """
@@ -89,57 +89,57 @@ class _LoadRows:
 
     def chosen(self, loaded: Mask) -> frozenset[Key]:
         """Return the records of a mask (U,)."""
-        return frozenset(key for key, here in zip(self.keys, loaded, strict=True) if here)
+        return frozenset(key for key, is_loaded in zip(self.keys, loaded, strict=True) if is_loaded)
 
 
-def undeclared_load(records: TraceRuns, beside: Sequence[Effect] = ()) -> UndeclaredLoad | None:
+def undeclared_load(records: TraceRuns, effects: Sequence[Effect] = ()) -> UndeclaredLoad | None:
     """Return the runs with the load that the torque rows show in some records, None if in none.
 
-    The load alone is tried, then with the effects `beside` it. In a record that nothing is fitted
-    to, its rows alone decide; in a held-out record whose rows are divided, the rows that choose.
+    The load is fitted alone, then beside `effects`. Whether a held-out record carries it follows
+    from its own rows, where they are divided from the choosing rows.
     """
     rig, terms = records.rig, records.terms
     train, holdout, judge = records.train, records.holdout, records.judge
     if any(r.loaded is not None for run in (*train, *records.unseen) for r in run.records):
         return None
     load = fitted_load(rig, terms, train)
-    if load is None and beside:
-        terms = (*terms, *(at_start(rig, effect) for effect in beside))
+    if load is None and effects:
+        terms = (*terms, *(at_start(rig, effect) for effect in effects))
         load = fitted_load(rig, terms, train)
     if load is None:
         return None
-    found = [
+    loaded_by_task = [
         (train, load.loaded),
         (holdout, loaded_records(rig, terms, holdout, load, divided=not judge)),
         (judge, loaded_records(rig, terms, judge, load, divided=False) if judge else frozenset()),
     ]
-    carry = [word for runs, loaded in found for word in _in_words(runs, loaded)]
+    carry = [word for runs, loaded in loaded_by_task for word in _in_words(runs, loaded)]
     weighed = "" if load.shows_inertia else ", by its weight alone"
     words = (
         f"no record states a load: by the torque balances {' '.join(dict.fromkeys(carry))} carry "
         f"about {plain(load.mass, 2)} kg more at the tip than the other records{weighed}; state "
         "`loaded` of the records where it is known (import manifest)"
     )
-    train, holdout, judge = (with_loads(runs, loaded) for runs, loaded in found)
+    train, holdout, judge = (with_loads(runs, loaded) for runs, loaded in loaded_by_task)
     stated = replace(records, train=train, holdout=holdout, judge=judge)
     return UndeclaredLoad(stated, words, load.shows_inertia)
 
 
 def _in_words(runs: Sequence[Run], loaded: frozenset[Key]) -> list[str]:
-    """Return the steps that carry a load, of a step that carries it in part the records."""
+    """Return the names of loaded steps, and of loaded records of steps that are partly loaded."""
     out = []
     for number, run in enumerate(runs):
-        bare = {r.step for r in run.records if (number, r.name) not in loaded}
-        here = [r for r in run.records if (number, r.name) in loaded]
-        out += [r.name if r.step in bare else r.step for r in here]
+        unloaded_steps = {r.step for r in run.records if (number, r.name) not in loaded}
+        carrying = [r for r in run.records if (number, r.name) in loaded]
+        out += [r.name if r.step in unloaded_steps else r.step for r in carrying]
     return out
 
 
 def fitted_load(rig: Rig, terms: Sequence[Used], runs: Sequence[Run]) -> LoadFit | None:
     """Return the load that separates the training records best.
 
-    None on a rig without links, and where no load removes `DATA.load_share` of the torque rows'
-    energy above noise.
+    None on a rig without links, and where no load removes `DATA.load_share` of the energy above
+    noise of the torque rows.
     """
     if not Payload.all_places(rig):
         return None
@@ -178,27 +178,27 @@ def loaded_records(
     With `divided`, rows of blocks that are set aside for judging are not used.
     """
     rows = _load_rows(rig, terms, runs, load.beta)
-    asked = np.ones(len(rows.column))
+    used = np.ones(len(rows.column))
     for s in rows.data.segments if divided else ():
-        asked[s.where] = ~in_judging_block(rows.data.source(s)[1].time)
-    rows = replace(rows, column=rows.column * asked)
+        used[s.where] = ~in_judging_block(rows.data.source(s)[1].time)
+    rows = replace(rows, column=rows.column * used)
     return rows.chosen(_states(rows, rows.residual, load.mass))
 
 
 def with_loads(runs: Sequence[Run], loaded: frozenset[Key]) -> tuple[Run, ...]:
     """Return the runs with every record's load stated.
 
-    Loaded records of a step that has records without a load too become a step of their own, since
-    they do not have the same motion.
+    Loaded records of a partly loaded step become a separate step, since their motion differs.
     """
     out = []
     for number, run in enumerate(runs):
-        bare = {r.step for r in run.records if (number, r.name) not in loaded}
+        unloaded_steps = {r.step for r in run.records if (number, r.name) not in loaded}
         records = []
         for record in run.records:
-            here = (number, record.name) in loaded
-            step = f"{record.step}, loaded" if here and record.step in bare else record.step
-            attributes = {**record.attributes, LOADED: int(here)}
+            is_loaded = (number, record.name) in loaded
+            suffix = ", loaded" if is_loaded and record.step in unloaded_steps else ""
+            step = f"{record.step}{suffix}"
+            attributes = {**record.attributes, LOADED: int(is_loaded)}
             records.append(replace(record, step=step, attributes=attributes))
         out.append(replace(run, records=tuple(records)))
     return tuple(out)
@@ -215,41 +215,42 @@ def _load_rows(
     per_kilogram = growth(rig)
     column = data.base @ np.array([per_kilogram.get(name, 0.0) for name in data.names])
     keys = tuple(conditioned.group for conditioned in data.records)
-    unit = np.zeros(len(column), dtype=np.int64)
+    record_number = np.zeros(len(column), dtype=np.int64)
     for s in data.segments:
-        unit[s.where] = keys.index(s.group)
-    return _LoadRows(data, column, data.mean_residual, unit, keys)
+        record_number[s.where] = keys.index(s.group)
+    return _LoadRows(data, column, data.mean_residual, record_number, keys)
 
 
 def _steps(runs: Sequence[Run], keys: Sequence[Key]) -> list[Mask]:
-    """Return which records (U,) each step of each run has; of one step alone, each record."""
+    """Return masks (U,) of the records of each step of each run, of each record if all are one."""
     step_of = {(n, r.name): (n, r.step) for n, run in enumerate(runs) for r in run.records}
-    found = [step_of[key] for key in keys]
-    if len(set(found)) == 1:
+    step_of_record = [step_of[key] for key in keys]
+    if len(set(step_of_record)) == 1:
         return list(np.eye(len(keys), dtype=bool))
-    return [np.array([step == one for step in found]) for one in dict.fromkeys(found)]
+    steps = dict.fromkeys(step_of_record)
+    return [np.array([other == step for other in step_of_record]) for step in steps]
 
 
 def _first_guess(rows: _LoadRows, basis: Array, residual: Array, steps: Sequence[Mask]) -> Mask:
-    """Return the records (U,) of the steps that a load in them explains best."""
+    """Return a mask (U,) of the records of the steps that a load in them explains best."""
     columns = np.column_stack([rows.with_load(step) for step in steps])
     columns = columns - basis @ (basis.T @ columns)
     K, c, size = columns.T @ columns, columns.T @ residual, float(rows.column @ rows.column)
 
     def removed(chosen: Mask) -> float:
-        own = float(chosen @ K @ chosen)
-        return float(chosen @ c) ** 2 / own if own > TRACE.rank_limit**2 * size else 0.0
+        energy = float(chosen @ K @ chosen)
+        return float(chosen @ c) ** 2 / energy if energy > TRACE.rank_limit**2 * size else 0.0
 
     best = np.zeros(len(steps), dtype=bool)
-    for first in np.eye(len(steps), dtype=bool):
-        now = first
+    for start in np.eye(len(steps), dtype=bool):
+        current = start
         while True:
-            others = [now ^ step for step in np.eye(len(steps), dtype=bool)]
-            other = max(others, key=removed)
-            if removed(other) <= removed(now):
+            others = [current ^ step for step in np.eye(len(steps), dtype=bool)]
+            better = max(others, key=removed)
+            if removed(better) <= removed(current):
                 break
-            now = other
-        best = max(best, now, key=removed)
+            current = better
+        best = max(best, current, key=removed)
     if best @ c < 0.0:  # the mass is negative: the others carry the load
         best = ~best
     return np.asarray(np.array(steps)[best].any(axis=0))
@@ -258,14 +259,14 @@ def _first_guess(rows: _LoadRows, basis: Array, residual: Array, steps: Sequence
 def _fit(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:
     """Return the mass [kg] and the changes (k,) of the baseline's coefficients."""
     matrix = np.column_stack((rows.data.base, rows.with_load(loaded)))
-    found = shortest(matrix, rows.residual, TRACE.rank_limit)
-    return float(found[-1]), found[:-1]
+    solution = shortest(matrix, rows.residual, TRACE.rank_limit)
+    return float(solution[-1]), solution[:-1]
 
 
 def _inertia_agrees(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
     """Return whether the inertia of the load in the records `loaded` (U,) agrees with its weight.
 
-    The mass from gravity terms alone and that from inertia terms alone may differ by
+    The masses from gravity terms alone and from inertia terms alone may differ by
     `TRACE.invariance_tolerance`, plus noise: a tilt of the base or an offset of a sensor adds a
     weight without inertia. None where M and R absorb the inertia, since the joint moves in no
     record without the load.
@@ -289,6 +290,6 @@ def _inertia_agrees(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
 
 
 def _states(rows: _LoadRows, residual: Array, mass: float) -> Mask:
-    """Return which records (U,) a residual (M,) without load fits better with the mass."""
+    """Return a mask (U,) of the records in which the load reduces `residual` (M,)."""
     added = mass * rows.column
     return np.asarray(rows.sums(residual * added) > 0.5 * rows.sums(added * added))

@@ -113,7 +113,7 @@ def gains(candidates: CandidateColumns, r: Array) -> Array:
     out = []
     for group in candidates.groups:
         X = candidates.columns[:, list(group)]
-        visible = np.linalg.norm(X, axis=0) > np.sqrt(candidates.least[list(group)])
+        visible = np.linalg.norm(X, axis=0) > np.sqrt(candidates.visibility_limit[list(group)])
         X = X[:, visible]
         out.append(r @ X @ np.linalg.lstsq(X, r, rcond=1e-6)[0] if X.shape[1] else 0.0)
     return np.array(out)

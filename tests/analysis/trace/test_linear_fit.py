@@ -37,7 +37,9 @@ def test_how_much_of_a_column_must_be_its_own(
         Used(TorqueOffset("joint 2"), ()), (name,), column[:, None], frozenset({"torque_2"})
     )
     candidates = project(data, [entry], lambda _: 1, lambda *_: True)
-    gained = gains(candidates.K, candidates.columns.T @ own, candidates.groups, candidates.least)
+    gained = gains(
+        candidates.K, candidates.columns.T @ own, candidates.groups, candidates.visibility_limit
+    )
     assert gained[0] == pytest.approx(float(own @ own) if shows else 0.0)
 
 

@@ -129,7 +129,7 @@ def _one_candidate(
     r = inference.sign_flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     size = np.maximum(np.diag(candidates.K), 1e-300)
-    first = int(np.argmax(size > candidates.least))
+    first = int(np.argmax(size > candidates.visibility_limit))
     gain: Array = (candidates.columns[:, first] @ r) ** 2 / size[first]
     return gain
 
