@@ -1,4 +1,4 @@
-"""Caches of what is computed from records more than once: rows, signals, parts of rows."""
+"""Caches of rows, signals and parts of rows, which many models of the same records share."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Cache:
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return the value of a key; `make` computes it if it is not stored."""
-        found = self._values.get(key)
-        if found is not None:
-            return found[0]
+        entry = self._values.get(key)
+        if entry is not None:
+            return entry[0]
         value = make()
         size = _bytes(value)
         self._values[key] = value, size
@@ -62,15 +62,15 @@ class SignalCache:
     def get(self, key: Hashable, signals: Signals, make: Callable[[Signals], Any]) -> Any:
         """Return `make(signals)`, computed again only if a field that `make` reads has changed."""
         stored = self._values.setdefault(key, [])
-        for read, value in stored:
-            if all(getattr(signals, name) is x for name, x in read):
+        for fields_read, value in stored:
+            if all(getattr(signals, name) is x for name, x in fields_read):
                 return value
         recording = _RecordingSignals(**vars(signals))
         value = make(recording)
-        read = [(name, getattr(signals, name)) for name in vars(recording).get(READ, ())]
+        fields_read = [(name, getattr(signals, name)) for name in vars(recording).get(READ, ())]
         # The first entry belongs to the record's own signals, which most models use: it is kept.
         del stored[1 : len(stored) - DATA.cached_signal_sets + 2]
-        stored.append((read, value))
+        stored.append((fields_read, value))
         return value
 
 

@@ -1,4 +1,4 @@
-"""Candidates: every effect of the catalogue at every place, with a grid of shapes to start from."""
+"""Candidates: every effect of the catalogue at every place, with a grid of starting shapes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from rig.model.rig import Rig
 
 
 def effect_in(used: Used) -> Effect:
-    """Return the effect of a used term that is one."""
+    """Return a used term's effect; the term must be an effect."""
     assert isinstance(used.term, Effect)
     return used.term
 
 
 def effects_among(terms: Iterable[Used]) -> list[Effect]:
-    """Return the effects of those of a model's terms that are effects."""
+    """Return the effects among a model's terms."""
     return [used.term for used in terms if isinstance(used.term, Effect)]
 
 
@@ -58,10 +58,11 @@ def shape_grid(
     axes = [shape.grid for shape in effect.shapes(rig) if not shape.detail]
     grid = list(itertools.product(*axes))
     if len(grid) > DATA.grid_points:
-        per = max(2, int(DATA.grid_points ** (1 / len(axes))))
+        per_axis = max(2, int(DATA.grid_points ** (1 / len(axes))))
         thinned = [
             tuple(
-                axis[i] for i in np.unique(np.linspace(0, len(axis) - 1, per).round().astype(int))
+                axis[i]
+                for i in np.unique(np.linspace(0, len(axis) - 1, per_axis).round().astype(int))
             )
             for axis in axes
         ]
@@ -78,9 +79,9 @@ def variants(rig: Rig, effects: Sequence[Effect], evidence: Evidence | None = No
 
 def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
     """Return the number of effects and of their free numbers, details of forms not counted."""
-    free = sum(
+    numbers = sum(
         len(u.term.coefficients(rig))
         + sum(not (shape.detail or shape.fixed) for shape in shapes_of(rig, u))
         for u in used
     )
-    return len(used), free
+    return len(used), numbers

@@ -37,15 +37,15 @@ Array = NDArray[np.float64]
 
 
 def trace_filtering(record: Record) -> Filtering:
-    """Return the default filters with a decimation that whole periods are multiples of.
+    """Return the default filters with a decimation that divides the period.
 
     Rows of successive periods then stand at the same phase and can be compared one by one.
     """
-    chosen = default_filtering(record)
+    default = default_filtering(record)
     if not record.period:
-        return chosen
-    step = next(k for k in range(chosen.step, 0, -1) if record.period % k == 0)
-    return replace(chosen, step=max(step, (chosen.step + 1) // 2))
+        return default
+    step = next(k for k in range(default.step, 0, -1) if record.period % k == 0)
+    return replace(default, step=max(step, (default.step + 1) // 2))
 
 
 def moving_filtering(
@@ -78,8 +78,8 @@ def is_hidden_by_lock(term: Term, conditioned: ConditionedRecord) -> bool:
     An error of a position sensor shows in a locked joint too, by the position where it stands.
     """
     where = term.where
-    place = getattr(term, "stage", None) == SENSOR and where.endswith(("piston", "position"))
-    if not where.startswith("joint ") or place:
+    of_sensor = getattr(term, "stage", None) == SENSOR
+    if not where.startswith("joint ") or (of_sensor and where.endswith(("piston", "position"))):
         return False
     return int(where.split()[1]) in conditioned.record.locked
 
@@ -114,7 +114,7 @@ def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) 
 
 
 def prepared_signals(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> Signals:
-    """Return the signals of a record as the terms of a model see them."""
+    """Return the signals of a record as changed by the terms of a model (`Term.prepare`)."""
     signals = conditioned.signals
     for used in ordered(terms):
         signals = used.term.prepare(rig, signals, used.shape)
@@ -140,34 +140,37 @@ def _at_rows(
 def shared_rows(
     rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, cache: RowCache
 ) -> dict[str, Rows]:
-    """Return a record's rows under the terms that can show in it; parts are shared by `cache`.
+    """Return a record's rows under the terms that no lock hides; models share parts in `cache`.
 
-    Many models share the terms that act on a family of rows. The columns of an effect that changes
-    no signal are filtered separately and appended to the rows of the other terms.
+    The columns of an effect that changes no signal are filtered separately and appended to the rows
+    of the other terms.
     """
-    here = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
+    visible = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
     out: dict[str, Rows] = {}
     for family in conditioned.families:
-        acting = acting_on(rig, here, family, cache)
-        added = [u for u in acting if isinstance(u.term, Effect) and not changes_rows(u.term)]
-        others = tuple(u for u in acting if u not in added)
-        key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
+        acting = acting_on(rig, visible, family, cache)
+        appended = [u for u in acting if isinstance(u.term, Effect) and not changes_rows(u.term)]
+        others = tuple(u for u in acting if u not in appended)
+        key, one_family = (
+            (conditioned.group, family, others),
+            replace(conditioned, families=(family,)),
+        )
         # Signals depend only on the terms that change them, so that families of rows share them.
         changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
         prepared = partial(
             cache.signals.get,
             (conditioned.group, changing),
-            partial(prepared_signals, rig, changing, own),
+            partial(prepared_signals, rig, changing, one_family),
         )
-        bare: dict[str, Rows] = cache.rows.get(
-            key, partial(_rows_of_family, rig, others, own, prepared, cache)
+        common: dict[str, Rows] = cache.rows.get(
+            key, partial(_rows_of_family, rig, others, one_family, prepared, cache)
         )
-        rows = bare
-        for u in added:
-            more = cache.rows.get(
-                (*key, u), partial(added_columns, rig, own, prepared, bare, u, cache)
+        rows = common
+        for u in appended:
+            further = cache.rows.get(
+                (*key, u), partial(added_columns, rig, one_family, prepared, common, u, cache)
             )
-            rows = {e: _with_columns(r, more.get(e, {})) for e, r in rows.items()}
+            rows = {e: _with_columns(r, further.get(e, {})) for e, r in rows.items()}
         out |= rows
     return out
 
@@ -176,7 +179,7 @@ def _rows_of_family(
     rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord,
     prepared: Callable[[], Signals], cache: RowCache,
 ) -> dict[str, Rows]:  # fmt: skip
-    """Return the rows of a record with one family, under `terms` and the signals `prepared`."""
+    """Return the rows of a record of one family under `terms`, from the signals `prepared`."""
     (family,), filtering = conditioned.families, conditioned.filtering
     terms, signals = ordered(terms), prepared()
     parts = [_term_part(rig, u, conditioned, family, signals, cache) for u in terms]

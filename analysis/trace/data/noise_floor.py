@@ -6,9 +6,9 @@ A record that is the only repeat of its step is cut into its periods, which serv
 there are no periods either, but the motion comes back to states x where it was before,
  noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
 (a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
-rig's stated sensor noise, put through the same rows, is used, times the ratio of measured to stated
-noise in other steps: in repeats and periods, else between neighbours. Without these it lacks every
-noise that the rig file does not state, and a note says so.
+rig's stated sensor noise, propagated to the same rows, is used, times the ratio of measured to
+stated noise in other steps: in repeats and periods, else between neighbours. Without these the
+floor lacks every noise that the rig file does not state, and a note says so.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
@@ -91,26 +91,27 @@ def floors(
     """Return the split of every equation of every group of records under a model.
 
     `others` are floors of other records of the machine: groups without repeats take the ratio of
-    measured to stated noise from those and from the groups whose noise was measured. `noise_ratio`
-    is that ratio by equation for stated noise that is left.
+    measured to stated noise from those and from the groups whose noise was measured. Where neither
+    gives it, `noise_ratio` does, by equation.
     """
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
         groups.setdefault(conditioned.group, []).append(index)
     sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
-    # Whether the rounding error of a sensor's converter is much the same in all repeats.
+    # Whether a sensor's rounding error repeats, since its converter is coarser than its noise.
     coarse = any(repeated_rounding(s) >= DATA.least_rounding * sensor_variance(s) for s in sensors)
     out = []
     for indices in groups.values():
-        first, own = members[indices[0]], [rows[i] for i in indices]
-        stated, rounding = stated_noise(rig, terms, first, own[0], beta), dict[str, float]()
+        first, group_rows = members[indices[0]], [rows[i] for i in indices]
+        stated, rounding = stated_noise(rig, terms, first, group_rows[0], beta), dict[str, float]()
         if coarse:  # of the filter of the rows, or of the channels where rows have none
             smoother = first.filtering.rows or first.filtering.channels
             rounded = partial(with_added_rounding, smoother=smoother)
-            rounding = stated_noise(rig, terms, first, own[0], beta, rounded, DATA.rounding_draws)
-        for equation, by_sensors in stated.items():
-            parts = [r[equation] for r in own if equation in r]
-            out.append(_floor(first, parts, beta, by_sensors, rounding.get(equation, 0.0)))
+            draws = DATA.rounding_draws
+            rounding = stated_noise(rig, terms, first, group_rows[0], beta, rounded, draws)
+        for equation, rms in stated.items():
+            parts = [r[equation] for r in group_rows if equation in r]
+            out.append(_floor(first, parts, beta, rms, rounding.get(equation, 0.0)))
     by_repeats = _measured_over_stated([*out, *others], (REPEATS,))
     scale = _measured_over_stated([*out, *others], (NEIGHBOURS,))
     scale |= _measured_over_stated([*out, *others], (REPEATS, PERIODS))
@@ -127,8 +128,8 @@ def _floor(
     `stated` and `rounding` are the rms that the rig's sensor noise and their converters make.
     """
     residual = [row_residual(rows, beta) for rows in parts]
-    every = np.concatenate(residual)
-    total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
+    squares = np.concatenate(residual) ** 2
+    total = float(np.sqrt(np.mean(squares))) if len(squares) else 0.0  # all rows masked
     floor = Floor(conditioned.group, parts[0].equation, stated, 0.0, total, 1, STATED, stated)
     table, source = stacked_repeats(conditioned, parts, residual)
     if table is not None:
@@ -136,20 +137,19 @@ def _floor(
         mean2 = float(np.mean(np.mean(table, axis=0) ** 2))
         repeatable = float(np.sqrt(max(0.0, mean2 - noise2 / len(table))))
         rounded = min(repeatable, rounding)
-        noise = max(float(np.hypot(np.sqrt(noise2), rounded)), DATA.least_noise * stated)
-        repeatable = float(np.sqrt(repeatable**2 - rounded**2))
-        return replace(floor, noise=noise, repeatable=repeatable, count=len(table), source=source)
-    near = noise_by_neighbours(conditioned, parts[0], residual[0]) if len(parts) == 1 else None
-    if near is None:
+        measured = max(float(np.hypot(np.sqrt(noise2), rounded)), DATA.least_noise * stated)
+        rest = float(np.sqrt(repeatable**2 - rounded**2))
+        return replace(floor, noise=measured, repeatable=rest, count=len(table), source=source)
+    noise = noise_by_neighbours(conditioned, parts[0], residual[0]) if len(parts) == 1 else None
+    if noise is None:
         return floor.unrepeated(stated, STATED)
-    return floor.unrepeated(max(near, DATA.least_noise * stated), NEIGHBOURS)
+    return floor.unrepeated(max(noise, DATA.least_noise * stated), NEIGHBOURS)
 
 
 def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
-    """Return a floor as stated where its record's periods differ by more than sensors do.
+    """Return a floor, by stated noise where periods scatter more than repeats of other steps do.
 
-    Where repeats of other steps show the sensors' noise, it is a cause that begins with the record,
-    but is no multiple of its period: a hum that is in step with the record.
+    That scatter is no sensor noise, but a cause with another period, such as a hum.
     """
     noisy = floor.noise > DATA.unrepeated_ratio * floor.stated
     if floor.source != PERIODS or not noisy or floor.equation not in by_repeats:
@@ -160,8 +160,8 @@ def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
 def _measured_over_stated(split: Sequence[Floor], sources: Collection[str]) -> dict[str, float]:
     """Return by equation the rms ratio of noise measured from `sources` to stated noise.
 
-    Each group counts by the degrees of freedom of its repeats. Above `DATA.unrepeated_ratio` it is
-    no noise of the sensors, but a cause that does not follow the excitation.
+    Each group counts by the degrees of freedom of its repeats. Ratios above `DATA.unrepeated_ratio`
+    are left out: they show a cause that does not follow the excitation, not sensor noise.
     """
     ratios: dict[str, list[float]] = {}
     weights: dict[str, list[int]] = {}
@@ -177,7 +177,7 @@ def _measured_over_stated(split: Sequence[Floor], sources: Collection[str]) -> d
 
 
 def _scaled(floor: Floor, scale: Mapping[str, float], source: str) -> Floor:
-    """Return a floor by stated noise times the ratio of its equation, others unchanged."""
+    """Return a floor by stated noise multiplied by the ratio of its equation; others unchanged."""
     if floor.source != STATED or floor.equation not in scale:
         return floor
     return floor.unrepeated(floor.stated * scale[floor.equation], source)
@@ -193,18 +193,18 @@ def noise_by_neighbours(
     """
     if len(rows.time) < DATA.least_pairs:
         return None
-    x = _states(conditioned, rows)
-    count = min(len(x), DATA.neighbours_asked)
-    distance, other = cKDTree(x).query(x, k=count)
-    apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_time
-    first = np.argmax(apart, axis=1)  # the nearest neighbour at least `pair_time` away
-    here = np.flatnonzero(apart.any(axis=1))
-    d = distance[here, first[here]] ** 2
-    half = 0.5 * (residual[other[here, first[here]]] - residual[here]) ** 2
-    nearest = np.argsort(d)[: int(DATA.nearest_pair_share * len(x))]
-    if len(nearest) < DATA.least_pairs or d[nearest[-1]] > DATA.pair_distance**2:
+    states = _states(conditioned, rows)
+    count = min(len(states), DATA.neighbours_asked)
+    distance, neighbours = cKDTree(states).query(states, k=count)
+    apart = np.abs(rows.time[neighbours] - rows.time[:, None]) > DATA.pair_time
+    row = np.flatnonzero(apart.any(axis=1))
+    nearest = np.argmax(apart, axis=1)[row]  # the nearest neighbour at least `pair_time` away
+    distance2 = distance[row, nearest] ** 2
+    noise2 = 0.5 * (residual[neighbours[row, nearest]] - residual[row]) ** 2
+    pairs = np.argsort(distance2)[: int(DATA.nearest_pair_share * len(states))]
+    if len(pairs) < DATA.least_pairs or distance2[pairs[-1]] > DATA.pair_distance**2:
         return None
-    return float(np.sqrt(np.mean(half[nearest])))
+    return float(np.sqrt(np.mean(noise2[pairs])))
 
 
 def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
@@ -219,43 +219,43 @@ def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
 def stacked_repeats(
     conditioned: ConditionedRecord, parts: Sequence[Rows], residual: Sequence[Array]
 ) -> tuple[Array | None, str]:
-    """Return the residuals (n, m) of n repeats, or of one record's n periods, and their source."""
+    """Return residuals (n, m) of n repeats or periods, None without them, and their source."""
     if len(parts) > 1:
         common = parts[0].time
         for rows in parts[1:]:
             common = np.intersect1d(common, rows.time)
         if len(common) >= 10:
-            picked = [r[np.isin(p.time, common)] for p, r in zip(parts, residual, strict=True)]
-            return np.array(picked), REPEATS
+            table = [r[np.isin(p.time, common)] for p, r in zip(parts, residual, strict=True)]
+            return np.array(table), REPEATS
     if len(parts) == 1:
-        table = _periods(conditioned, parts[0], residual[0])
-        if table is not None:
-            return table, PERIODS
+        periods = _periods(conditioned, parts[0], residual[0])
+        if periods is not None:
+            return periods, PERIODS
     return None, STATED
 
 
 def _periods(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> Array | None:
-    """Return a record's residual cut into whole periods (n, m), None where there are too few.
+    """Return a record's residual by whole period (n, m), None where there are too few.
 
-    A record of less than three periods gives the part that the first two have in common, if that is
-    at least a quarter of a period. A period needs at least five rows.
+    Of a record of less than three periods, the part in common of the first two is returned, if it
+    is at least a quarter of a period. A period needs at least five rows.
     """
     period, step = conditioned.record.period, conditioned.filtering.step
     if not period or period % step or not len(rows.time):
         return None
-    per = period // step
+    period_rows = period // step
     index = np.rint((rows.time - rows.time[0]) * conditioned.record.sample_rate / step).astype(int)
-    whole = (int(index[-1]) + 1) // per
-    if whole < 3:
-        least, whole = max(5, per // 4), 2
+    periods = (int(index[-1]) + 1) // period_rows
+    if periods < 3:
+        least, periods = max(5, period_rows // 4), 2
     else:
         least = 5
-    if per < 5:
+    if period_rows < 5:
         return None
-    grid = np.full(whole * per, np.nan)
-    inside = index < whole * per
+    grid = np.full(periods * period_rows, np.nan)
+    inside = index < periods * period_rows
     grid[index[inside]] = residual[inside]
-    table = grid.reshape(whole, per)
+    table = grid.reshape(periods, period_rows)
     table = table[:, np.isfinite(table).all(axis=0)]
     return table if table.shape[1] >= least else None
 
@@ -269,19 +269,20 @@ def stated_noise(
     disturbed: Callable[[Rig, Record, np.random.Generator], Record] = with_added_noise,
     draws: int = 1,
 ) -> dict[str, float]:
-    """Return the rms that noise of the rig's sensors alone puts into each residual.
+    """Return the rms [SI] of each equation's residual by noise of the rig's sensors alone.
 
     `disturbed` adds that noise to a record, by default all that the rig file states; the rms is
-    that of so many `draws`.
+    over `draws` of it.
     """
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
     squares: dict[str, list[float]] = {name: [] for name in rows}
     for _ in range(draws):
         noisy = disturbed(rig, conditioned.record, rng)
-        again = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
+        after = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
         for name, before in rows.items():
-            a, b = in_common(before, again[name])
-            change = row_residual(again[name], beta)[b] - row_residual(before, beta)[a]
+            in_before, in_after = in_common(before, after[name])
+            quiet, disturbed_rows = row_residual(before, beta), row_residual(after[name], beta)
+            change = disturbed_rows[in_after] - quiet[in_before]
             if len(change):
                 squares[name].append(float(np.mean(change**2)))
     return {n: float(np.sqrt(np.mean(drawn))) if drawn else NO_ROWS for n, drawn in squares.items()}

@@ -90,14 +90,14 @@ def at_nominal_temperature(model: Model) -> Model:
     covariance = model.covariance.copy()
     if bulk.identified and term.reference is not None:
         kelvin = model.rig.oil.temperature - term.reference
-        bulk, more = _bulk_modulus_at(bulk, model.parameters[KAPPA], kelvin)
-        covariance[b, b] += more
-    kept = [k for k in range(len(names)) if k != kappa]
+        bulk, added_variance = _bulk_modulus_at(bulk, model.parameters[KAPPA], kelvin)
+        covariance[b, b] += added_variance
+    kept_numbers = [k for k in range(len(names)) if k != kappa]
     return replace(
         model,
         terms=tuple(u for u in model.terms if not isinstance(u.term, BulkTemperature)),
         parameters={n: bulk if n == "b" else model.parameters[n] for n in names if n != KAPPA},
-        covariance=covariance[np.ix_(kept, kept)],
+        covariance=covariance[np.ix_(kept_numbers, kept_numbers)],
     )
 
 
@@ -107,15 +107,15 @@ def _bulk_modulus_at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estim
     1/b(T) = 1/b + kappa (T - T0), with kappa as the mean of the records' value and the prior one
     (`IDENTIFY.bulk_slope`), each weighted by its inverse variance.
     """
-    believed, spread = -IDENTIFY.bulk_slope / b.value, IDENTIFY.bulk_slope_std / b.value
-    own = kappa.std if math.isfinite(kappa.std) else math.inf
-    weight = spread**2 / (spread**2 + own**2) if math.isfinite(kappa.value) else 0.0
-    slope = weight * kappa.value + (1.0 - weight) * believed if weight else believed
+    prior_slope, prior_std = -IDENTIFY.bulk_slope / b.value, IDENTIFY.bulk_slope_std / b.value
+    measured_std = kappa.std if math.isfinite(kappa.std) else math.inf
+    weight = prior_std**2 / (prior_std**2 + measured_std**2) if math.isfinite(kappa.value) else 0.0
+    slope = weight * kappa.value + (1.0 - weight) * prior_slope if weight else prior_slope
     value = b.value / (1.0 + b.value * slope * kelvin)
-    more = (value**2 * kelvin * spread) ** 2 * (1.0 - weight)
-    std = math.hypot(b.std, math.sqrt(more))
+    added_variance = (value**2 * kelvin * prior_std) ** 2 * (1.0 - weight)
+    std = math.hypot(b.std, math.sqrt(added_variance))
     half = b.half * (std / b.std if b.std > 0 else 1.0)
-    return replace(b, value=value, std=std, ci95=(value - half, value + half)), more
+    return replace(b, value=value, std=std, ci95=(value - half, value + half)), added_variance
 
 
 def path_terms(data: RegressionData) -> tuple[Used, ...]:
@@ -124,8 +124,8 @@ def path_terms(data: RegressionData) -> tuple[Used, ...]:
     A path whose fitted lead exceeds `BETWEEN_SAMPLES` of a sample is left out: another delay acts.
     """
     rig, kind = data.rig, "torque" if data.rig.electric else "flow"
-    moved = [s.equation for s in data.segments if s.equation.startswith(kind)]
-    joints = sorted({joint_of(equation) for equation in moved})
+    moving_equations = [s.equation for s in data.segments if s.equation.startswith(kind)]
+    joints = sorted({joint_of(equation) for equation in moving_equations})
     paths = sample_paths(rig, joints, {name: float(v) for name, v in data.beta.items()})
     if not paths:
         return ()
@@ -133,7 +133,7 @@ def path_terms(data: RegressionData) -> tuple[Used, ...]:
     lead = least_squares(rig, rows)
 
     def in_range(used: Used) -> bool:
-        (own,) = used.term.coefficients(rig)
-        return abs(lead.get(own.parameter, np.inf)) <= BETWEEN_SAMPLES
+        (coefficient,) = used.term.coefficients(rig)
+        return abs(lead.get(coefficient.parameter, np.inf)) <= BETWEEN_SAMPLES
 
     return tuple(filter(in_range, paths))

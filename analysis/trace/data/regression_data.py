@@ -57,7 +57,7 @@ class Segment:
 
     @property
     def count(self) -> int:
-        """How many rows it has."""
+        """The number of its rows."""
         return int(self.where.stop - self.where.start)
 
 
@@ -68,8 +68,8 @@ class RegressionData:
     `base` (M, k) holds the columns of the coefficients `names`; `residual` (R, M) the residual of
     each repeat over its noise, NaN on segments with fewer repeats. `records` are the averaged
     records, `rows` their rows before whitening [SI], `floors` the split of the residuals.
-    `relative`: rows of a model with effects that rescale signals have the size that they have
-    without these effects; otherwise gains that make rows small would seem to leave little.
+    `relative`: rows of a model with effects that rescale signals are scaled to their size without
+    these effects; otherwise a gain below 1 would reduce the residual by the scaling alone.
     """
 
     rig: Rig
@@ -104,7 +104,7 @@ class RegressionData:
 
     @property
     def row_counts(self) -> Counter[str]:
-        """How many rows each equation has."""
+        """The number of rows of each equation."""
         rows: Counter[str] = Counter()
         for s in self.segments:
             rows[s.equation] += s.count
@@ -130,8 +130,8 @@ class RegressionData:
         for s in self.segments:
             kept, k = mask[s.where], index[s.group]
             if kept.any():
-                whole = self.rows[k][s.equation]
-                rows[k][s.equation] = _rows_at(whole, whole.time[kept])
+                all_rows = self.rows[k][s.equation]
+                rows[k][s.equation] = _rows_at(all_rows, all_rows.time[kept])
                 segments.append(replace(s, where=slice(start, start + int(kept.sum()))))
                 start = segments[-1].where.stop
         return replace(
@@ -140,20 +140,20 @@ class RegressionData:
         )  # fmt: skip
 
 
-def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecord:
+def _averaged_record(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecord:
     """Return the average of the repeats' channels, filtered like them."""
-    first = repeats[0]
+    reference = repeats[0]
     if len(repeats) == 1:
-        return first
-    n = min(conditioned.record.samples for conditioned in repeats)
-    names = [c for c in first.record.channels if all(c in s.record.channels for s in repeats)]
+        return reference
+    count = min(conditioned.record.samples for conditioned in repeats)
+    names = [c for c in reference.record.channels if all(c in s.record.channels for s in repeats)]
     channels = {
-        name: np.mean([np.asarray(s.record.channels[name])[:n] for s in repeats], axis=0)
+        name: np.mean([np.asarray(s.record.channels[name])[:count] for s in repeats], axis=0)
         for name in names
     }
-    average = first.condition_alike(rig, replace(first.record, channels=channels))
-    valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
-    weights = [s.signals.weight[:n] for s in repeats if s.signals.weight is not None]
+    average = reference.condition_alike(rig, replace(reference.record, channels=channels))
+    valid = np.all([s.signals.valid[:count] for s in repeats], axis=0)
+    weights = [s.signals.weight[:count] for s in repeats if s.signals.weight is not None]
     signals = replace(
         average.signals,
         valid=average.signals.valid & valid,
@@ -189,48 +189,44 @@ def regression_data(
     records and filters; `others` and `noise_ratio` are those of `noise_floor.floors`. Raises
     InputError where filter edges leave no rows.
     """
-    every = [model_rows(rig, terms, conditioned) for conditioned in members]
-    beta = least_squares(rig, every) if beta is None else beta
-    split = floors(rig, terms, members, every, beta, others, noise_ratio)
+    rows_of_records = [model_rows(rig, terms, conditioned) for conditioned in members]
+    beta = least_squares(rig, rows_of_records) if beta is None else beta
+    noise_floors = floors(rig, terms, members, rows_of_records, beta, others, noise_ratio)
     groups: dict[Group, list[int]] = {}
     for k, conditioned in enumerate(members):
         groups.setdefault(conditioned.group, []).append(k)
-    averages = [_average(rig, [members[k] for k in repeats]) for repeats in groups.values()]
+    averages = [_averaged_record(rig, [members[k] for k in repeats]) for repeats in groups.values()]
     mean_rows = [model_rows(rig, terms, conditioned) for conditioned in averages]
-    names = tuple(
-        dict.fromkeys(n for record in mean_rows for r in record.values() for n in r.names)
-    )
-    noise = {(f.group, f.equation): f.noise for f in split}
-    most = max(map(len, groups.values()))
+    names = tuple(dict.fromkeys(n for rows in mean_rows for r in rows.values() for n in r.names))
+    noise = {(f.group, f.equation): f.noise for f in noise_floors}
+    most_repeats = max(map(len, groups.values()))
     base, residual, segments, start = [], [], [], 0
-    kept_rows: list[dict[str, Rows]] = []
-    for conditioned, rows in zip(averages, mean_rows, strict=True):
-        own = [every[k] for k in groups[conditioned.group]]
-        kept_rows.append({})
+    rows_of_groups: list[dict[str, Rows]] = [{} for _ in averages]
+    for conditioned, rows, kept in zip(averages, mean_rows, rows_of_groups, strict=True):
+        repeats = [rows_of_records[k] for k in groups[conditioned.group]]
         for equation, mean in rows.items():
             time = mean.time
-            for record in own:
+            for record in repeats:
                 time = np.intersect1d(time, record[equation].time)
             if len(time) < 5:
                 continue
-            cut = _rows_at(mean, time)
-            kept_rows[-1][equation] = cut
+            kept[equation] = _rows_at(mean, time)
             sigma = max(noise[conditioned.group, equation], 1e-30)
-            base.append(matrix_of(cut, names) * np.sqrt(len(own)) / sigma)
-            table = np.full((most, len(time)), np.nan)
-            for k, record in enumerate(own):
-                table[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
-            residual.append(table)
-            where = slice(start, start + len(time))
-            segments.append(Segment(conditioned.group, equation, where, sigma, len(own)))
-            start = where.stop
+            base.append(matrix_of(kept[equation], names) * np.sqrt(len(repeats)) / sigma)
+            residuals = np.full((most_repeats, len(time)), np.nan)
+            for k, record in enumerate(repeats):
+                residuals[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
+            residual.append(residuals)
+            where = slice(start, start := start + len(time))
+            segments.append(Segment(conditioned.group, equation, where, sigma, len(repeats)))
     if not segments:
         raise InputError(
             "the records are too short: no rows are left after filter edges; take longer records"
         )
     return RegressionData(
         rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(residual, axis=1),
-        tuple(segments), tuple(split), tuple(averages), tuple(kept_rows), cache or RowCache(),
+        tuple(segments), tuple(noise_floors), tuple(averages), tuple(rows_of_groups),
+        cache or RowCache(),
     )  # fmt: skip
 
 
@@ -251,23 +247,23 @@ class VariantColumns:
 def evidence(data: RegressionData, residual: Array) -> Evidence:
     """Return signals and residuals for effects whose shape grid depends on the data.
 
-    `residual` (M,) is the whitened residual of a model. Samples before the first and after the last
-    row of a record are marked as not valid.
+    `residual` (M,) is the whitened residual of a model. Samples outside a record's rows are marked
+    as not valid.
     """
     signals: list[Signals] = []
-    left: list[dict[str, tuple[Array, Array]]] = []
+    residuals: list[dict[str, tuple[Array, Array]]] = []
     for conditioned, rows, prepared in zip(data.records, data.rows, signals_of(data), strict=True):
-        own = [s for s in data.segments if s.group == conditioned.group]
-        left.append({s.equation: (rows[s.equation].time, residual[s.where]) for s in own})
-        times = np.concatenate([time for time, _ in left[-1].values()] or [prepared.t[:0]])
-        first, last = (times.min(), times.max()) if len(times) else (np.inf, -np.inf)
-        inside = (prepared.t >= first) & (prepared.t <= last)
+        segments = [s for s in data.segments if s.group == conditioned.group]
+        residuals.append({s.equation: (rows[s.equation].time, residual[s.where]) for s in segments})
+        times = np.concatenate([time for time, _ in residuals[-1].values()] or [prepared.t[:0]])
+        start, end = (times.min(), times.max()) if len(times) else (np.inf, -np.inf)
+        inside = (prepared.t >= start) & (prepared.t <= end)
         signals.append(replace(prepared, valid=prepared.valid & inside[:, None]))
-    return Evidence(signals, left)
+    return Evidence(signals, residuals)
 
 
 def signals_of(data: RegressionData) -> list[Signals]:
-    """Return the signals of every record after the changes by the data's own terms."""
+    """Return every record's signals as changed by the data's own terms (`prepare`)."""
     return [prepared_signals(data.rig, data.terms, conditioned) for conditioned in data.records]
 
 
@@ -280,16 +276,16 @@ def variant_columns(
     `progress` is called after each with the share of them done. With `equations`, columns
     are computed in their rows only and are zero elsewhere.
     """
-    asked = equations or {s.equation for s in data.segments}
-    families = {family_of(e) for e in asked}
+    searched = equations or {s.equation for s in data.segments}
+    families = {family_of(e) for e in searched}
     records = [
         replace(c, families=tuple(f for f in c.families if f in families)) for c in data.records
     ]
-    segments = [s for s in data.segments if s.equation in asked]
-    seen = signals_of(data)
+    segments = [s for s in data.segments if s.equation in searched]
+    signals_of_records = signals_of(data)
     columns = []
     for used in chosen:
-        columns.append(_columns_of(data, records, segments, used, seen))
+        columns.append(_columns_of(data, records, segments, used, signals_of_records))
         if progress is not None:
             progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]
@@ -301,10 +297,10 @@ def candidate_columns(
 ) -> dict[str, dict[str, Array]]:  # fmt: skip
     """Return the columns that a candidate adds to a record's rows: equation -> name -> column (m,).
 
-    `prepared` and `rows` are the record's signals and rows under the model of `data`. It has none
-    where the lock of its joint hides it. Effects that change the signals (`prepare`) enter as a
-    pseudo-column, named '': with X, y the rows before and X', y' the rows after the change, and
-    beta the present coefficients,
+    `prepared` and `rows` are the record's signals and rows under the model of `data`. The result is
+    empty where the lock of its joint hides the effect. Effects that change the signals (`prepare`)
+    enter as a pseudo-column, named '': with X, y the rows before and X', y' the rows after the
+    change, and beta the coefficients of `data`,
      d = (y - X beta) - (y' - X' beta),
     which to first order in the change is what the effect adds to the residual.
     """
@@ -313,23 +309,24 @@ def candidate_columns(
     if not changes_rows(used.term):
         return added_columns(data.rig, conditioned, lambda: prepared, rows, used, data.cache)
     families = tuple(f for f in conditioned.families if acting_on(data.rig, (used,), f, data.cache))
-    own = [c.parameter for c in used.term.coefficients(data.rig)]
+    parameters = [c.parameter for c in used.term.coefficients(data.rig)]
     of_families = replace(conditioned, families=families)
     out: dict[str, dict[str, Array]] = {}
     for name, after in shared_rows(data.rig, (*data.terms, used), of_families, data.cache).items():
         if name not in rows:
             continue
         before = rows[name]
-        here, there = in_common(before, after)
+        in_before, in_after = in_common(before, after)
         # Column by column, so that an unchanged column gives a difference of exactly 0.
-        moved = matrix_of(after, before.names)[there] - before.matrix[here]
-        side = after.rhs[there] - before.rhs[here]
+        matrix_change = matrix_of(after, before.names)[in_after] - before.matrix[in_before]
+        rhs_change = after.rhs[in_after] - before.rhs[in_before]
         columns = {"": np.zeros(len(before.rhs))}
-        columns[""][here] = moved @ np.array([data.beta.get(n, 0.0) for n in before.names]) - side
+        beta = np.array([data.beta.get(n, 0.0) for n in before.names])
+        columns[""][in_before] = matrix_change @ beta - rhs_change
         for k, parameter in enumerate(after.names):
-            if parameter in own and np.any(after.matrix[:, k]):
+            if parameter in parameters and np.any(after.matrix[:, k]):
                 columns[parameter] = np.zeros(len(before.rhs))
-                columns[parameter][here] = after.matrix[there, k]
+                columns[parameter][in_before] = after.matrix[in_after, k]
         columns = {key: column for key, column in columns.items() if np.any(column)}
         if columns:
             out[name] = columns
@@ -338,20 +335,20 @@ def candidate_columns(
 
 def _columns_of(
     data: RegressionData, records: Sequence[ConditionedRecord], segments: Sequence[Segment],
-    used: Used, seen: Sequence[Signals],
+    used: Used, signals_of_records: Sequence[Signals],
 ) -> VariantColumns | None:  # fmt: skip
     """Return a candidate's columns in some segments' rows, None where it does not act there."""
     columns: dict[str, Array] = {}
     touched = set()
     M = data.base.shape[0]
-    for conditioned, signals, rows in zip(records, seen, data.rows, strict=True):
+    for conditioned, signals, rows in zip(records, signals_of_records, data.rows, strict=True):
         candidate = candidate_columns(data, conditioned, signals, rows, used)
         for segment in segments:
             if segment.group == conditioned.group and segment.equation in candidate:
                 touched.add(segment.equation)
                 for name, column in candidate[segment.equation].items():
-                    whole = columns.setdefault(name, np.zeros(M))
-                    whole[segment.where] += column * np.sqrt(segment.repeats) / segment.noise
+                    all_rows = columns.setdefault(name, np.zeros(M))
+                    all_rows[segment.where] += column * np.sqrt(segment.repeats) / segment.noise
     if not columns or not all(np.isfinite(c).all() for c in columns.values()):
         return None
     return VariantColumns(

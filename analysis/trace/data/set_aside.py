@@ -1,10 +1,10 @@
-"""Rows that no parameter is fitted to: those that choose between effects, those that judge.
+"""Hold-out rows: those that choose between effects, and those that judge.
 
-Rows that choose are read many times, so that their error is smaller for what was chosen than on
-other rows. Where no records are given to judge, the second of every three blocks of
-`DATA.judging_block` of each held-out record is therefore set aside: its rows are read once, after
-everything is chosen. Rows are weighted by the noise floor of the whole record, since periods and
-neighbouring states cannot be found within blocks.
+The error of choosing rows is too small for the effects chosen by them. Where no records are given
+to judge, the second of every three blocks of `DATA.judging_block` of each held-out record is
+therefore set aside: its rows are read once, after everything is chosen. Rows are weighted by the
+noise floor of the whole record, since periods and neighbouring states cannot be found within
+blocks.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def set_aside(
     judge = np.zeros(data.base.shape[0], dtype=bool)
     short = set()
     for s in data.segments:
-        judge[s.where] = here = in_judging_block(data.source(s)[1].time)
-        if min(here.sum(), (~here).sum()) < TRACE.least_rows:
+        judge[s.where] = in_block = in_judging_block(data.source(s)[1].time)
+        if min(in_block.sum(), (~in_block).sum()) < TRACE.least_rows:
             short.add(s.group)
     choose = ~judge
     for s in data.segments:
@@ -125,18 +125,18 @@ def refuse_repeated_records(
         )
     if judge and not any(run.records for run in judge):
         raise InputError("no judging records: the runs of --judge are empty")
-    seen: dict[str, str] = {}
+    known: dict[str, str] = {}
     for kind, option, checked in (
         ("training", "", runs), ("held-out", "--holdout", holdout), ("judging", "--judge", judge),
     ):  # fmt: skip
         digests = [(_digest(record), record.name) for run in checked for record in run.records]
         for digest, name in digests if option else ():
-            if digest in seen:
+            if digest in known:
                 raise InputError(
-                    f"{kind} record {name!r} is {seen[digest]}, sample for sample; it must not be "
+                    f"{kind} record {name!r} is {known[digest]}, sample for sample; it must not be "
                     f"used twice: give {option} other records"
                 )
-        seen |= {digest: f"{kind} record {name!r}" for digest, name in digests}
+        known |= {digest: f"{kind} record {name!r}" for digest, name in digests}
 
 
 def _digest(record: Record) -> str:

@@ -87,7 +87,7 @@ class SpectralLines:
         return meaning(self.shares_after, self.velocity_shares)
 
 
-def meaning(shares: Mapping[str, float], of_velocity: Mapping[str, float]) -> str:
+def meaning(shares: Mapping[str, float], velocity_shares: Mapping[str, float]) -> str:
     """Return the cause in words, from the shares by kind of line of residual and velocity."""
     if not any(shares.values()):
         return "not above the noise"
@@ -95,12 +95,12 @@ def meaning(shares: Mapping[str, float], of_velocity: Mapping[str, float]) -> st
     if moving < DATA.asymmetric_share:
         return "constant"
     meanings = []
-    for kind, least, word in (
+    for kind, threshold, word in (
         (EVEN, DATA.asymmetric_share, "asymmetric"),
         (ODD, DATA.symmetric_share, "a symmetric nonlinearity"),
     ):
         share = shares[kind] / moving
-        if share > least and share > DATA.velocity_ratio * of_velocity[kind]:
+        if share > threshold and share > DATA.velocity_ratio * velocity_shares[kind]:
             meanings.append((share, word))
     if not meanings:
         return "linear in the motion"
@@ -136,44 +136,46 @@ def _segment_lines(
     """Return the lines of residuals (repeats + 1, m) [SI]; the last one is of the final model."""
     record = conditioned.record
     highest = max(record.lines)
-    per = record.period // conditioned.filtering.step
-    place = np.rint((rows.time - rows.time[0]) * record.sample_rate / conditioned.filtering.step)
-    pairs = _half_period_pairs(place.astype(np.int64), per)
-    base = record.sample_rate / record.period
-    beyond = DATA.line_band * lines_cutoff(record) / base
-    K = int(min([beyond, *(DATA.lines_per_pair * len(p) for p in pairs)]))
+    step = conditioned.filtering.step
+    period_rows = record.period // step
+    place = np.rint((rows.time - rows.time[0]) * record.sample_rate / step)
+    pairs = _half_period_pairs(place.astype(np.int64), period_rows)
+    base_frequency = record.sample_rate / record.period
+    highest_line = DATA.line_band * lines_cutoff(record) / base_frequency
+    K = int(min([highest_line, *(DATA.lines_per_pair * len(p) for p in pairs)]))
     if not pairs or highest > K:
         return None
     joint = joint_of(s.equation)
     velocity = filtered({"v": conditioned.signals.sd[:, joint]}, conditioned, rows)["v"]
     series = np.vstack((residuals, velocity))
-    spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])
-    single = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
-    n = len(single)
+    spectra = np.stack([spectrum(place[p[:, 0]] / period_rows, series[:, p], K) for p in pairs])
+    of_periods = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
+    n = len(of_periods)
     # A single period does not show its noise: the noise floor is spread evenly over the lines.
-    noise = single.var(axis=0, ddof=1) if n > 1 else np.full(K + 1, s.noise**2 / (K + 1))
+    noise = of_periods.var(axis=0, ddof=1) if n > 1 else np.full(K + 1, s.noise**2 / (K + 1))
     excited = np.isin(np.arange(K + 1), record.lines)
-    of_velocity = np.abs(spectra[:, -1].mean(axis=0)) ** 2
-    of_velocity[0] = 0.0  # a mean velocity only comes from the ends that were cut off
-    before = np.abs(single.mean(axis=0)) ** 2 - noise / n
-    remaining = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
-    frequency = np.asarray(np.arange(K + 1) * base, dtype=np.float64)
+    velocity_power = np.abs(spectra[:, -1].mean(axis=0)) ** 2
+    velocity_power[0] = 0.0  # a mean velocity only comes from the ends that were cut off
+    power_before = np.abs(of_periods.mean(axis=0)) ** 2 - noise / n
+    power_after = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
+    frequency = np.asarray(np.arange(K + 1) * base_frequency, dtype=np.float64)
     return SpectralLines(
-        s.group, s.equation, frequency, before, noise, remaining, excited,
-        _shares(before, noise / n, excited), _shares(remaining, noise / n, excited),
-        _shares(of_velocity, np.zeros(K + 1), excited), above_noise,
+        s.group, s.equation, frequency, power_before, noise, power_after, excited,
+        _shares(power_before, noise / n, excited), _shares(power_after, noise / n, excited),
+        _shares(velocity_power, np.zeros(K + 1), excited), above_noise,
     )  # fmt: skip
 
 
-def _half_period_pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
+def _half_period_pairs(place: NDArray[np.int64], period_rows: int) -> list[NDArray[np.int64]]:
     """Return the pairs (p, 2) of row numbers half a period apart, for each nearly whole period."""
-    if per % 2:
+    if period_rows % 2:
         return []
-    at = np.full(int(place[-1]) + 1 + per if len(place) else per, -1)
-    at[place] = np.arange(len(place))
-    whole = at[: len(at) // per * per].reshape(-1, 2, per // 2).transpose(0, 2, 1)
-    complete = [p[(p >= 0).all(axis=1)] for p in whole]
-    return [p for p in complete if len(p) >= DATA.least_period_share * per / 2]
+    row_at = np.full(int(place[-1]) + 1 + period_rows if len(place) else period_rows, -1)
+    row_at[place] = np.arange(len(place))
+    whole = len(row_at) // period_rows * period_rows
+    halves = row_at[:whole].reshape(-1, 2, period_rows // 2).transpose(0, 2, 1)
+    complete = [p[(p >= 0).all(axis=1)] for p in halves]
+    return [p for p in complete if len(p) >= DATA.least_period_share * period_rows / 2]
 
 
 def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
@@ -204,14 +206,14 @@ def lines_by_kind(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
 
 
 def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str, float]:
-    """Return the share of the power by kind of line, 0 for a kind that noise would explain."""
+    """Return the share of the power by kind of line, 0 for a kind within the noise."""
     sums = {}
-    for kind, own in lines_by_kind(excited).items():
-        total = float(power[own].sum())
-        scatter = float(np.sqrt(np.sum(noise[own] ** 2)))
-        sums[kind] = total if total > DATA.line_deviations * scatter else 0.0
-    whole = sum(sums.values())
-    return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
+    for kind, of_kind in lines_by_kind(excited).items():
+        power_of_kind = float(power[of_kind].sum())
+        scatter = float(np.sqrt(np.sum(noise[of_kind] ** 2)))
+        sums[kind] = power_of_kind if power_of_kind > DATA.line_deviations * scatter else 0.0
+    total_power = sum(sums.values())
+    return {kind: v / total_power if total_power > 0 else 0.0 for kind, v in sums.items()}
 
 
 def largest_residual_lines(lines: Sequence[SpectralLines]) -> list[SpectralLines]:

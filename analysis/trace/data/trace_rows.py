@@ -81,18 +81,18 @@ def trace_rows(
 
     train_data = _training_rows(records, conditioned(records.train), cache)
 
-    def unseen(members: Sequence[ConditionedRecord]) -> RegressionData:
+    def unseen_rows(members: Sequence[ConditionedRecord]) -> RegressionData:
         return regression_data(
             records.rig, train_data.terms, members, train_data.beta,
             others=train_data.floors, noise_ratio=records.noise_ratio,
         )  # fmt: skip
 
     members = conditioned(records.holdout)
-    data = unseen(members)
+    data = unseen_rows(members)
     if not records.judge:
         return set_aside(train_data, data, members, records.holdout)
     members = conditioned(records.judge)
-    judging = unseen(members)
+    judging = unseen_rows(members)
     return TraceRows(train_data, data, judging, tuple(members), records.holdout)
 
 
@@ -112,21 +112,21 @@ def _training_rows(
 
 
 def _without_masked_steps(train_data: RegressionData) -> RegressionData:
-    """Return the rows without equations of a step of which nearly all rows are masked.
+    """Return the rows without those equations of a step that have nearly all rows masked.
 
     Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation and is
     too short, or is the only one with rows of that equation.
     """
     least = TRACE.least_rows
     short = [s for s in train_data.segments if s.count < least]
-    elsewhere = {s.equation for s in train_data.segments if s not in short}
-    kept = np.ones(train_data.base.shape[0], dtype=bool)
+    equations_elsewhere = {s.equation for s in train_data.segments if s not in short}
+    used_rows = np.ones(train_data.base.shape[0], dtype=bool)
     for s in short:
         count = s.count
         conditioned, rows = train_data.source(s)
         record, masked = conditioned.record, rows.masked
-        if masked > count and s.equation in elsewhere:
-            kept[s.where] = False
+        if masked > count and s.equation in equations_elsewhere:
+            used_rows[s.where] = False
             continue
         remedy = "take longer records"
         if masked > count:
@@ -138,7 +138,7 @@ def _without_masked_steps(train_data: RegressionData) -> RegressionData:
             f"step {s.group[1]!r}: records of {record.samples / record.sample_rate:.3g} s "
             f"leave {count} rows of {s.equation}; the trace needs {least}: {remedy}"
         )
-    return train_data if kept.all() else train_data.at(kept)
+    return train_data if used_rows.all() else train_data.at(used_rows)
 
 
 def with_other_motions_apart(runs: Sequence[Run]) -> tuple[list[Run], tuple[str, ...]]:
@@ -152,7 +152,7 @@ def with_other_motions_apart(runs: Sequence[Run]) -> tuple[list[Run], tuple[str,
         first: dict[str, Record] = {}
         records = []
         for record in run.records:
-            difference = _difference(run.rig, first.setdefault(record.step, record), record)
+            difference = _motion_difference(run.rig, first.setdefault(record.step, record), record)
             if difference > DATA.other_motion:
                 notes.append(
                     f"step {record.step!r}: repeat {record.repeat} differs from the first by "
@@ -166,7 +166,7 @@ def with_other_motions_apart(runs: Sequence[Run]) -> tuple[list[Run], tuple[str,
     return out, tuple(notes)
 
 
-def _difference(rig: Rig, first: Record, other: Record) -> float:
+def _motion_difference(rig: Rig, first: Record, other: Record) -> float:
     """Return the largest of the free joints' rms differences over the deviation in `first`."""
     noise = rig.sensors.of(rig.position_kind).noise
     largest = 0.0
