@@ -34,16 +34,16 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     known = {**model.beta, **shape_values(data.rig, used)}
     out = []
     for line in lines:
-        here = [n for n in line.weights if n in names]
-        at = [names.index(n) for n in here]
-        W = np.column_stack([line.weights[n] for n in here])
-        y = W @ np.array([known[n] for n in here])
-        spread = W @ covariance[np.ix_(at, at)] * W
-        half = IDENTIFY.normal_quantile * np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
-        ends = (y - half, y + half)
+        shared = [n for n in line.weights if n in names]
+        numbers = [names.index(n) for n in shared]
+        W = np.column_stack([line.weights[n] for n in shared])
+        y = W @ np.array([known[n] for n in shared])
+        variance = W @ covariance[np.ix_(numbers, numbers)] * W
+        half = IDENTIFY.normal_quantile * np.sqrt(np.maximum(variance.sum(axis=1), 0.0))
+        band = (y - half, y + half)
         if line.reciprocal:
-            y, ends = 1.0 / y, (1.0 / ends[1], 1.0 / ends[0])
-        out.append(Curve(line.label, line.x, y, *ends, line.unit_x, line.unit_y))
+            y, band = 1.0 / y, (1.0 / band[1], 1.0 / band[0])
+        out.append(Curve(line.label, line.x, y, *band, line.unit_x, line.unit_y))
     return tuple(out)
 
 

@@ -1,12 +1,11 @@
 """Gates: the conditions that an effect must meet to be named.
 
-Significance is not enough, since a model error makes every correlated candidate significant. The
-cause differs from these in that it reduces the error of records with another excitation, has a
-physically possible size, has the same size in all parts of the records, and fits better than any
-other effect.
+Significance is not enough, since a model error makes every correlated candidate significant. Only
+the cause reduces the error of records with another excitation, has a physically possible size, the
+same in all parts of the records, and fits better than any other effect.
 
-Where the verdict is `unexplained`, what the unknown cause puts into the rows can make an effect
-seem to act that does not: further conditions hold beside it (`judged_beside_unknown_cause`).
+Where the verdict is `unexplained`, the unknown cause may resemble an effect that does not act:
+effects beside it must meet further conditions (`judged_beside_unknown_cause`).
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def passes_gates(effect: JudgedEffect) -> bool:
 
 
 def removes(effect: JudgedEffect) -> bool:
-    """Return whether an effect removes enough held-out residual, whatever else refuses it."""
+    """Return whether an effect passes the gate of removed held-out energy."""
     return any(gate.ok for gate in effect.gates if gate.name == REMOVES)
 
 
@@ -85,7 +84,7 @@ def judge_effects(
     `holdout_data` are the choosing rows; `rng` draws the sign flips.
     """
     train_data = hypotheses.train_data
-    null = inference.null_maximum(
+    null_energies = inference.null_maximum(
         hypotheses.candidates, train_data, _noise_samples(train_data, winner.fit.residual), rng
     )
     before, after = (held_out_residual(holdout_data, o.fit) for o in (hypotheses.empty, winner))
@@ -103,26 +102,26 @@ def judge_effects(
             *held_out.disturbed_equations(hypotheses, winner, alternative),
             *held_out.disturbed_in_held_out(holdout_data, before, without, after),
         }
-        p = inference.p_value(alternative.fit.energy - winner.fit.energy, null)
-        errors = inference.effect_errors(train_data, winner.fit, used)
-        estimates = inference.estimates(train_data, used, errors, shift)
-        unknown = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
-        differing = invariance(train_data, winner.fit, used, errors)
+        p = inference.p_value(alternative.fit.energy - winner.fit.energy, null_energies)
+        effect_errors = inference.effect_errors(train_data, winner.fit, used)
+        estimates = inference.estimates(train_data, used, effect_errors, shift)
+        unknown_size = inference.is_of_unknown_size(train_data.rig, used, estimates, winner.effects)
+        differing = invariance(train_data, winner.fit, used, effect_errors)
         unphysical = hypotheses.physical_problem(winner, used)
         inseparable = [
             Rival(name, rivals.place_of(effect_of(name, at)), 1.0, 1.0, True, at)
             for name, at in effect.inseparable(used.shape)
         ]
         removes = removed.share >= TRACE.least_removed and not disturbed
-        significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown else "")
-        nearest = rivals.rivals_in_words([*inseparable, *others])
-        nearest += rivals.composites_in_words(hypotheses, winner, used, tie_test)
+        significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown_size else "")
+        rival_words = rivals.rivals_in_words([*inseparable, *others])
+        rival_words += rivals.composites_in_words(hypotheses, winner, used, tie_test)
         gates = (
             Gate(REMOVES, removes, held_out.removal_in_words(removed, disturbed)),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences_in_words(differing)),
-            Gate(SIGNIFICANT, p <= TRACE.p_limit and not unknown, significance),
-            Gate(NO_RIVAL, not (inseparable or any(r.tied for r in others)), nearest),
+            Gate(SIGNIFICANT, p <= TRACE.p_limit and not unknown_size, significance),
+            Gate(NO_RIVAL, not (inseparable or any(r.tied for r in others)), rival_words),
         )
         out.append(
             JudgedEffect(
@@ -147,27 +146,27 @@ def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> H
     readings of one law are removed together, since `readings` decides whether both are needed.
     """
     law = effect_in(used)
-    kept = [u for u in winner.without(used) if not of_one_law(effect_in(u), law)]
-    without = hypotheses.refined(kept)
+    others = [u for u in winner.without(used) if not of_one_law(effect_in(u), law)]
+    without = hypotheses.refined(others)
     rig = hypotheses.train_data.rig
     # A shape at its bound is an error of the form, not of physics.
     at_bound = any(effect_in(u).outside(rig, u.shape) for u in without.effects)
     if at_bound or not hypotheses.physical_problem(without):
         return without
 
-    def is_kept(other: Effect) -> bool:
-        """Return whether a kept effect, or one of its readings, is another set's effect."""
-        return any(other == k or of_one_law(other, k) for k in effects_among(kept))
+    def is_kept(effect: Effect) -> bool:
+        """Return whether an effect is one of `others` or a reading of one."""
+        return any(effect == other or of_one_law(effect, other) for other in effects_among(others))
 
     physical = [o for o in hypotheses.fitted.values() if not hypotheses.physical_problem(o)]
-    simpler = [o for o in physical if all(map(is_kept, effects_among(o.effects)))]
-    return min([hypotheses.empty, *simpler], key=lambda o: o.total)
+    of_kept = [o for o in physical if all(map(is_kept, effects_among(o.effects)))]
+    return min([hypotheses.empty, *of_kept], key=lambda o: o.total)
 
 
 def equations_above_band(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> list[tuple[str, str]]:
-    """Return the equations that keep more than the band, and in words how much in which records.
+    """Return the equations above the band, with the remaining energy and its records in words.
 
     Held-out records judge a set of effects (`held_out_above_band`); without any effect, training
     records must hold no more than noise either (`HypothesisSet.negligible`).
@@ -185,20 +184,21 @@ def equations_above_band(
 def held_out_above_band(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
-    """Return the equations that keep more than the band in held-out rows, and in words how much.
+    """Return the equations above the band in held-out rows, and their error in words.
 
     The band is an rms of `TRACE.held_out_band` noise floors or, where an effect has a form that may
     miss (`Effect.exact`), `TRACE.held_out_share` of the energy above noise that the model `before`
     leaves, whichever is larger.
     """
-    left = held_out_residual(holdout_data, after)
-    start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
-    now = energy_above_noise(holdout_data, left)
+    residual = held_out_residual(holdout_data, after)
+    energy_before = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
+    energy_after = energy_above_noise(holdout_data, residual)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
-        for e, r in held_out.error_over_floor(holdout_data, left).items()
+        for e, r in held_out.error_over_floor(holdout_data, residual).items()
         if r > TRACE.held_out_band
-        and now[e] > form_share(holdout_data.rig, effects_among(after.terms), e) * start[e]
+        and energy_after[e]
+        > form_share(holdout_data.rig, effects_among(after.terms), e) * energy_before[e]
     ]
 
 
@@ -219,9 +219,9 @@ def _noise_samples(train_data: RegressionData, residual: Array) -> Array:
     out = train_data.residual.copy()
     for s in train_data.segments:
         if s.repeats > 1:
-            part = out[: s.repeats, s.where]
+            repeats = out[: s.repeats, s.where]
             scale = np.sqrt(s.repeats / (s.repeats - 1))
-            out[: s.repeats, s.where] = (part - part.mean(axis=0)) * scale
+            out[: s.repeats, s.where] = (repeats - repeats.mean(axis=0)) * scale
         else:
             out[0, s.where] = residual[s.where]
     return out
@@ -241,54 +241,54 @@ def judged_beside_unknown_cause(
     effects: Sequence[JudgedEffect],
     unexplained: Collection[str],
 ) -> tuple[JudgedEffect, ...]:
-    """Return the effects of the set `winner` with the gates that hold beside an unknown cause.
+    """Return the effects of the set `winner` after the further gates beside an unknown cause.
 
-    `unexplained` are the equations that keep too much. An effect is refused that removes less than
+    `unexplained` are the equations above the band. An effect is refused that removes less than
     `TRACE.least_removed_beside` of the energy in its own equations, that the other equations alone
-    do not show, or whose size may be nothing. Rivals that held-out records alone do not separate
-    from an effect are tied.
+    do not show, or whose size may be zero. Rivals that held-out records alone do not separate from
+    an effect are tied.
     """
     data = hypotheses.train_data
     rows = ~data.in_equations(unexplained)
-    left_outside = _energy(data, winner, rows)
+    energy_outside = _energy(data, winner, rows)
 
     def problem(group: Sequence[Used]) -> str:
         """Return in words why effects that act together are not named ('' if they are)."""
         without = hypotheses.refined([u for u in winner.effects if u not in group])
-        columns = [jacobian(data, winner.fit, used)[1] for used in group]
+        columns = [jacobian(data, winner.fit, used_by_key)[1] for used_by_key in group]
         # Sorted: the order of a sum decides its last digit.
-        own = sorted(
+        acting = sorted(
             {s.equation for s in data.segments if any(np.any(J[s.where]) for J in columns)}
         )
-        removed = {e: without.excess_energy[e] - winner.excess_energy[e] for e in own}
-        share = sum(removed.values()) / max(1e-30, sum(without.excess_energy[e] for e in own))
+        removed = {e: without.excess_energy[e] - winner.excess_energy[e] for e in acting}
+        share = sum(removed.values()) / max(1e-30, sum(without.excess_energy[e] for e in acting))
         if share < TRACE.least_removed_beside:
             return (
                 f"{100 * max(0.0, share):.0f} % of the repeatable energy of "
-                f"{', '.join(own)}, too little beside a cause that is not known"
+                f"{', '.join(acting)}, too little beside a cause that is not known"
             )
-        outside = sum(v for e, v in removed.items() if e not in unexplained)
-        gain = _energy(data, without, rows) - left_outside
-        asked = outside > TRACE.least_removed * sum(removed.values())
-        if asked and gain < TRACE.least_removed * outside:
+        removed_outside = sum(v for e, v in removed.items() if e not in unexplained)
+        gain_outside = _energy(data, without, rows) - energy_outside
+        mostly_outside = removed_outside > TRACE.least_removed * sum(removed.values())
+        if mostly_outside and gain_outside < TRACE.least_removed * removed_outside:
             return (
                 f"nothing where {', '.join(sorted(unexplained))} are left out of the fit: they "
                 "bend a parameter that the other equations share"
             )
         return ""
 
-    # Of two effects that make up for one bent parameter, each seems needed beside the other.
+    # Two effects that together compensate one biased parameter seem needed beside each other.
     together = problem(winner.effects) if len(winner.effects) > 1 else ""
-    used = {u.term.key: u for u in winner.effects}
+    used_by_key = {u.term.key: u for u in winner.effects}
 
     def refused(effect: JudgedEffect) -> JudgedEffect:
-        own = used[effect.name, effect.at]
-        why = together or problem([own]) or _size_includes_zero(data.rig, own, effect)
-        out = tied_in_held_out(effect)
+        used = used_by_key[effect.name, effect.at]
+        why = together or problem([used]) or _size_includes_zero(data.rig, used, effect)
+        tied = tied_in_held_out(effect)
         if not why:
-            return out
-        gates = (Gate(REMOVES, False, why) if g.name == REMOVES else g for g in out.gates)
-        return replace(out, gates=tuple(gates))
+            return tied
+        gates = (Gate(REMOVES, False, why) if g.name == REMOVES else g for g in tied.gates)
+        return replace(tied, gates=tuple(gates))
 
     return tuple(map(refused, effects))
 
@@ -308,22 +308,22 @@ def _size_includes_zero(rig: Rig, used: Used, effect: JudgedEffect) -> str:
 
 
 def _energy(data: RegressionData, hypothesis: Hypothesis, rows: NDArray[np.bool_]) -> float:
-    """Return the energy that a set leaves in some rows if its coefficients are fitted to these."""
+    """Return the energy that a set leaves in `rows` (a mask) with coefficients fitted to these."""
     design = design_matrix(data, hypothesis.fit.terms)
     X, y = design.matrix[rows], design.rhs[rows]
-    left = y - X @ shortest(X, y, TRACE.rank_limit)
-    return float(left @ left)
+    residual = y - X @ shortest(X, y, TRACE.rank_limit)
+    return float(residual @ residual)
 
 
 def tied_in_held_out(effect: JudgedEffect) -> JudgedEffect:
     """Return an effect with every rival tied that held-out records alone do not separate from it.
 
-    What a fit of training records with an unknown cause in them leaves is no evidence.
+    With an unknown cause in the training records, their residuals are no evidence.
     """
     rivals = [replace(r, tied=r.tied or r.ratio < TRACE.tie_ratio) for r in effect.rivals]
     rivals.sort(key=lambda r: not r.tied)
     if not any(r.tied for r in rivals):
         return effect
-    kept = [gate for gate in effect.gates if gate.name != NO_RIVAL]
+    other_gates = [gate for gate in effect.gates if gate.name != NO_RIVAL]
     gate = Gate(NO_RIVAL, False, rivals_in_words(rivals))
-    return replace(effect, rivals=tuple(rivals), gates=(*kept, gate))
+    return replace(effect, rivals=tuple(rivals), gates=(*other_gates, gate))

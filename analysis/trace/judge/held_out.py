@@ -1,4 +1,4 @@
-"""Errors on records that no model was fitted to, and what effects remove and disturb there."""
+"""Errors on hold-out records, and the energy that effects remove or add there."""
 
 from __future__ import annotations
 
@@ -69,24 +69,23 @@ def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> Exact
 
 
 def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
-    """Return `refitted_to_held_out` by the design of the held-out rows."""
+    """Return `refitted_to_held_out` by the design matrix of the held-out rows."""
     model = _at_temperature(rows, model)
-    of_effects = {
-        c.parameter for effect in effects_among(model.terms) for c in effect.coefficients(rig)
-    }  # fmt: skip
+    fixed = {c.parameter for e in effects_among(model.terms) for c in e.coefficients(rig)} | {KAPPA}
     # A coefficient that no row contains would be moved by rounding alone.
-    shown = np.sum(rows.matrix**2, axis=0) + np.diag(model.information) > 0.0
-    at = [k for k, n in enumerate(rows.names) if shown[k] and n not in {KAPPA, *of_effects}]
-    X, known = rows.matrix[:, at], model.information[np.ix_(at, at)]
-    seen = X.T @ X
-    scale = np.sqrt(np.diag(seen) + np.diag(known))
-    least = TRACE.eigenvalue_ratio * np.eye(len(at))
-    ratio, directions = eigh(seen / np.outer(scale, scale), known / np.outer(scale, scale) + least)
-    free = directions[:, ratio > TRACE.information_ratio] / scale[:, None]
-    if not free.shape[1]:  # the usual case
+    visible = np.sum(rows.matrix**2, axis=0) + np.diag(model.information) > 0.0
+    numbers = [k for k, n in enumerate(rows.names) if visible[k] and n not in fixed]
+    X, training = rows.matrix[:, numbers], model.information[np.ix_(numbers, numbers)]
+    held_out = X.T @ X
+    scale = np.sqrt(np.diag(held_out) + np.diag(training))
+    least, unit = TRACE.eigenvalue_ratio * np.eye(len(numbers)), np.outer(scale, scale)
+    ratio, directions = eigh(held_out / unit, training / unit + least)
+    better_known = directions[:, ratio > TRACE.information_ratio] / scale[:, None]
+    if not better_known.shape[1]:  # the usual case
         return model
-    step = free @ np.linalg.lstsq(X @ free, rows.residual(model.beta), rcond=None)[0]
-    changed = {rows.names[k]: float(v) for k, v in zip(at, step, strict=True)}
+    residual = rows.residual(model.beta)
+    step = better_known @ np.linalg.lstsq(X @ better_known, residual, rcond=None)[0]
+    changed = {rows.names[k]: float(v) for k, v in zip(numbers, step, strict=True)}
     return replace(model, beta={n: v + changed.get(n, 0.0) for n, v in model.beta.items()})
 
 
@@ -129,37 +128,36 @@ def errors(
     Sines that are taken out of the rows are part of what the model `before` leaves.
     """
     repeats = Counter(c.group for c in members)
-    compared: list[dict[str, Rows]] = []
-    first: list[tuple[str, Rows]] = []
-    other: list[tuple[str, Rows]] = []
+    floor_rows: list[dict[str, Rows]] = []
+    parts: tuple[list[tuple[str, Rows]], list[tuple[str, Rows]]] = ([], [])  # before, after
     groups: list[Group] = []
     for c in members:
-        bare = replace(c, filtering=replace(c.filtering, lines=()))
+        with_lines = replace(c, filtering=replace(c.filtering, lines=()))
         whole = model_rows(rig, after.terms, c)
-        sides = [model_rows(rig, before.terms, bare), whole]
+        judging = [model_rows(rig, before.terms, with_lines), whole]
         if c.group in divided:
-            sides = [{e: judging_rows(r) for e, r in rows.items()} for rows in sides]
-        compared.append(sides[1] if repeats[c.group] > 1 else whole)
+            judging = [{e: judging_rows(r) for e, r in rows.items()} for rows in judging]
+        floor_rows.append(judging[1] if repeats[c.group] > 1 else whole)
         groups += [c.group] * len(whole)
-        for side, rows_of in zip((first, other), sides, strict=True):
-            side += [
-                (e, rows_within(rig, (curves or {}).get(e, ()), c, r)) for e, r in rows_of.items()
-            ]
-    split = floors(rig, after.terms, members, compared, after.beta, others, noise_ratio)
+        for part, rows in zip(parts, judging, strict=True):
+            part += [(e, rows_within(rig, (curves or {}).get(e, ()), c, rows[e])) for e in rows]
+    split = floors(rig, after.terms, members, floor_rows, after.beta, others, noise_ratio)
     floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
-    for group, (e, rows) in zip(groups, other, strict=True):
+    for group, (e, r) in zip(groups, parts[1], strict=True):
         noise.setdefault(e, []).append(floor[group, e])
-        counts.setdefault(e, []).append(max(len(rows.rhs), 1))
+        counts.setdefault(e, []).append(max(len(r.rhs), 1))
     return Errors(
         {
-            e: float(np.sqrt(np.average(np.square(own), weights=counts[e])))
-            for e, own in sorted(noise.items())
+            e: float(np.sqrt(np.average(np.square(floors_of), weights=counts[e])))
+            for e, floors_of in sorted(noise.items())
         },
-        _rms_by_equation((e, rows.rhs) for e, rows in first),
-        _rms_by_equation((e, row_residual(rows, before.beta)) for e, rows in first),
-        _rms_by_equation((e, row_residual(rows, after.beta)) for e, rows in other),
+        _rms_by_equation((e, r.rhs) for e, r in parts[0]),
+        *(
+            _rms_by_equation((e, row_residual(r, model.beta)) for e, r in part)
+            for part, model in zip(parts, (before, after), strict=True)
+        ),
     )
 
 
@@ -196,20 +194,16 @@ class FreeRunErrors:
 
 def free_curves(before: FreeRunErrors, after: FreeRunErrors) -> FreeCurves | None:
     """Return the beginning of one held-out record, measured and under both models; None if none."""
-    first, other = before.first, after.first
-    if first is None or other is None or first.record != other.record:
+    run, other = before.first, after.first
+    if run is None or other is None or run.record != other.record:
         return None
-    count = min(round(TRACE.curve_seconds / float(first.time[1] - first.time[0])), len(first.time))
-    kept = slice(0, count, max(count // TRACE.curve_points, 1))
-    before_it, after_it = first.simulation.channels(), other.simulation.channels()
-    return FreeCurves(
-        first.record,
-        first.time[kept],
-        first.units,
-        {name: y[kept] for name, y in first.measured.items()},
-        {name: before_it[name][kept] for name in first.measured},
-        {name: after_it[name][kept] for name in first.measured},
+    count = min(round(TRACE.curve_seconds / float(run.time[1] - run.time[0])), len(run.time))
+    shown = slice(0, count, max(count // TRACE.curve_points, 1))
+    measured, simulated, simulated_after = (
+        {name: channels[name][shown] for name in run.measured}
+        for channels in (run.measured, run.simulation.channels(), other.simulation.channels())
     )
+    return FreeCurves(run.record, run.time[shown], run.units, measured, simulated, simulated_after)
 
 
 def free_runs(
@@ -237,11 +231,12 @@ def worse_free_run(before: FreeRunErrors, after: FreeRunErrors) -> str:
     Windows restarted from the data are compared: over a whole record a drift grows without bound.
     """
     for channel, error in before.window_rmse.items():
-        now = after.window_rmse.get(channel, 0.0)  # none: a parameter is not identified
-        if math.isfinite(error) and not now <= TRACE.free_run_ratio * error:
-            if not math.isfinite(now):
+        error_after = after.window_rmse.get(channel, 0.0)  # none: a parameter is not identified
+        if math.isfinite(error) and not error_after <= TRACE.free_run_ratio * error:
+            if not math.isfinite(error_after):
                 return f"the held-out free run of {channel} fails with it, and not without"
-            return f"the held-out free run of {channel} is {now / error:.2g} times worse with it"
+            times = error_after / error
+            return f"the held-out free run of {channel} is {times:.2g} times worse with it"
     return ""
 
 
@@ -252,21 +247,21 @@ def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRunErrors:
         return FreeRunErrors({}, {}, {})
     fit, rmse, windows = {}, {}, {}
     for c in sorted({channel for r in results for channel in r.fit}):
-        own = [r for r in results if c in r.fit]
-        lost = np.array([math.nan if r.failure else 1.0 for r in own])
-        fit[c] = float(np.mean(lost * [r.fit[c] for r in own]))
-        rmse[c] = float(np.sqrt(np.mean(lost * [r.rmse[c] ** 2 for r in own])))
-        windows[c] = float(np.sqrt(np.mean([r.window_rmse[c] ** 2 for r in own])))
+        of_channel = [r for r in results if c in r.fit]
+        weight = np.array([math.nan if r.failure else 1.0 for r in of_channel])
+        fit[c] = float(np.mean(weight * [r.fit[c] for r in of_channel]))
+        rmse[c] = float(np.sqrt(np.mean(weight * [r.rmse[c] ** 2 for r in of_channel])))
+        windows[c] = float(np.sqrt(np.mean([r.window_rmse[c] ** 2 for r in of_channel])))
     return FreeRunErrors(fit, rmse, windows, next((r for r in results if not r.failure), None))
 
 
 def removed_energy(winner: Hypothesis, alternative: Hypothesis) -> dict[str, float]:
     """Return the training energy that an effect removes, by equation in which it acts."""
-    change = {
+    removed = {
         e: alternative.excess_energy[e] - winner.excess_energy[e] for e in alternative.excess_energy
     }
-    most = max(change.values())
-    return {e: v for e, v in change.items() if v > SEARCH.acting_share * most}
+    most = max(removed.values())
+    return {e: v for e, v in removed.items() if v > SEARCH.acting_share * most}
 
 
 def disturbed_equations(
@@ -289,18 +284,19 @@ def disturbed_equations(
 def disturbed_in_held_out(
     holdout_data: RegressionData, before: Array, without: Array, after: Array
 ) -> list[str]:
-    """Return the equations in which held-out records lose by an effect.
+    """Return the equations whose held-out error an effect increases.
 
     Their error exceeds `TRACE.noted_ratio` noise floors, and their energy above noise exceeds that
     of the baseline by `TRACE.harm_ratio` and that without the effect. `before`, `without` and
     `after` (M,) are the whitened residuals of the baseline, and without and with the effect.
     """
-    start, alone, now = (energy_above_noise(holdout_data, r) for r in (before, without, after))
+    energies = [energy_above_noise(holdout_data, r) for r in (before, without, after)]
+    baseline, without_effect, with_effect = energies
     return [
         e
         for e, ratio in error_over_floor(holdout_data, after).items()
         if ratio > TRACE.noted_ratio
-        and now[e] > max(TRACE.harm_ratio * max(0.0, start[e]), alone[e])
+        and with_effect[e] > max(TRACE.harm_ratio * max(0.0, baseline[e]), without_effect[e])
     ]
 
 
@@ -325,31 +321,31 @@ def removal_in_words(removed: Removal, disturbed: Collection[str]) -> str:
 def removal_of(
     holdout_data: RegressionData, changes: Mapping[str, float], without: Array, after: Array
 ) -> Removal:
-    """Return what an effect removes of the held-out energy above noise.
+    """Return the share of the held-out energy above noise that an effect removes.
 
     It is the mean over equations, weighted by the training energy that the effect removes in each
     (`changes`): an error of the baseline in another equation does not count against the effect.
-    Where the held-out rows of an equation (`without` and with the effect, `after`: (M,), whitened)
-    have no more energy than noise, the share is that of the effect's change which they show;
-    equations where that change would not show are left out.
+    `without` and `after` (M,) are the whitened residuals without and with the effect. In an
+    equation without energy above noise the share is that of the effect's change which the residual
+    shows; equations where that change is within the noise are left out.
     """
-    before, now = energy_above_noise(holdout_data, without), energy_above_noise(holdout_data, after)
-    shares, above = {}, set()
-    for equation in changes:  # in their order: a set's would change the sum's last digit
-        if equation not in before:
+    energy, remaining = (energy_above_noise(holdout_data, r) for r in (without, after))
+    shares, in_noise = {}, True
+    for e in changes:  # in their order: a set's would change the sum's last digit
+        if e not in energy:
             continue
-        start = _residual_of(holdout_data, without, (equation,))
-        change = start - _residual_of(holdout_data, after, (equation,))
+        residual = _residual_of(holdout_data, without, (e,))
+        change = residual - _residual_of(holdout_data, after, (e,))
         size = float(np.linalg.norm(change))
-        if before[equation] > TRACE.standard_errors * np.sqrt(2.0 * len(start)):
-            above.add(equation)
-            shares[equation] = max(-1.0, 1.0 - max(0.0, now[equation]) / before[equation])
+        if energy[e] > TRACE.standard_errors * np.sqrt(2.0 * len(residual)):
+            in_noise = False
+            shares[e] = max(-1.0, 1.0 - max(0.0, remaining[e]) / energy[e])
         elif size > 2.0 * TRACE.standard_errors:
-            # 1 on average if the effect is right, 0 if there is none; the noise makes it 1 / size.
-            shares[equation] = float(np.clip(start @ change / size**2, -1.0, 1.0))
+            # 1 on average if the effect is right, 0 if there is none, with a deviation of 1 / size.
+            shares[e] = float(np.clip(residual @ change / size**2, -1.0, 1.0))
     total = sum(changes[e] for e in shares)
     share = sum(changes[e] * v for e, v in shares.items()) / total if total > 0.0 else 0.0
-    return Removal(share, bool(shares) and not above)
+    return Removal(share, bool(shares) and in_noise)
 
 
 def rms_in(data: RegressionData, residual: Array, equations: Collection[str]) -> float:

@@ -61,14 +61,14 @@ def sign_flipped(
     M = train_data.base.shape[0]
     out = np.zeros((M, count))
     groups = sorted({s.group for s in train_data.segments})
-    most = int(numbers.max()) + 1
+    most_blocks = int(numbers.max()) + 1
     for group in groups:
         parts = [s for s in train_data.segments if s.group == group]
-        signs = rng.choice([-1.0, 1.0], size=(parts[0].repeats, most, count))
+        signs = rng.choice([-1.0, 1.0], size=(parts[0].repeats, most_blocks, count))
         for s in parts:
             repeats = residual[: s.repeats, s.where]
-            mixed = np.einsum("rm,rmc->mc", repeats, signs[:, numbers[s.where], :])
-            out[s.where] = mixed / np.sqrt(s.repeats)
+            sums = np.einsum("rm,rmc->mc", repeats, signs[:, numbers[s.where], :])
+            out[s.where] = sums / np.sqrt(s.repeats)
     return out
 
 
@@ -120,8 +120,8 @@ def effect_errors(train_data: RegressionData, model: ExactFit, used: Used) -> Ef
     scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
     scale[scale == 0] = 1.0
     error = parameter_covariance(train_data, J_p / scale, model.residual)
-    known = {**shape_values(train_data.rig, used), **model.parameters(train_data.rig)}
-    value = np.array([known.get(n, np.nan) for n in names])
+    values = {**shape_values(train_data.rig, used), **model.parameters(train_data.rig)}
+    value = np.array([values.get(n, np.nan) for n in names])
     return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
 
 
@@ -144,11 +144,11 @@ def estimates(
         )
         for name, v, s, h in zip(errors.names, errors.value, errors.std, half, strict=True)
     }
-    seen = [conditioned.signals for conditioned in train_data.records]
-    for name, beyond in effect_in(used).extrapolated(rig, seen, used.shape).items():
+    signals = [conditioned.signals for conditioned in train_data.records]
+    for name, range_beyond in effect_in(used).extrapolated(rig, signals, used.shape).items():
         if name in out:
             low, high = out[name].ci95
-            out[name] = replace(out[name], ci95=(min(low, *beyond), max(high, *beyond)))
+            out[name] = replace(out[name], ci95=(min(low, *range_beyond), max(high, *range_beyond)))
     return out
 
 
@@ -172,10 +172,10 @@ def all_include(values: Mapping[str, float], parameters: Mapping[str, Estimate])
 
     False where none of `values` is that of one of the `parameters`.
     """
-    found = [
+    intervals = [
         (value, *parameters[name].ci95) for name, value in values.items() if name in parameters
     ]
-    return bool(found) and all(low <= value <= high for value, low, high in found)
+    return bool(intervals) and all(low <= value <= high for value, low, high in intervals)
 
 
 def is_of_unknown_size(
@@ -187,30 +187,30 @@ def is_of_unknown_size(
     the other `effects` of its family, but of another law, acts at its place: two frictions of one
     joint.
     """
-    own = effect_in(used)
-    if own.free or not all_include({c.parameter: 0.0 for c in own.coefficients(rig)}, parameters):
+    effect = effect_in(used)
+    zeros = {c.parameter: 0.0 for c in effect.coefficients(rig)}
+    if effect.free or not all_include(zeros, parameters):
         return False
+    family = effect.family, effect.where
     others = effects_among(o for o in effects if o is not used)
-    return any(
-        (o.family, o.where) == (own.family, own.where) and not of_one_law(o, own) for o in others
-    )
+    return any((o.family, o.where) == family and not of_one_law(o, effect) for o in others)
 
 
-def with_shape_errors(found: ShapeFit, model: Model) -> tuple[Model, dict[str, Estimate]]:
+def with_shape_errors(shape_fit: ShapeFit, model: Model) -> tuple[Model, dict[str, Estimate]]:
     """Return the model with wider intervals, and the shapes found with their 95 % intervals.
 
-    `model` was identified with the shapes of `found` taken as exact. Its intervals then include the
-    uncertainty of the shapes, and errors of the effects' forms (`scatter.with_form_errors`).
+    `model` was identified with the shapes of `shape_fit` taken as exact. Its intervals then include
+    the uncertainty of the shapes, and errors of the effects' forms (`scatter.with_form_errors`).
     """
-    data, fit = found.data, found.fit
+    data, fit = shape_fit.data, shape_fit.fit
     shift = form_shift(data, fit)
     shapes: dict[str, Estimate] = {}
     for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        own = {s.parameter for s in shapes_of(data.rig, used)}
-        every = estimates(data, used, effect_errors(data, fit, used), shift)
-        shapes |= {name: e for name, e in every.items() if name in own}
+        shape_names = {s.parameter for s in shapes_of(data.rig, used)}
+        all_estimates = estimates(data, used, effect_errors(data, fit, used), shift)
+        shapes |= {name: e for name, e in all_estimates.items() if name in shape_names}
     return with_form_errors(data, fit, model, shift), shapes
 
 

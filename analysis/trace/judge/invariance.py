@@ -1,8 +1,8 @@
 """Invariance: whether an effect has the same size in all parts of the records, as a cause has.
 
 The linearised model is solved again on parts of the rows: each step, each half of the records, each
-direction of motion, fast and slow. The size must not differ by more than noise, the error of the
-catalogue's simpler form, and the form error of a larger effect together may cause.
+direction of motion, fast and slow. The size may differ by noise, by the error of the catalogue's
+simpler form and by the form error of a larger effect, together.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Arra
     """
     M = train_data.base.shape[0]
     out: dict[str, Array] = {}
-    early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
-    outer = np.zeros(M, dtype=bool)
+    early, extending = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
+    fast = np.zeros(M, dtype=bool)
     for s in train_data.segments:
         name = f"step {s.group[1]}"
         out.setdefault(name, np.zeros(M, dtype=bool))[s.where] = True
         conditioned, rows = train_data.source(s)
         time = rows.time
         early[s.where] = time < 0.5 * (time[0] + time[-1])
-        own = joint if joint is not None else joint_of(s.equation)
-        speed = conditioned.signals.sd[conditioned.samples_at(time), own]
-        ahead[s.where] = speed > 0
+        joint_number = joint if joint is not None else joint_of(s.equation)
+        speed = conditioned.signals.sd[conditioned.samples_at(time), joint_number]
+        extending[s.where] = speed > 0
         size = np.abs(speed)
-        outer[s.where] = size > np.median(size)
+        fast[s.where] = size > np.median(size)
     out |= {
-        "first half": early, "second half": ~early, "extending": ahead, "retracting": ~ahead,
-        "fast": outer, "slow": ~outer,
+        "first half": early, "second half": ~early, "extending": extending,
+        "retracting": ~extending, "fast": fast, "slow": ~fast,
     }  # fmt: skip
     return out
 
@@ -67,7 +67,7 @@ def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Arra
 def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
     """Return the number of the block of every row (M,), None where the noise was measured.
 
-    Where a step has neither repeats nor periods, the residual is used as noise, block by block.
+    Where a step has neither repeats nor periods, the residual of each block counts as noise.
     """
     if all(floor.count > 1 for floor in train_data.floors):
         return None
@@ -90,20 +90,20 @@ def _parts(
 
 
 def _shift(
-    own: Array, residual: Array, base: Array, blocks: NDArray[np.int64] | None
+    column: Array, residual: Array, base: Array, blocks: NDArray[np.int64] | None
 ) -> tuple[float, float]:
     """Return the change of a coefficient in a part of the rows, and its standard error.
 
-    `own` (m,) is its column orthogonal to the others, whose orthonormal basis is `base` (m, r).
+    `column` (m,) is its column orthogonal to the others, whose orthonormal basis is `base` (m, r).
     With `blocks` (m,) the error is also computed from the `residual` (m,) as noise, by block.
     """
-    size = float(own @ own)
-    shift = float(own @ residual) / size
+    size = float(column @ column)
+    shift = float(column @ residual) / size
     error = 1.0 / np.sqrt(size)
     if blocks is not None:
-        noise = residual - base @ (base.T @ residual) - own * shift
+        noise = residual - base @ (base.T @ residual) - column * shift
         _, index = np.unique(blocks, return_inverse=True)
-        by_block = np.bincount(index, weights=own * noise)
+        by_block = np.bincount(index, weights=column * noise)
         error = max(error, float(np.linalg.norm(by_block)) / size)
     return shift, float(error)
 
@@ -120,22 +120,22 @@ def _energy_of_larger_effect(
     energy = {}
     for u in model.terms:
         if isinstance(u.term, Effect):
-            own = [rows.names.index(c.parameter) for c in u.term.coefficients(train_data.rig)]
-            values = np.array([model.beta.get(rows.names[k], 0.0) for k in own])
-            part = rows.matrix[mask][:, own] @ values
+            places = [rows.names.index(c.parameter) for c in u.term.coefficients(train_data.rig)]
+            values = np.array([model.beta.get(rows.names[k], 0.0) for k in places])
+            part = rows.matrix[mask][:, places] @ values
             energy[u.term.key] = float(part @ part)
-    mine = energy.pop(used.term.key, 0.0)
+    own_energy = energy.pop(used.term.key, 0.0)
     most = max(energy.values(), default=0.0)
-    return most if most > mine else 0.0
+    return most if most > own_energy else 0.0
 
 
 def _column_off_others(columns: Array, k: int) -> Array:
     """Return column k (m,) projected orthogonal to the other columns."""
-    rest, own = np.delete(columns, k, axis=1), columns[:, k]
-    if not rest.shape[1]:
-        return own
-    Q = orthonormal(rest)
-    return np.asarray(own - Q @ (Q.T @ own))
+    others, column = np.delete(columns, k, axis=1), columns[:, k]
+    if not others.shape[1]:
+        return column
+    Q = orthonormal(others)
+    return np.asarray(column - Q @ (Q.T @ column))
 
 
 def invariance(
@@ -156,45 +156,46 @@ def invariance(
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
     J_all = J - base @ (base.T @ J)
-    whole = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
+    column_energy = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
     # A number that the effect's other numbers can replace is no size of its own: then the whole
     # effect is judged.
-    ridge = {
+    replaceable = {
         name
         for k, name in enumerate(names)
-        if name in sizes and whole[k] < TRACE.separable_share * float(J_all[:, k] @ J_all[:, k])
+        if name in sizes
+        and column_energy[k] < TRACE.separable_share * float(J_all[:, k] @ J_all[:, k])
     }
-    if ridge:
+    if replaceable:
         out += _whole_effect_differences(train_data, model, used, base, joint)
-        sizes -= ridge
+        sizes -= replaceable
     for label, mask, B, blocks in _parts(train_data, base, joint):
-        J_s = J[mask] - B @ (B.T @ J[mask])
+        J_part = J[mask] - B @ (B.T @ J[mask])
         for k, name in enumerate(names):
             if name not in sizes:
                 continue
-            if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
+            if np.linalg.norm(J_part[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
-            own = _column_off_others(J_s, k)
-            size = float(own @ own)
+            column = _column_off_others(J_part, k)
+            size = float(column @ column)
             # A part with little information shows the tail of the form, not the size.
             if (
-                size < TRACE.informative_share * whole[k]
+                size < TRACE.informative_share * column_energy[k]
                 or size <= 0
                 or not np.isfinite(value.value[k])
             ):
                 continue
-            shift, error = _shift(own, model.residual[mask], B, blocks)
-            spill = np.sqrt(
+            shift, error = _shift(column, model.residual[mask], B, blocks)
+            form_error = np.sqrt(
                 SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
             )
             # Differences are relative to the largest number of the same unit: of two levels, 2 N
             # and 100 N, the smaller is a detail.
-            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
-            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
-            if error > TRACE.subset_error * full:
+            same_unit = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
+            size_scale = float(np.max(np.abs(value.value[same_unit] - neutral[same_unit])))
+            if error > TRACE.subset_error * size_scale:
                 continue
-            if abs(shift) > spill + TRACE.standard_errors * np.hypot(
-                error, TRACE.invariance_tolerance / TRACE.standard_errors * full
+            if abs(shift) > form_error + TRACE.standard_errors * np.hypot(
+                error, TRACE.invariance_tolerance / TRACE.standard_errors * size_scale
             ):
                 out.append(Difference(label, name, float(value.value[k]) + shift, error))
     return out
@@ -210,16 +211,16 @@ def _whole_effect_differences(
     one; their common contribution to the rows must be the same everywhere.
     """
     whole = contribution(train_data, model, used)
-    start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
+    total_energy = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
     out = []
     for label, mask, B, blocks in _parts(train_data, base, joint):
-        own = whole[mask] - B @ (B.T @ whole[mask])
-        size = float(own @ own)
-        if size <= TRACE.informative_share * start or size < 0.01 * float(
+        part = whole[mask] - B @ (B.T @ whole[mask])
+        size = float(part @ part)
+        if size <= TRACE.informative_share * total_energy or size < 0.01 * float(
             whole[mask] @ whole[mask]
         ):
             continue
-        shift, error = _shift(own, model.residual[mask], B, blocks)
+        shift, error = _shift(part, model.residual[mask], B, blocks)
         if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
             error, TRACE.invariance_tolerance / TRACE.standard_errors
         ):

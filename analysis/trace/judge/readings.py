@@ -1,4 +1,4 @@
-"""Readings: names of one mechanism's law, of which the simplest one that fits is chosen.
+"""Readings: alternative names of one mechanism's law; the simplest one that fits is chosen.
 
 A name is a restriction of its mechanism's law: one level of dry friction where the law has two, no
 breakaway, no line behind the tank. The remaining energy cannot show whether a restriction holds,
@@ -49,14 +49,14 @@ def best_readings(
     """
     winner = _simplified(hypotheses, winner, holdout_data)
     while winner.effects:
-        held = held_out_residual(holdout_data, winner.fit)
+        residual = held_out_residual(holdout_data, winner.fit)
         richer = [o for o in _richer_sets(hypotheses, winner) if not hypotheses.physical_problem(o)]
-        needed = [o for o in richer if _needs_richer(hypotheses, winner, o, held, holdout_data)]
+        needed = [o for o in richer if _needs_richer(hypotheses, winner, o, residual, holdout_data)]
         if not needed:
             break
         least = min(o.fit.energy for o in needed)
-        near = [o for o in needed if o.fit.energy <= least + SEARCH.number_price]
-        best = min(near, key=lambda o: (o.size, o.fit.energy))
+        similar = [o for o in needed if o.fit.energy <= least + SEARCH.number_price]
+        best = min(similar, key=lambda o: (o.size, o.fit.energy))
         log.info("richer reading: %s for %s", sorted(best.keys), sorted(winner.keys))
         winner = best
     return winner
@@ -66,20 +66,20 @@ def _simplified(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
     """Return the winner with effects replaced by simpler ones they include, if nothing is lost."""
-    known = {effect.key for effect in effects_among(hypotheses.base)}
+    in_model = {effect.key for effect in effects_among(hypotheses.base)}
     for used in winner.effects:
         effect = effect_in(used)
         for name in effect.includes:
-            if (name, effect.where) in known:  # the model has this effect already
+            if (name, effect.where) in in_model:  # the model has this effect already
                 continue
             effects = winner.without(used)
             if (name, effect.where) not in winner.keys:
                 simple = effect_of(name, effect.where)
                 effects = (*effects, at_start(hypotheses.train_data.rig, simple))
             other = hypotheses.refined(effects)
-            held = held_out_residual(holdout_data, other.fit)
+            residual = held_out_residual(holdout_data, other.fit)
             if not hypotheses.physical_problem(other) and not _needs_richer(
-                hypotheses, other, winner, held, holdout_data
+                hypotheses, other, winner, residual, holdout_data
             ):
                 log.info("simpler reading: %s for %s", sorted(other.keys), sorted(winner.keys))
                 return _simplified(hypotheses, other, holdout_data)
@@ -109,48 +109,48 @@ def loses_by_restriction(restricted: Array, richer: Array) -> bool:
 
 
 def _needs_richer(
-    hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis, held: Array,
+    hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis, residual: Array,
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records need `other`, the richer of two sets.
 
     In training `other` must remove: with the same number of effects more than noise for each
     number, and `_form_error_energy`; with one more effect what a further effect must. In held-out
-    records `hypothesis`, whose residual there is `held` (M,), must leave more than `other` and lose
-    more than `TRACE.standard_errors`. The training rows must determine an effect that is added
+    records `hypothesis`, with `residual` (M,) there, must leave more than `other` and lose more
+    than `TRACE.standard_errors`. The training rows must determine an effect that is added
     (`_is_determined`). One that replaces another removes `TRACE.richer_name_share` of what
     `hypothesis` leaves, or has intervals that exclude the simpler one (`Effect.distinct`): two
     levels of friction remove little where a change of W makes most of their difference.
     """
-    more = other.size[1] - hypothesis.size[1]
+    further = other.size[1] - hypothesis.size[1]
     added = len(other.effects) > len(hypothesis.effects)
     if added:
-        least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
+        least_removed = max(SEARCH.number_price * further, SEARCH.add_share * hypothesis.total)
     else:
-        noise = TRACE.standard_errors**2 * more
-        least = max(noise, _form_error_energy(hypotheses, hypothesis, other))
+        noise = TRACE.standard_errors**2 * further
+        least_removed = max(noise, _form_error_energy(hypotheses, hypothesis, other))
     removed = hypothesis.fit.energy - other.fit.energy
-    if removed <= least:
+    if removed <= least_removed:
         return False
-    if not loses_by_restriction(held, held_out_residual(holdout_data, other.fit)):
+    if not loses_by_restriction(residual, held_out_residual(holdout_data, other.fit)):
         return False
-    fresh = [u for u in other.effects if u.term.key not in hypothesis.keys]
+    new_effects = [u for u in other.effects if u.term.key not in hypothesis.keys]
     if added:
-        return all(_is_determined(hypotheses, other, u) for u in fresh)
+        return all(_is_determined(hypotheses, other, u) for u in new_effects)
     # A law leaves form error beside noise: a number that removes little may only adapt the form.
     if removed > TRACE.richer_name_share * hypothesis.total:
         return True
     return all(
         effect_in(u).distinct({n: e.ci95 for n, e in _numbers(hypotheses, other, u).items()})
-        for u in fresh
+        for u in new_effects
     )
 
 
 def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> bool:
     """Return whether no 95 % interval of an effect's numbers holds 0, details of its form aside.
 
-    A Stribeck speed far above those of the records makes of it a second level by Coulomb, whose
-    size the two levels share in any proportion.
+    With a Stribeck speed far above those of the records, the breakaway is a second Coulomb level,
+    and the rows determine only the sum of the two.
     """
     shapes = shapes_of(hypotheses.train_data.rig, used)
     details = {s.parameter for s in shapes if s.detail or s.resolution}
@@ -175,7 +175,7 @@ def _form_error_energy(
     """
     rig = hypotheses.train_data.rig
     values = other.fit.parameters(rig)
-    near = any(
+    is_near = any(
         (effect.simpler_equivalent(rig, values, TRACE.near_tolerance), effect.where)
         in hypothesis.keys
         for effect in effects_among(other.effects)
@@ -183,7 +183,7 @@ def _form_error_energy(
     left = sum(
         max(0.0, v - hypotheses.noise_band.by_equation[e]) for e, v in other.excess_energy.items()
     )
-    return left if near else 0.0
+    return left if is_near else 0.0
 
 
 def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
@@ -193,17 +193,17 @@ def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypo
     """
     rig, sets = hypotheses.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
     for used in hypothesis.effects:
-        own = effect_in(used)
+        member = effect_in(used)
         for effect in hypotheses.effects:
-            if not of_one_law(effect, own) or effect.key in hypothesis.keys:
+            if not of_one_law(effect, member) or effect.key in hypothesis.keys:
                 continue
-            kept = hypothesis.without(used)
-            if effect.beside or own.beside:
-                kept = (*kept, used)
-            elif own.name not in effect.includes:
+            others = hypothesis.without(used)
+            if effect.beside or member.beside:
+                others = (*others, used)
+            elif member.name not in effect.includes:
                 continue
-            if not may_grow(kept):
+            if not may_grow(others):
                 continue
-            effects = (*kept, at_start(rig, effect))
+            effects = (*others, at_start(rig, effect))
             sets[keys_of(effects)] = effects
     return [hypotheses.refined(effects) for effects in sets.values()]

@@ -1,4 +1,4 @@
-"""Rivals: other effects that could take the place of a named one."""
+"""Rivals: other effects that explain the records as well, or nearly, as a named one."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def rivals_of(
 
     Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
     held-out records have shown that it is too simple; a richer one is a rival where it changes a
-    parameter of another law, or where the effect cannot be separated from others anyway.
+    parameter of another law, or where another rival is tied.
     """
     judged_effect, train_data = effect_in(used), hypotheses.train_data
     holdout_data = held_out_test.data
@@ -55,12 +55,13 @@ def rivals_of(
     )
     out: list[Rival] = []
     richer: list[Rival] = []
-    for hypothesis, fresh in hypotheses.replacements(winner, used):
-        other = effect_in(fresh)
+    for hypothesis, rival_term in hypotheses.replacements(winner, used):
+        other = effect_in(rival_term)
         same_law = of_one_law(judged_effect, other)
         # Each further free number must remove its price.
-        more = hypothesis.size[1] - winner.size[1]
-        justified = more <= 0 or hypothesis.total <= winner.total - SEARCH.number_price * more
+        further = hypothesis.size[1] - winner.size[1]
+        price = SEARCH.number_price * further
+        justified = further <= 0 or hypothesis.total <= winner.total - price
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
         if (
             not (justified or alike)
@@ -69,16 +70,15 @@ def rivals_of(
             or held_out.disturbed_equations(hypotheses, hypothesis, alternative)
         ):
             continue
-        rival_residual = held_out_residual(holdout_data, hypothesis.fit)
-        if _is_refused_simpler_name(
-            hypotheses, holdout_data, (judged_effect, other), others, rival_residual
-        ):
+        residual, pair = held_out_residual(holdout_data, hypothesis.fit), (judged_effect, other)
+        if _is_refused_simpler_name(hypotheses, holdout_data, pair, others, residual):
             continue
-        ratio = held_out_test.ratio(rival_residual)
-        near = TRACE.tie_ratio_training if other.amplifies else TRACE.tie_ratio
-        tied = held_out_test.ties(rival_residual, near) and (alike or ratio < TRACE.decisive_ratio)
-        own = judged_effect.family if same_law else ""
-        moved = moved_parameter(train_data, winner, hypothesis, own) if tied else None
+        ratio = held_out_test.ratio(residual)
+        tie_ratio = TRACE.tie_ratio_training if other.amplifies else TRACE.tie_ratio
+        tied = held_out_test.ties(residual, tie_ratio)
+        tied = tied and (alike or ratio < TRACE.decisive_ratio)
+        law = judged_effect.family if same_law else ""
+        moved = moved_parameter(train_data, winner, hypothesis, law) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
         free = any(effect.free for effect in effects_among(hypothesis.effects))
         if not same_law and not justified and (moved is None or free):
@@ -115,38 +115,37 @@ def moved_parameter(
     """Return the baseline parameter that a rival changes most, and its relative change.
 
     It changes by at least `least` and lies outside the rival's 95 % interval: the stated intervals
-    would be wrong if the rival were true. None where no parameter does. Those of
-    the baseline's term of the same `law` are left out (viscous friction beside dry `friction`,
-    whose forms differ by a slope too), and for the others it is enough that the rival's interval
-    is wider than `TRACE.open_share`: its end farther from the named set's value gives the change.
-    '' leaves out none.
+    would be wrong if the rival were true. None where no parameter does.
+    With a `law`, parameters of the baseline's term of that law are left out (viscous friction
+    beside dry `friction`, whose forms differ by a slope too), and a rival's interval wider than
+    `TRACE.open_share` suffices: its end farther from the named set's value gives the change.
     """
-    known = deviations(train_data, rival.fit)
-    most: tuple[str, float] | None = None
+    std = deviations(train_data, rival.fit)
+    largest: tuple[str, float] | None = None
     rig = train_data.rig
     left_out = _of_law(rig, law)
     for c in (c for term in baseline_of(rig) for c in term.coefficients(rig)):
         if c.parameter in left_out:
             continue
         value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
-        if not value or not other or c.parameter not in known:
+        if not value or not other or c.parameter not in std:
             continue
-        half_width = IDENTIFY.normal_quantile * known[c.parameter]
+        half_width = IDENTIFY.normal_quantile * std[c.parameter]
         if law and half_width > TRACE.open_share * abs(value):
             other += math.copysign(half_width, other - value)
         elif abs(other - value) <= half_width:
             continue
         change = value / other - 1.0 if c.reciprocal else other / value - 1.0
-        if abs(change) > max(least, abs(most[1]) if most else 0.0):
-            most = c.parameter, float(change)
-    return most
+        if abs(change) > max(least, abs(largest[1]) if largest else 0.0):
+            largest = c.parameter, float(change)
+    return largest
 
 
 def deviations(data: RegressionData, fit: ExactFit) -> dict[str, float]:
-    """Return the standard deviations from noise of a fit's coefficients, by name.
+    """Return the standard deviations by noise of a fit's coefficients, by name.
 
-    Those that the rows do not determine are left out: the pseudo-inverse gives them less variance
-    than 1 / I, with their information I.
+    Coefficients that the rows do not determine are left out: the pseudo-inverse gives them a
+    variance below 1 / I, with their information I.
     """
     names, covariance = noise_covariance(data, fit)
     variance = dict(zip(names, np.diag(covariance).tolist(), strict=True))
@@ -182,8 +181,8 @@ def best_tied_set(
 
     tied = [o for o in tied_sets(hypotheses, winner, effects) if not is_richer(o)]
     best = min(tied, key=lambda o: cost(o, holdout_data), default=winner)
-    least = cost(winner, holdout_data) - SEARCH.number_price
-    return best if cost(best, holdout_data) < least else winner
+    limit = cost(winner, holdout_data) - SEARCH.number_price
+    return best if cost(best, holdout_data) < limit else winner
 
 
 def cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
@@ -237,14 +236,14 @@ def errors_by_alternatives(
     """
     compared = [(other.parameters, _of_law(model.rig, law)) for other, law in alternatives]
     errors = {}
-    for name, own in model.parameters.items():
+    for name, estimate in model.parameters.items():
         others = [found[name] for found, out in compared if name in found and name not in out]
-        more = sum(
-            (o.value - own.value) ** 2 + max(o.std**2 - own.std**2, 0.0)
+        added_variance = sum(
+            (o.value - estimate.value) ** 2 + max(o.std**2 - estimate.std**2, 0.0)
             for o in others if o.identified
         )  # fmt: skip
-        if own.identified and more > 0.0:
-            errors[name] = math.sqrt(more / (len(alternatives) + 1))
+        if estimate.identified and added_variance > 0.0:
+            errors[name] = math.sqrt(added_variance / (len(alternatives) + 1))
     return errors
 
 
@@ -263,12 +262,12 @@ def _tied_composites(
     only. The ratio yielded is that of `TieTest`; the two effects are the last of the set's.
     """
     for effects in confounders.composites(hypotheses.train_data, hypotheses.effects, winner, used):
-        both = hypotheses.refined(effects)
-        if hypotheses.physical_problem(both):
+        composite = hypotheses.refined(effects)
+        if hypotheses.physical_problem(composite):
             continue
-        residual = held_out_residual(held_out_test.data, both.fit)
+        residual = held_out_residual(held_out_test.data, composite.fit)
         if held_out_test.ties(residual, TRACE.tie_ratio):
-            yield both, held_out_test.ratio(residual)
+            yield composite, held_out_test.ratio(residual)
 
 
 def composites_in_words(
@@ -278,8 +277,8 @@ def composites_in_words(
 
     They are no rival where no parameter changes with them, since one effect is simpler.
     """
-    for both, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
-        names = " and ".join(u.term.name for u in both.effects[-2:])
+    for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
+        names = " and ".join(u.term.name for u in composite.effects[-2:])
         return f"; {names} together would leave {ratio:.2f} times the held-out rms"
     return ""
 

@@ -49,10 +49,10 @@ def parameter_covariance(
         k = len(V)
         if not determined.shape[1]:
             return CovarianceParts(np.zeros((k, k)), np.ones(k), np.zeros(k))
-        inner = parameter_covariance(train_data, columns @ determined, residual)
-        whole = determined @ inner.covariance @ determined.T
+        reduced = parameter_covariance(train_data, columns @ determined, residual)
+        covariance = determined @ reduced.covariance @ determined.T
         return CovarianceParts(
-            whole, np.full(k, inner.dof.min()), np.full(k, inner.systematic.max())
+            covariance, np.full(k, reduced.dof.min()), np.full(k, reduced.systematic.max())
         )
     inverse = np.asarray((V / size) @ V.T, dtype=np.float64)
     groupings = [_scores(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
@@ -62,7 +62,7 @@ def parameter_covariance(
 def _scores(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
     """Return scores and information of every step, repeat and group of rows.
 
-    `by` says what rows are grouped by: PERIOD, STATE or SPEED.
+    Rows are grouped `by` PERIOD, STATE or SPEED.
     """
     strata = {g: k for k, g in enumerate(sorted({s.group for s in train_data.segments}))}
     pieces: dict[tuple[int, int, int], tuple[Array, Array]] = {}
@@ -71,15 +71,15 @@ def _scores(train_data: RegressionData, columns: Array, residual: Array, by: str
         label = _row_groups(conditioned, s, rows.time, by)
         # Parts of a period group all equations; levels of a state group each equation by itself.
         label = label if by == PERIOD else label + number * IDENTIFY.state_levels
-        own = columns[s.where] / np.sqrt(s.repeats)
-        noise = train_data.residual[: s.repeats, s.where]
-        left = noise - noise.mean(axis=0) + residual[s.where] / np.sqrt(s.repeats)
+        weighted = columns[s.where] / np.sqrt(s.repeats)
+        repeats = train_data.residual[: s.repeats, s.where]
+        noise = repeats - repeats.mean(axis=0) + residual[s.where] / np.sqrt(s.repeats)
         for part in np.unique(label):
-            here = label == part
-            information = own[here].T @ own[here]
+            in_group = label == part
+            information = weighted[in_group].T @ weighted[in_group]
             for repeat in range(s.repeats):
                 key = (strata[s.group], repeat, int(part))
-                score = own[here].T @ left[repeat, here]
+                score = weighted[in_group].T @ noise[repeat, in_group]
                 before = pieces.get(key, (0.0, 0.0))
                 pieces[key] = (score + before[0], information + before[1])
     keys = np.array(list(pieces), dtype=np.int64)
@@ -120,9 +120,9 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         effects = [(u.term, u.shape) for u in other.terms if isinstance(u.term, Effect)]
         if any(e.problem(rig, values, s) or e.outside(rig, s) for e, s in effects):
             continue
-        left = fit.residual[contribution(train_data, fit, used) != 0.0]
-        own = max(float(left @ left) - len(left), TRACE.form_noise)
-        share = own / (own + max(0.0, other.energy - fit.energy))
+        residual = fit.residual[contribution(train_data, fit, used) != 0.0]
+        excess = max(float(residual @ residual) - len(residual), TRACE.form_noise)
+        share = excess / (excess + max(0.0, other.energy - fit.energy))
         incomparable = _of_other_meaning(rig, fit, other)
         for name, value in other.beta.items():
             if name in incomparable:
@@ -156,11 +156,11 @@ def _growth_shift_squares(train_data: RegressionData, fit: ExactFit) -> dict[str
         size = float(np.sqrt(np.mean(x[x != 0.0] ** 2))) if x.any() else 1.0
         column = x * np.abs(x) / size
         moved = np.linalg.lstsq(X / scale, column, rcond=1e-6)[0]
-        own = column - X @ (moved / scale)
-        energy = float(own @ own)
+        projected = column - X @ (moved / scale)
+        energy = float(projected @ projected)
         if energy <= SEARCH.least_projected_length**2 * float(column @ column):
             continue
-        e = float(own @ fit.residual) / energy
+        e = float(projected @ fit.residual) / energy
         if abs(e) * np.sqrt(energy) > TRACE.standard_errors:
             for name, shift in zip(names, e * moved / scale, strict=True):
                 squares[name] += float(shift) ** 2
@@ -204,11 +204,11 @@ def with_errors(model: Model, errors: Mapping[str, float]) -> Model:
 
 
 def _variance_from_shapes(
-    train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]
+    train_data: RegressionData, fit: ExactFit, X: Array, coefficients: Sequence[str]
 ) -> Array:
     """Return the variance (k,) of the coefficients of X (M, k) by the covariance of the shapes."""
     names, columns = tangent(train_data, fit)
-    shapes = columns[:, [k for k, n in enumerate(names) if n not in own]]
+    shapes = columns[:, [k for k, n in enumerate(names) if n not in coefficients]]
     shapes = shapes[:, np.linalg.norm(shapes, axis=0) > 0]
     if not shapes.shape[1]:
         return np.zeros(X.shape[1])

@@ -1,10 +1,9 @@
-"""What differs between repeats beyond sensor noise: notes on it, and torques of another phase.
+"""Scatter between repeats beyond sensor noise: notes on it, and periodic torques of any phase.
 
-A pump, a neighbouring machine or an intermittent fault acts with another phase in every repeat.
-It is then part of the noise floor and leaves no repeatable residual. If it is a torque at one
-frequency, that is named: the scatter between the repeats shows the frequency, and a sine of free
-amplitude and phase is fitted to every record of that torque balance and subtracted. The effect's
-size is the amplitude, which must be the same in all records.
+A pump, a neighbouring machine or an intermittent fault acts with another phase in every repeat: it
+counts as noise and leaves no repeatable residual. A torque at one frequency is named: the scatter
+between the repeats shows the frequency, and a sine of free amplitude and phase is fitted to every
+record of that torque balance and subtracted. The amplitude must be the same in all records.
 """
 
 from __future__ import annotations
@@ -54,15 +53,15 @@ def unlocked_lines(data: RegressionData) -> tuple[Line, ...]:
         floor = repeated.get((s.group, s.equation))
         if floor is not None and floor.noise > DATA.line_ratio * floor.stated:
             scattered.setdefault(s.equation, []).append(s)
-    found: dict[str, float] = {}
+    frequencies: dict[str, float] = {}
     for e, segments in scattered.items():
         f, share = dominant_frequency([scatter(data, s) for s in segments])
         if share > DATA.unrepeated_share:
-            found[e] = f
+            frequencies[e] = f
     out = []
-    for e, f in found.items():
+    for e, f in frequencies.items():
         joint = joint_of(e)
-        others = [g for other, g in found.items() if other != e]
+        others = [g for other, g in frequencies.items() if other != e]
         velocities = [_velocity(data, s, joint) for s in scattered[e]]
         length = max(float(time[-1] - time[0]) for time, _ in velocities)
         if (
@@ -109,23 +108,23 @@ class _LineFit:
 def _fitted(
     rig: Rig, conditioned: ConditionedRecord, fit: ExactFit, line: Line, chosen: bool
 ) -> _LineFit | None:
-    """Fit a sine to a model's residual in one record, None where the joint is locked.
+    """Fit a sine to a model's residual in one record; return None where the joint is locked.
 
-    `chosen`: leave out the rows that judge.
+    `chosen`: leave out the judging rows.
     """
     rows = model_rows(rig, fit.terms, conditioned).get(equation("torque", line[0]))
     if rows is None or len(rows.time) < TRACE.least_rows:
         return None
     with_line = replace(conditioned.filtering, lines=(line,))
-    left, sines = row_residual(rows, fit.beta), sines_at(rows, conditioned.signals, with_line)
-    rest = without_sines(left, sines)
-    waves = np.linalg.lstsq(sines, left, rcond=None)[0]
-    noise = float(np.sqrt(rest @ rest / max(len(rest) - len(WAVES), 1)))
-    size = math.sqrt(float(np.sum(sines**2)) / len(WAVES))
-    used = ~in_judging_block(rows.time) if chosen else np.ones(len(rest), dtype=bool)
+    residual, sines = row_residual(rows, fit.beta), sines_at(rows, conditioned.signals, with_line)
+    after = without_sines(residual, sines)
+    waves = np.linalg.lstsq(sines, residual, rcond=None)[0]
+    noise = float(np.sqrt(after @ after / max(len(after) - len(WAVES), 1)))
+    sine_norm = math.sqrt(float(np.sum(sines**2)) / len(WAVES))
+    used = ~in_judging_block(rows.time) if chosen else np.ones(len(after), dtype=bool)
     return _LineFit(
         conditioned.group, float(rows.time[-1] - rows.time[0]), float(np.hypot(*waves)),
-        noise / size, float(left[used] @ left[used]), float(rest[used] @ rest[used]),
+        noise / sine_norm, float(residual[used] @ residual[used]), float(after[used] @ after[used]),
         int(used.sum()),
     )  # fmt: skip
 
@@ -146,21 +145,21 @@ def judged_line(
     the held-out records, SI.
     """
     joint, frequency = line
-    own = [f for c in train if (f := _fitted(rig, c, fit, line, False)) is not None]
-    unseen = [
-        f for c in holdout if (f := _fitted(rig, c, fit, line, c.group in divided)) is not None
-    ]
-    amplitude = _mean_amplitude(rig, joint, own)
-    before, after = sum(f.before for f in unseen), sum(f.after for f in unseen)
-    quiet = noise**2 * sum(f.count for f in unseen)
+    fits = [_fitted(rig, c, fit, line, False) for c in train]
+    train_fits = [f for f in fits if f is not None]
+    fits = [_fitted(rig, c, fit, line, c.group in divided) for c in holdout]
+    held_out_fits = [f for f in fits if f is not None]
+    amplitude = _mean_amplitude(rig, joint, train_fits)
+    before, after = sum(f.before for f in held_out_fits), sum(f.after for f in held_out_fits)
+    quiet = noise**2 * sum(f.count for f in held_out_fits)
     removed = 1.0 - max(0.0, after - quiet) / (before - quiet) if before > quiet else 0.0
     tolerance = TRACE.invariance_tolerance * amplitude.value
     differing = [
         f"{plain(f.amplitude, 2)} in {f.group[1]}"
-        for f in own
+        for f in train_fits
         if abs(f.amplitude - amplitude.value) > max(tolerance, TRACE.standard_errors * f.error)
     ]
-    p = _probability(own)
+    p = _probability(train_fits)
     limit, effect = torque_limit(rig, joint), PeriodicDisturbance(f"joint {joint + 1}")
     size = f"amplitude {plain(amplitude.value, 2)} of the {plain(limit, 2)} that may be"
     share = f"{100 * removed:.0f} % of the energy above noise"
@@ -172,8 +171,8 @@ def judged_line(
         Gate(SIGNIFICANT, p <= TRACE.p_limit, f"p = {p:.3g} over all frequencies"),
         Gate(NO_RIVAL, True, "its phase does not follow the excitation, as effects of motion do"),
     )
-    error = _frequency_error(own, amplitude.value)
-    scale = noise * math.sqrt(max(sum(f.count for f in unseen), 1))
+    error = _frequency_error(train_fits, amplitude.value)
+    scale = noise * math.sqrt(max(sum(f.count for f in held_out_fits), 1))
     parameters = {
         f"T_amplitude_{joint + 1}": amplitude,
         effect.shape_names()[0]: _estimate(frequency, "Hz", error),
@@ -185,31 +184,31 @@ def judged_line(
     )  # fmt: skip
 
 
-def _mean_amplitude(rig: Rig, joint: int, own: Sequence[_LineFit]) -> Estimate:
+def _mean_amplitude(rig: Rig, joint: int, fits: Sequence[_LineFit]) -> Estimate:
     """Return the mean amplitude; its error includes the scatter between records beyond noise."""
-    weight = np.array([1.0 / f.error**2 for f in own])
-    values = np.array([f.amplitude for f in own])
-    spread = float(values.std(ddof=1)) / math.sqrt(len(own))
+    weight = np.array([1.0 / f.error**2 for f in fits])
+    values = np.array([f.amplitude for f in fits])
+    spread = float(values.std(ddof=1)) / math.sqrt(len(fits))
     unit = PeriodicDisturbance(f"joint {joint + 1}").coefficients(rig)[0].unit
     mean = float(weight @ values / weight.sum())
     return _estimate(mean, unit, max(spread, 1.0 / math.sqrt(float(weight.sum()))))
 
 
-def _probability(own: Sequence[_LineFit]) -> float:
+def _probability(fits: Sequence[_LineFit]) -> float:
     """Return Fisher's probability that noise has as large a line at any frequency."""
-    share = 1.0 - sum(f.after for f in own) / max(sum(f.before for f in own), 1e-300)
-    count = sum(f.count for f in own) / 2
+    share = 1.0 - sum(f.after for f in fits) / max(sum(f.before for f in fits), 1e-300)
+    count = sum(f.count for f in fits) / 2
     return float(min(1.0, count * (1.0 - share) ** (count - 1.0)))
 
 
-def _frequency_error(own: Sequence[_LineFit], amplitude: float) -> float:
+def _frequency_error(fits: Sequence[_LineFit], amplitude: float) -> float:
     """Return the standard error of the frequency [Hz] of sines of free phase in several records.
 
     Of a record of T seconds it is sqrt(12) / (2 pi T) times the phase's error (Rife and Boorstyn,
     1974).
     """
-    known = sum((2 * math.pi * f.seconds * amplitude / f.error) ** 2 / 12.0 for f in own)
-    return 1.0 / math.sqrt(known)
+    information = sum((2 * math.pi * f.seconds * amplitude / f.error) ** 2 / 12.0 for f in fits)
+    return 1.0 / math.sqrt(information)
 
 
 def _estimate(value: float, unit: str, std: float) -> Estimate:
@@ -217,18 +216,18 @@ def _estimate(value: float, unit: str, std: float) -> Estimate:
     return Estimate(value, unit, std, (value - half, value + half))
 
 
-def phase_notes(named: Sequence[JudgedEffect], lines: Sequence[Line]) -> list[str]:
+def phase_notes(effects: Sequence[JudgedEffect], lines: Sequence[Line]) -> list[str]:
     """Return a note for each named torque whose phase differs between records."""
     of_joint = {f"joint {joint + 1}": (joint, f) for joint, f in lines}
-    found = [
+    named_lines = [
         of_joint[e.where]
-        for e in named
+        for e in effects
         if e.name == PeriodicDisturbance.name and e.where in of_joint
     ]
     return [
         f"{equation('torque', joint)}: the torque at {plain(f, 3)} Hz has another phase in each "
         "record; it is fitted to each record separately, and models and free runs leave it out"
-        for joint, f in found
+        for joint, f in named_lines
     ]
 
 
@@ -289,10 +288,10 @@ def dominant_frequency(parts: Sequence[tuple[Array, Array]]) -> tuple[float, flo
     """
     length = max(float(time[-1] - time[0]) for time, _ in parts)
     highest = 0.5 / float(np.median(np.diff(parts[0][0])))
-    whole = sum(float(np.sum(series**2)) for _, series in parts)
+    total = sum(float(np.sum(series**2)) for _, series in parts)
 
     def share(frequency: Array) -> Array:
-        return np.asarray(sum(_sine_energy(t, series, frequency) for t, series in parts) / whole)
+        return np.asarray(sum(_sine_energy(t, series, frequency) for t, series in parts) / total)
 
     frequency = np.arange(2.0 / length, highest, 0.25 / length)
     coarse = float(frequency[np.argmax(share(frequency))])
@@ -312,8 +311,8 @@ def _sine_energy(time: Array, series: Array, frequency: Array) -> Array:
     cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
     a, b = series @ c, series @ s
     fitted = (ss * a * a - 2 * cs * a * b + cc * b * b).sum(axis=0)
-    both = cc * ss - cs * cs
-    # Of instants at half the sampling rate or a multiple, sine and cosine are one column.
-    one = both < SAME_COLUMN * (cc + ss) ** 2
-    single = (a * a + b * b).sum(axis=0) / (cc + ss)
-    return np.asarray(np.where(one, single, fitted / np.where(one, 1.0, both)))
+    determinant = cc * ss - cs * cs
+    # At multiples of half the sampling rate, sine and cosine are one column.
+    single = determinant < SAME_COLUMN * (cc + ss) ** 2
+    energy = (a * a + b * b).sum(axis=0) / (cc + ss)
+    return np.asarray(np.where(single, energy, fitted / np.where(single, 1.0, determinant)))
