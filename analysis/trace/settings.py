@@ -22,25 +22,25 @@ class TraceSettings:
     # Gates of an effect.
     least_removed: float = 0.5
     """Least share of the held-out energy above noise that an effect removes in the equations where
-    it acts: a cause removes most of it."""
+    it acts (convention: a cause removes most of it)."""
     least_removed_beside: float = 0.75
-    """Least share of the repeatable energy that an effect removes in its own equations where
-    another cause stays unknown: a wrong effect imitates half of it (a dead volume a cross-talk of
-    0.7, on a plant written apart from the study's)."""
+    """Least share of the repeatable energy that an effect removes in its own equations beside an
+    unknown cause (tuned: a wrong effect removes half of it, such as a dead volume for a cross-talk
+    of 0.7, on a plant written apart from the study's)."""
     p_limit: float = 0.01
     """Largest family-wise p over all candidates and shapes (convention)."""
     tie_ratio: float = 1.10
     """Held-out rms of a rival over that of the best set: a rival with less is tied (tuned). For an
     effect that removes less energy than remains, the ratio applies to what the effect removes."""
     tie_ratio_training: float = 1.25
-    """Training rms of a rival over that of the best set: a tied rival must have less, since one
-    that fits the training records worse has another size (tuned)."""
+    """Largest training rms of a tied rival over that of the best set: one that fits the training
+    records worse is no alternative (tuned)."""
     decisive_ratio: float = 0.95
     """Held-out rms of a rival over that of the best set: a rival with less is tied whatever its
     training rms (tuned)."""
     harm_ratio: float = 1.2
-    """Energy above noise of an equation with an effect over that under the baseline: with more, the
-    effect is refused (tuned)."""
+    """Largest energy above noise of an equation with an effect over that under the baseline, beyond
+    which the effect is refused (tuned)."""
     # Residual that may remain.
     held_out_share: float = 0.05
     """Largest remaining share of an equation's held-out energy above noise under the baseline;
@@ -70,10 +70,10 @@ class TraceSettings:
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
     breakaway_speed: float = 0.3
-    """Speed of a joint over its rms speed, below which a breakaway is looked for, and from which
-    samples in motion have their whole weight where one is found."""
+    """Speed of a joint over its rms speed, below which friction may be a breakaway; where one is
+    found, samples have full weight from this speed on."""
     breakaway_rows: float = 0.02
-    """Share of the rows near standstill that may have larger friction."""
+    """Share of the rows near standstill that may exceed the stated friction there."""
     breakaway_ratio: float = 1.25
     """Friction near standstill over the level in motion, from which there is a breakaway (tuned: at
     most 1.2 for one level, 1.27 to 2.3 with a breakaway of twice the level and more above it)."""
@@ -87,8 +87,8 @@ class TraceSettings:
     """Standard deviations of its noise from which an effect too small to be named widens intervals
     (tuned: on 19 benches with nothing hidden the largest of all effects was at most 3.9)."""
     visible_share: float = 0.005
-    """Share of an equation's energy above noise under the baseline from which the same is done: a
-    friction beside a stiff spring left 1 % (tuned)."""
+    """Remaining share of an equation's energy above noise under the baseline, from which a further
+    effect is searched for in it (tuned: a friction beside a stiff spring left 1 %)."""
     clue_share: float = 0.1
     """Share of the remaining energy of all equations, below which an equation is not searched for
     clues (tuned)."""
@@ -97,13 +97,13 @@ class TraceSettings:
     """Relative difference of a size between parts of the rows that a catalogue's simpler form may
     cause (tuned)."""
     standard_errors: float = 3.5
-    """Standard errors by which a size must differ in a part of the rows, and standard deviations of
-    noise that held-out records must lose by a simpler name or a rival, to count (convention: 1 in
-    2000, for some 10 parts)."""
+    """Standard errors from which a size differs in a part of the rows, and standard deviations of
+    noise from which a simpler name or a rival loses in held-out records (convention: probability 1
+    in 2000, for some 10 parts)."""
     informative_share: float = 0.12
-    """Share of a column's energy, orthogonal to all other columns, that a part of the rows must
-    hold to be judged: a part with less shows the tail of the form, not the size (tuned: tails of
-    seals reach 0.09, wrong names show from 0.2 on)."""
+    """Least share of a column's energy, orthogonal to all other columns, in a part of the rows that
+    is judged: one with less shows the tail of the form, not the size (tuned: tails of seals reach
+    0.09, wrong names show from 0.2 on)."""
     separable_share: float = 0.01
     """Share of a column's energy that the effect's other columns cannot make: with less the whole
     effect is judged, not this number (convention: a variance inflation factor of 100)."""
@@ -144,14 +144,14 @@ class TraceSettings:
     least_rows: int = 40
     """Least number of rows of an equation in one step (arithmetic)."""
     most_rivals: int = 4
-    """Largest number of rivals in a result, but for tied ones: all are listed."""
+    """Largest number of rivals in a result; tied ones are all listed."""
     noted_shift: float = 0.01
     """Relative change of a parameter from which it matters: by an effect at its detection limit, by
     the fit to held-out rows, or by a rival in place of a named effect (tuned: with good excitation
     no detection limit reaches it)."""
     open_share: float = 0.02
-    """Half-width of a parameter's 95 % interval over its value from which another name of the same
-    law leaves the parameter open, and so is a rival (the error that parameters may keep)."""
+    """Half-width of a parameter's 95 % interval under another name of the same law, over its value,
+    from which that name is a rival (contract: the error that parameters may have)."""
     most_detection_limits: int = 3
     """Largest number of detection limits in the notes."""
     eigenvalue_ratio: float = 1e-10
@@ -171,8 +171,8 @@ class DataSettings:
     """[s] Length of a block of a held-out record, of which the second of every three only judges
     (arithmetic: ten times the row filter's memory, and a short record still has several)."""
     other_motion: float = 0.2
-    """Difference of a joint's position between repeats over its standard deviation, from which they
-    are no repeats of one motion (recordings that start 0.4 s apart made clean benches
+    """Rms difference of a joint's position between repeats over its standard deviation, from which
+    they are no repeats of one motion (tuned: recordings that start 0.4 s apart made clean benches
     `unexplained` on a plant written apart from the study's)."""
     seen_motion: float = 20.0
     """Least standard deviation of a position over its sensor's noise, to be compared between
@@ -192,8 +192,8 @@ class DataSettings:
     """What the model leaves over the stated noise, up to which it counts as noise where nothing
     repeats and it follows no variable of the records (convention: twice, and its scatter)."""
     unstated_clue: float = 0.25
-    """Share of that energy which a variable removes from held-out records, from which it does not
-    count as noise: noise in the regressors itself makes 0.1 (tuned)."""
+    """Share of that energy which a variable removes from held-out records, from which it is no
+    noise (tuned: noise in the regressors alone makes 0.1)."""
     unrepeated_share: float = 0.5
     """Share of that scatter's energy at one frequency, from which the note states the frequency
     (convention)."""
@@ -267,7 +267,7 @@ class SearchSettings:
     """Search for the set of effects that explains the residual."""
 
     band: float = 0.7
-    """Repeatable rms of an equation over its noise, below which there is nothing to explain
+    """Repeatable rms of an equation over its noise, up to which the residual counts as noise
     (tuned)."""
     residual_limit: float = 1.0
     """Repeatable rms of an equation over its noise that an explanation may leave (tuned)."""
@@ -277,15 +277,15 @@ class SearchSettings:
     exact_trials: int = 3
     """Number of candidates that are refined of those tried by exact columns (tuned)."""
     negative_share: float = 0.1
-    """Least size of a negative inertia or weight over its value in the baseline's fit, to be
-    impossible (a spring for an inclination of 0.3 rad made a weight of 206 kg m one of -243, on a
-    plant written apart from the study's)."""
+    """Absolute value of a negative inertia or weight over its value in the baseline's fit, from
+    which it is impossible (tuned: a spring in place of an inclination of 0.3 rad turned a weight of
+    206 kg m into -243, on a plant written apart from the study's)."""
     add_share: float = 0.3
     """Least share of the remaining energy, in the equations where an effect acts, that the effect
     must remove to be added (tuned)."""
     further_share: float = 0.1
     """Largest share of tolerated remainders that a further effect may leave to be added although it
-    cannot be separated from another (a dead volume beside a leak, of which 25 % stayed)."""
+    cannot be separated from another (tuned: a dead volume beside a leak, of which 25 % stayed)."""
     simpler_ratio: float = 1.25
     """Largest remaining energy of a simpler set over that of the best one, as a product over
     equations, at which the simpler set is chosen (tuned)."""
@@ -304,8 +304,8 @@ class SearchSettings:
     """Length of a column orthogonal to the baseline's columns over its whole length, from which the
     first-order column of a signal change shows: less may be of second order (arithmetic)."""
     least_exact_length: float = 0.003
-    """The same for the column of a coefficient, which has no error of first order: a torque offset
-    on a joint that turns by 0.8 rad has 0.03 (arithmetic)."""
+    """The same length for the column of a coefficient, which is exact: a torque offset on a joint
+    that turns by 0.8 rad has 0.03 (arithmetic)."""
     size_ratio: float = 3.0
     """Largest fitted size over the size for which the first-order column of a signal change was
     computed; smaller sizes are closer to linear (tuned)."""
@@ -341,8 +341,8 @@ class SearchSettings:
     """Shares of its size by first-order columns at one of which a new effect begins
     (arithmetic)."""
     first_steps: int = 3
-    """Number of steps of a refinement, and of its continuation, after which it is asked whether the
-    set is promising."""
+    """Number of steps of a refinement, and of its continuation, after which an unpromising set is
+    given up."""
     unpromising_ratio: float = 10.0
     """Energy of a set over that of the set that it may replace, above which it is unpromising."""
     promising_drop: float = 0.5
@@ -369,11 +369,10 @@ class SearchSettings:
     """Share of an equation's energy above noise that a set removes, from which a free form must
     explain that equation (tuned)."""
     most_deviations: float = 3.0
-    """Standard uncertainties by which a number of the rig file with a tolerance may be wrong
-    (convention: three standard deviations)."""
+    """Largest deviation of a number of the rig file, in its standard uncertainties (convention)."""
     independent_rows: float = 0.03
-    """Share of the rows whose noise is independent, since the row filter correlates it (tuned: with
-    it a geometry drawn within its tolerances comes out nearest to the true one)."""
+    """Share of the rows with independent noise, since the row filter correlates it (tuned: with it
+    a geometry drawn within its tolerances is estimated best)."""
     free_form_near: float = 2.0
     """Remaining energy over the least of all sets with a free form: of the sets with less, the
     simplest is judged first (tuned)."""
@@ -388,13 +387,13 @@ class ClueSettings:
     least_share: float = 0.05
     """Share of the held-out energy above noise below which a variable is no clue (tuned)."""
     by_balance_weight: float = 0.3
-    """Weight, in the order of clues, of a variable that follows by the equation's own balance
-    whatever the equation lacks (tuned)."""
+    """Weight, in the order of clues, of a variable that the equation's own balance makes follow any
+    missing term (tuned)."""
     spool_weight: float = 0.6
     """Weight of the spool in a torque: it acts through the pressures (tuned)."""
     chamber_lead: float = 0.2
-    """Share that one chamber's pressure must remove beyond the pressure difference, to count as not
-    following by balance (tuned)."""
+    """Share that one chamber's pressure must remove beyond the pressure difference to have full
+    weight (tuned)."""
     product_gain: float = 0.05
     """Share that a product of two variables must remove beyond either of them (tuned)."""
     direction_speed: float = 0.1
@@ -462,8 +461,7 @@ class ExperimentSettings:
     repeats: int = 4
     """Number of repeats of each training record."""
     held_out_amplitude: float = 0.85
-    """Amplitude of held-out over training records: what shows at the limits disappears soon below
-    them."""
+    """Amplitude of held-out over training records: some effects show near the limits only."""
     held_out_repeats: int = 3
     """Number of repeats of each held-out record."""
     line_ratio: float = 5.0
@@ -475,16 +473,16 @@ class ExperimentSettings:
     """Least separation, or range of a variable, that an experiment promises over that of the
     records (tuned)."""
     useful_separation: float = 3.0
-    """Separation over the noise beyond which more shows no more (convention)."""
+    """Separation over the noise beyond which more adds no information (convention)."""
     steps: int = 3
     """Largest number of steps of an experiment."""
     least_step_gain: float = 0.3
     """Separation over the noise, summed over questions, that a further step must add (tuned)."""
     near_energy: float = 2.0
-    """Remaining energy of a set over that of the best one, up to which the set is still in question
-    (tuned)."""
+    """Remaining energy of a set over that of the best one, up to which the experiment is to
+    separate the two (tuned)."""
     rivals: int = 3
-    """Largest number of sets in question beside the best one."""
+    """Largest number of sets that an experiment is to separate from the best one."""
     parameter_ratio: float = 2.0
     """Largest ratio of an estimated parameter to its nominal value, and of the nominal value to it,
     at which the twin uses the estimate."""
