@@ -306,7 +306,7 @@ class Trace:
         return (after - floor) / max(before - floor, 1e-30)
 
     @property
-    def moves_with(self) -> tuple[str, ...]:
+    def residual_variables(self) -> tuple[str, ...]:
         """The variables that the remaining residual depends on, strongest first, each once."""
         names = [name for d in self.depends_on for name in (d.variable, d.by) if name]
         return tuple(dict.fromkeys(names))
@@ -340,7 +340,7 @@ def to_json(result: Trace) -> dict[str, Any]:
         },
         "unexplained": {
             "fraction": finite(result.unexplained_fraction),
-            "depends_on": list(result.moves_with),
+            "depends_on": list(result.residual_variables),
             "shares": {d.text: finite(d.share) for d in result.depends_on},
             "formulas": [
                 {

@@ -7,10 +7,10 @@ It is judged on the other set, by the share of the energy above noise that it re
 variable (Hastie and Tibshirani's varying coefficients): the direction of motion, with and without
 memory, the velocity, the pressure difference, the spool.
 
-Or the residual repeats at one frequency, whatever the joint does: hum of a pump, of the mains, of a
-control loop. Most of the power of the training residual lies at one line although the excitation
-has many. The frequency is searched around that line and judged on the held-out records, where a
-sine and a cosine of it, with a phase for each record, must remove most of the energy above noise.
+A residual may also repeat at one frequency independent of the motion: hum of a pump, of the mains,
+of a control loop. Then most of the power of the training residual lies at one line although the
+excitation has many. The frequency is searched around that line and judged on the held-out records,
+where a sine of it, with a phase for each record, must remove most of the energy above noise.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ from rig.model import channels as ch
 
 Array = NDArray[np.float64]
 
-# An equation's own balance makes these variables follow whatever the equation lacks, so that they
-# are no sign of a cause.
+# Variables that the equation's balance makes follow any missing term: they do not show the cause.
 FOLLOW_BY_BALANCE = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
 
 
@@ -50,30 +49,30 @@ def clues_to(
     train_data: RegressionData,
     holdout_data: RegressionData,
     winner: Hypothesis,
-    split: Sequence[SpectralLines],
+    lines: Sequence[SpectralLines],
 ) -> tuple[tuple[Dependence, ...], tuple[Formula, ...]]:
     """Return the variables that the remaining residual follows, strongest first, and formulas.
 
-    `split` are the spectral lines of the training residual.
+    `lines` are the spectral lines of the training residual.
     """
-    residual, held_residual = winner.fit.residual, held_out_residual(holdout_data, winner.fit)
+    residual, held_out_residuals = winner.fit.residual, held_out_residual(holdout_data, winner.fit)
     train_rows, holdout_rows = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     equations = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in equations)
     equations = [e for e in equations if winner.excess_energy[e] > TRACE.clue_share * total]
     sides = []
     for e in equations:
-        first = equation_rows(train_rows, residual, e)
-        second = equation_rows(holdout_rows, held_residual, e)
-        if first is not None and second is not None:
-            sides.append(EquationSides(train_data.rig, e, first, second))
+        train = equation_rows(train_rows, residual, e)
+        held_out = equation_rows(holdout_rows, held_out_residuals, e)
+        if train is not None and held_out is not None:
+            sides.append(EquationSides(train_data.rig, e, train, held_out))
     weight = {e: v for e, v in winner.excess_energy.items() if e in equations}
-    moves = dependences(sides, weight)
-    hum = frequency_clue(split, train_data, residual, holdout_data, held_residual)
-    formulas = tuple(found for found in map(formula, sides) if found is not None)
-    surest = _formula_clue(formulas) if hum is None else [hum]
-    listed = {d.variable for d in surest}
-    return (*surest, *(d for d in moves if d.variable not in listed)), formulas
+    variables_found = dependences(sides, weight)
+    frequency = frequency_clue(lines, train_data, residual, holdout_data, held_out_residuals)
+    formulas = tuple(sparse for sparse in map(formula, sides) if sparse is not None)
+    leading = _formula_clue(formulas) if frequency is None else [frequency]
+    listed = {d.variable for d in leading}
+    return (*leading, *(d for d in variables_found if d.variable not in listed)), formulas
 
 
 def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
@@ -90,11 +89,11 @@ def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
 def hat_functions(v: Array, knots: Array) -> Array:
     """Return the hat functions (n, k) of a piecewise linear curve with the given knots."""
     out = np.zeros((len(v), len(knots)))
-    place = np.clip(np.searchsorted(knots, v) - 1, 0, len(knots) - 2)
-    share = np.clip((v - knots[place]) / (knots[place + 1] - knots[place]), 0.0, 1.0)
-    at = np.arange(len(v))
-    out[at, place] = 1.0 - share
-    out[at, place + 1] = share
+    interval = np.clip(np.searchsorted(knots, v) - 1, 0, len(knots) - 2)
+    share = np.clip((v - knots[interval]) / (knots[interval + 1] - knots[interval]), 0.0, 1.0)
+    rows = np.arange(len(v))
+    out[rows, interval] = 1.0 - share
+    out[rows, interval + 1] = share
     return out
 
 
@@ -107,26 +106,27 @@ def dependences(sides: Sequence[EquationSides], weight: Mapping[str, float]) -> 
     """
     total = sum(weight.values()) or 1.0
     shares: dict[tuple[str, str], dict[str, float]] = {}
-    for both in sides:
-        for key, share in _curve_shares(both).items():
-            shares.setdefault(key, {})[both.equation] = share
+    for side in sides:
+        for key, share in _curve_shares(side).items():
+            shares.setdefault(key, {})[side.equation] = share
     sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in shares.items()}
-    out: list[tuple[float, Dependence]] = []
+    ranked: list[tuple[float, Dependence]] = []
     for (name, factor), by in shares.items():
         share = sums[name, factor]
-        parts = [sums.get(part, 0.0) for part in ((name, ""), ("", factor))]
-        product = name and factor
-        if share < CLUES.least_share or (product and share < max(parts) + CLUES.product_gain):
+        least = CLUES.least_share
+        if name and factor:  # a product must remove more than either variable alone
+            alone = max(sums.get(part, 0.0) for part in ((name, ""), ("", factor)))
+            least = max(least, alone + CLUES.product_gain)
+        if share < least:
             continue
         equation = max(by, key=lambda e: by[e])
         independence = 1.0 if factor else _independence_weight(name, equation, sums)
-        out.append(
-            (share * independence, _dependence_of(name, factor, share, equation, independence))
-        )
-    best: dict[str, Dependence] = {}
-    for _, clue in sorted(out, key=lambda pair: -pair[0]):
-        best.setdefault(clue.variable, clue)
-    return list(best.values())
+        clue = _dependence_of(name, factor, share, equation, independence)
+        ranked.append((share * independence, clue))
+    strongest: dict[str, Dependence] = {}
+    for _, clue in sorted(ranked, key=lambda pair: -pair[0]):
+        strongest.setdefault(clue.variable, clue)
+    return list(strongest.values())
 
 
 def _dependence_of(
@@ -166,20 +166,20 @@ def _independence_weight(
 def _curve_shares(sides: EquationSides) -> dict[tuple[str, str], float]:
     """Return the explained share of every curve, factor (variable '') and product of both.
 
-    Each is fitted on one side and judged on the other, both ways round, and the larger share is
-    used: a curve fitted to small motions does not predict large ones, but the reverse does.
+    Each is fitted to either side and judged on the other, and the larger share counts: a curve
+    fitted to small motions does not predict large ones, but the reverse does.
     """
-    first, second, every, joint = sides.first, sides.second, sides.parts, sides.joint
-    values = [variables(sides.rig, p.signals, joint) for p in every]
-    by = factors(sides.equation)
+    train, held_out, parts, joint = sides.train, sides.held_out, sides.parts, sides.joint
+    values = [variables(sides.rig, p.signals, joint) for p in parts]
+    by, travel = factors(sides.equation), sides.travel
     scales = [
-        {f: v[f] if f in v else factor_of(f, p.signals, joint, sides.travel) for f in by}
-        for v, p in zip(values, every, strict=True)
+        {f: v[f] if f in v else factor_of(f, p.signals, joint, travel) for f in by}
+        for v, p in zip(values, parts, strict=True)
     ]
-    curves: dict[str, list[Array]] = {"": [np.ones((len(p.signals.t), 1)) for p in every]}
+    curves: dict[str, list[Array]] = {"": [np.ones((len(p.signals.t), 1)) for p in parts]}
     for name in values[0]:
         moving = [
-            v[name] for v, p in zip(values, every, strict=True)
+            v[name] for v, p in zip(values, parts, strict=True)
             if joint + 1 not in p.conditioned.record.locked
         ]  # fmt: skip
         knots = _knots(np.concatenate(moving)) if moving else None
@@ -188,17 +188,13 @@ def _curve_shares(sides: EquationSides) -> dict[tuple[str, str], float]:
     out = {}
     for name, curve in curves.items():
         for factor in ("", *by) if name else by:
-            made = (
-                [c * s[factor][:, None] for c, s in zip(curve, scales, strict=True)]
-                if factor
-                else curve
-            )
-            one, two = sides.columns(made)
-            out[name, factor] = max(
-                0.0,
-                explained_share(one, first, two, second),
-                explained_share(two, second, one, first),
-            )
+            products = curve
+            if factor:
+                products = [c * s[factor][:, None] for c, s in zip(curve, scales, strict=True)]
+            columns, held_out_columns = sides.columns(products)
+            forward = explained_share(columns, train, held_out_columns, held_out)
+            backward = explained_share(held_out_columns, held_out, columns, train)
+            out[name, factor] = max(0.0, forward, backward)
     return out
 
 
@@ -224,13 +220,13 @@ def frequency_clue(
     `residual` (M,) and `holdout_residual` are the whitened residuals of the averaged training and
     held-out records.
     """
-    for own in sorted(lines, key=lambda own: -own.above_noise_after):
-        near = _peak_frequency(own) if own.above_noise_after >= 1.0 else None
-        if near is None:
+    for spectrum in sorted(lines, key=lambda spectrum: -spectrum.above_noise_after):
+        peak = _peak_frequency(spectrum) if spectrum.above_noise_after >= 1.0 else None
+        if peak is None:
             continue
-        e, width = own.equation, own.frequency[1]
-        tried = np.linspace(near - width, near + width, CLUES.frequency_steps).tolist()
-        f = max(tried, key=functools.partial(_energy_of_sine, train, residual, e))
+        e, spacing = spectrum.equation, spectrum.frequency[1]
+        frequencies = np.linspace(peak - spacing, peak + spacing, CLUES.frequency_steps).tolist()
+        f = max(frequencies, key=functools.partial(_energy_of_sine, train, residual, e))
         energy = energy_above_noise(holdout_data, holdout_residual)[e]
         share = _energy_of_sine(holdout_data, holdout_residual, e, f) / max(energy, 1e-300)
         if energy > 0 and share >= CLUES.frequency_share:
@@ -247,10 +243,10 @@ def _peak_frequency(lines: SpectralLines) -> float | None:
     k = int(np.argmax(power))
     if k < CLUES.first_line:
         return None
-    here = slice(k - CLUES.side_lines, k + CLUES.side_lines + 1)
-    if power[here].sum() < CLUES.peak_share * power.sum():
+    around_peak = slice(k - CLUES.side_lines, k + CLUES.side_lines + 1)
+    if power[around_peak].sum() < CLUES.peak_share * power.sum():
         return None
-    return float(np.average(lines.frequency[here], weights=power[here]))
+    return float(np.average(lines.frequency[around_peak], weights=power[around_peak]))
 
 
 def _energy_of_sine(data: RegressionData, residual: Array, equation: str, f: float) -> float:

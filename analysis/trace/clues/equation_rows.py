@@ -48,7 +48,7 @@ class EquationRows:
 
 def equation_rows(data: RegressionData, residual: Array, equation: str) -> EquationRows | None:
     """Return the rows of an equation with its `residual` (M,), None where it has no rows."""
-    parts, rest, base = [], [], []
+    parts, residuals, base = [], [], []
     for s in data.segments:
         if s.equation != equation:
             continue
@@ -56,23 +56,23 @@ def equation_rows(data: RegressionData, residual: Array, equation: str) -> Equat
         signals = prepared_signals(data.rig, data.terms, conditioned)
         weight = float(np.sqrt(s.repeats)) / s.noise
         parts.append(EquationPart(conditioned, rows, signals, weight))
-        rest.append(residual[s.where])
+        residuals.append(residual[s.where])
         base.append(data.base[s.where])
     if not parts:
         return None
     B = orthonormal(np.concatenate(base))
-    r = np.concatenate(rest)
+    r = np.concatenate(residuals)
     return EquationRows(tuple(parts), r - B @ (B.T @ r), B)
 
 
 @dataclass(frozen=True)
 class EquationSides:
-    """One equation's rows of training records (`first`) and of held-out ones (`second`)."""
+    """One equation's rows of training records and of held-out ones."""
 
     rig: Rig
     equation: str
-    first: EquationRows
-    second: EquationRows
+    train: EquationRows
+    held_out: EquationRows
 
     @property
     def joint(self) -> int:
@@ -82,31 +82,31 @@ class EquationSides:
     @property
     def parts(self) -> tuple[EquationPart, ...]:
         """The records' rows of both sides."""
-        return (*self.first.parts, *self.second.parts)
+        return (*self.train.parts, *self.held_out.parts)
 
     @property
     def travel(self) -> float:
         """The joint's largest travel [m, rad] in one record."""
         return max(float(np.ptp(p.conditioned.signals.s[:, self.joint])) for p in self.parts)
 
-    def columns(self, made: Sequence[Array]) -> tuple[Array, Array]:
+    def columns(self, columns: Sequence[Array]) -> tuple[Array, Array]:
         """Return `whitened_columns` of either side, of columns (n, k) for each of `parts`."""
-        count = len(self.first.parts)
-        first, second = made[:count], made[count:]
-        return whitened_columns(self.first, first), whitened_columns(self.second, second)
+        count = len(self.train.parts)
+        first, second = columns[:count], columns[count:]
+        return whitened_columns(self.train, first), whitened_columns(self.held_out, second)
 
 
-def whitened_columns(side: EquationRows, made: Sequence[Array]) -> Array:
+def whitened_columns(side: EquationRows, columns: Sequence[Array]) -> Array:
     """Return columns (m, k): filtered like the rows, whitened, orthogonal to the model's own.
 
-    `made` holds the unfiltered columns (n, k) of each part.
+    `of_part` holds the unfiltered columns (n, k) of each part.
     """
-    stack = []
-    for part, columns in zip(side.parts, made, strict=True):
-        named = {str(k): columns[:, k] for k in range(columns.shape[1])}
+    whitened = []
+    for part, of_part in zip(side.parts, columns, strict=True):
+        named = {str(k): of_part[:, k] for k in range(of_part.shape[1])}
         clue_columns = filtered(named, part.conditioned, part.rows)
-        stack.append(np.column_stack(list(clue_columns.values())) * part.weight)
-    D = np.concatenate(stack)
+        whitened.append(np.column_stack(list(clue_columns.values())) * part.weight)
+    D = np.concatenate(whitened)
     return np.asarray(D - side.base @ (side.base.T @ D))
 
 
@@ -116,16 +116,16 @@ def fitted_coefficients(columns: Array, side: EquationRows) -> Array:
 
 
 def explained_share(
-    fitted: Array, side: EquationRows, judging: Array, other: EquationRows
+    fitted_columns: Array, side: EquationRows, judged_columns: Array, other: EquationRows
 ) -> float:
     """Return the share of energy above noise in `other` that columns fitted to `side` remove.
 
-    `fitted` and `judging` are the same columns on either rows.
+    `fitted_columns` and `judged_columns` are the same columns on either rows.
     """
-    curve = fitted_coefficients(fitted, side)
-    q = other.residual
-    before = float(q @ q) - len(q)
-    after = float(np.sum((q - judging @ curve) ** 2)) - len(q)
+    coefficients = fitted_coefficients(fitted_columns, side)
+    residual = other.residual
+    before = float(residual @ residual) - len(residual)
+    after = float(np.sum((residual - judged_columns @ coefficients) ** 2)) - len(residual)
     return min(1.0, (before - after) / before) if before > 0 else 0.0
 
 

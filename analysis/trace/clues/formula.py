@@ -38,18 +38,21 @@ def surest_formula(formulas: Sequence[Formula]) -> Formula | None:
 
 def formula(sides: EquationSides) -> Formula | None:
     """Return a formula for an equation's residual, None where none removes `CLUES.shown_share`."""
-    rig, equation, first, second = sides.rig, sides.equation, sides.first, sides.second
-    names, fitted, checked = _candidate_monomials(sides)
-    both = EquationRows((), np.concatenate((first.residual, second.residual)), np.zeros((0, 0)))
-    chosen = _selected_columns(np.concatenate((fitted, checked)), both)
-    share = explained_share(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
+    equation, train, held_out = sides.equation, sides.train, sides.held_out
+    names, *columns = _candidate_monomials(sides)
+    both = EquationRows((), np.concatenate((train.residual, held_out.residual)), np.zeros((0, 0)))
+    selected = _selected_columns(np.concatenate(columns), both)
+    if not selected:
+        return None
+    fitted, judged = (side[:, selected] for side in columns)
+    share = explained_share(fitted, train, judged, held_out)
     if share < CLUES.shown_share:
         return None
-    values = fitted_coefficients(fitted[:, chosen], first)
-    terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
+    values = fitted_coefficients(fitted, train)
+    terms = {names[k]: float(v) for k, v in zip(selected, values, strict=True)}
     if is_balance(equation, terms):
         return None
-    at_piston = equation.startswith("torque") and not rig.electric
+    at_piston = equation.startswith("torque") and not sides.rig.electric
     return Formula(equation, terms, share, at_piston)
 
 
@@ -70,21 +73,19 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
 
 def _candidate_monomials(sides: EquationSides) -> tuple[list[str], Array, Array]:
     """Return the monomials' names and columns on either side, nearly equal ones only once."""
-    travel = sides.travel
-    made = [
-        _monomials(sides.rig, sides.equation, part.signals, sides.joint, travel)
-        for part in sides.parts
-    ]
-    names = list(made[0])
-    first, second = sides.columns([np.column_stack([m[n] for n in names]) for m in made])
-    both = np.concatenate((first, second))
-    size = np.linalg.norm(both, axis=0)
-    kept: list[int] = []
+    rig, equation, joint, travel = sides.rig, sides.equation, sides.joint, sides.travel
+    monomials = [_monomials(rig, equation, part.signals, joint, travel) for part in sides.parts]
+    names = list(monomials[0])
+    first, second = sides.columns([np.column_stack([m[n] for n in names]) for m in monomials])
+    columns = np.concatenate((first, second))
+    size = np.linalg.norm(columns, axis=0)
+    distinct: list[int] = []
+    most = CLUES.duplicate_correlation
     for k in np.flatnonzero(size > 1e-12):
-        unit = both[:, k] / size[k]
-        if all(abs(float(unit @ both[:, j])) < CLUES.duplicate_correlation * size[j] for j in kept):
-            kept.append(int(k))
-    return [names[k] for k in kept], first[:, kept], second[:, kept]
+        unit = columns[:, k] / size[k]
+        if all(abs(float(unit @ columns[:, j])) < most * size[j] for j in distinct):
+            distinct.append(int(k))
+    return [names[k] for k in distinct], first[:, distinct], second[:, distinct]
 
 
 def _monomials(
@@ -125,20 +126,20 @@ def _monomials(
 
 def _selected_columns(columns: Array, side: EquationRows) -> list[int]:
     """Return the numbers of the columns selected, in order of selection."""
-    chosen: list[int] = []
+    selected: list[int] = []
     share = 0.0
-    while len(chosen) < min(CLUES.monomials, columns.shape[1]):
-        free = [k for k in range(columns.shape[1]) if k not in chosen]
-        shares = {k: _joint_share([*chosen, k], columns, side) for k in free}
-        best = max(free, key=lambda k: shares[k])
+    while len(selected) < min(CLUES.monomials, columns.shape[1]):
+        others = [k for k in range(columns.shape[1]) if k not in selected]
+        shares = {k: _joint_share([*selected, k], columns, side) for k in others}
+        best = max(others, key=lambda k: shares[k])
         if shares[best] < share + CLUES.monomial_gain:
             break
-        chosen, share = [*chosen, best], shares[best]
-    for k in list(chosen):
-        rest = [j for j in chosen if j != k]
-        if rest and _joint_share(rest, columns, side) > share - CLUES.monomial_gain:
-            chosen = rest
-    return chosen
+        selected, share = [*selected, best], shares[best]
+    for k in list(selected):
+        fewer = [j for j in selected if j != k]
+        if fewer and _joint_share(fewer, columns, side) > share - CLUES.monomial_gain:
+            selected = fewer
+    return selected
 
 
 def _joint_share(chosen: list[int], columns: Array, side: EquationRows) -> float:

@@ -70,7 +70,7 @@ def test_it_is_told_as_a_clue_and_no_name(sprung: Trace) -> None:
     assert "a clue, not a named effect" in trace_text(sprung)
     (told,) = to_json(sprung)["unexplained"]["formulas"]
     assert told["terms"]["piston_2³"] == sprung.formulas[0].terms["piston_2³"]
-    assert sprung.moves_with[0] == "piston_2"
+    assert sprung.residual_variables[0] == "piston_2"
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def perform(case: Case) -> Outcome:
         max(f.ratio for f in found.floors), _size_error(case, found.effects),
         found.worst(found.after), float(np.max(off)) if off else math.nan,
         _mean(found.fit_before), _mean(found.fit_after),
-        found.moves_with, found.notes, seconds,
+        found.residual_variables, found.notes, seconds,
     )  # fmt: skip
 
 
