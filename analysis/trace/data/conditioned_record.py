@@ -151,10 +151,8 @@ def shared_rows(
         acting = acting_on(rig, visible, family, cache)
         appended = [u for u in acting if isinstance(u.term, Effect) and not changes_rows(u.term)]
         others = tuple(u for u in acting if u not in appended)
-        key, one_family = (
-            (conditioned.group, family, others),
-            replace(conditioned, families=(family,)),
-        )
+        one_family = replace(conditioned, families=(family,))
+        key = conditioned.group, family, others
         # Signals depend only on the terms that change them, so that families of rows share them.
         changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
         prepared = partial(

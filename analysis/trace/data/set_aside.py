@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import Filtering, Rows
+from analysis.regression.rows import Filtering
 from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.settings import DATA, TRACE
@@ -80,11 +80,6 @@ def set_aside(
         train, data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided),
         divided, (_division_note(divided, sorted({step for _, step in short})),),
     )  # fmt: skip
-
-
-def judging_rows(rows: Rows) -> Rows:
-    """Return a record's rows in the blocks that are set aside."""
-    return rows.at(in_judging_block(rows.time))
 
 
 def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Run, ...]:

@@ -122,9 +122,9 @@ def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, .
         record = conditioned.record
         if record.period and record.lines and all(k % 2 for k in record.lines):
             residual = data.residual[: s.repeats, s.where] * s.noise
-            rest = after[s.where] * s.noise / np.sqrt(s.repeats)
-            both, ratio = np.vstack((residual, rest)), ratios[s.group, s.equation]
-            of_segment = _segment_lines(s, conditioned, rows, both, ratio)
+            final_residual = after[s.where] * s.noise / np.sqrt(s.repeats)
+            residuals, ratio = np.vstack((residual, final_residual)), ratios[s.group, s.equation]
+            of_segment = _segment_lines(s, conditioned, rows, residuals, ratio)
             if of_segment is not None:
                 out.append(of_segment)
     return tuple(sorted(out, key=lambda equation_lines: -equation_lines.above_noise))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.least_squares import column_scale
 from analysis.regression.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import effect_in
@@ -31,13 +32,13 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     if not lines:
         return ()
     names, covariance = noise_covariance(data, model)
-    known = {**model.beta, **shape_values(data.rig, used)}
+    values = {**model.beta, **shape_values(data.rig, used)}
     out = []
     for line in lines:
         shared = [n for n in line.weights if n in names]
         numbers = [names.index(n) for n in shared]
         W = np.column_stack([line.weights[n] for n in shared])
-        y = W @ np.array([known[n] for n in shared])
+        y = W @ np.array([values[n] for n in shared])
         variance = W @ covariance[np.ix_(numbers, numbers)] * W
         half = IDENTIFY.normal_quantile * np.sqrt(np.maximum(variance.sum(axis=1), 0.0))
         band = (y - half, y + half)
@@ -61,7 +62,7 @@ class CurveRange:
         self._inside = np.ones(len(data.base), dtype=bool)
         self._kept: Counter[str] = Counter()
         for s in data.segments:
-            inside = _within_knots(data.rig, self.curves, *data.source(s))
+            inside = within_knots(data.rig, self.curves, *data.source(s))
             self._inside[s.where] = inside
             self._kept[s.equation] += int(np.count_nonzero(inside))
         rows = data.row_counts
@@ -95,17 +96,10 @@ class CurveRange:
         ]
 
 
-def rows_within(
-    rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, rows: Rows
-) -> Rows:
-    """Return a record's rows of an equation that lie between the outermost knots of all curves."""
-    return rows.at(_within_knots(rig, curves, conditioned, rows))
-
-
-def _within_knots(
+def within_knots(
     rig: Rig, curves: Sequence[Used], conditioned: ConditionedRecord, rows: Rows
 ) -> NDArray[np.bool_]:
-    """Return which rows (m,) lie between the outermost knots of every curve."""
+    """Return a mask (m,) of a record's rows between the outermost knots of every curve."""
     inside = np.ones(len(rows.time), dtype=bool)
     for used in curves:
         values = effect_in(used).abscissa(rig, conditioned.signals).get(rows.equation)
@@ -124,7 +118,6 @@ def _within_knots(
 def noise_covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
     """Return names and covariance from noise (p, p) of a model's coefficients and shapes."""
     names, X = tangent(data, model)
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0] = 1.0
+    scale = column_scale(X)
     inverse = np.linalg.pinv((X / scale).T @ (X / scale), rcond=1e-12, hermitian=True)
     return names, inverse / np.outer(scale, scale)

@@ -109,7 +109,7 @@ def judge_effects(
         differing = invariance(train_data, winner.fit, used, effect_errors)
         unphysical = hypotheses.physical_problem(winner, used)
         inseparable = [
-            Rival(name, rivals.place_of(effect_of(name, at)), 1.0, 1.0, True, at)
+            Rival(name, effect_of(name, at).place, 1.0, 1.0, True, at)
             for name, at in effect.inseparable(used.shape)
         ]
         removes = removed.share >= TRACE.least_removed and not disturbed
@@ -125,7 +125,7 @@ def judge_effects(
         )
         out.append(
             JudgedEffect(
-                effect.name, rivals.place_of(effect),
+                effect.name, effect.place,
                 {n: e for n, e in estimates.items() if n not in train_data.beta},
                 p, removed.share, (*inseparable, *others), gates,
                 effect.variable_on(train_data.rig),
@@ -171,7 +171,7 @@ def equations_above_band(
     Held-out records judge a set of effects (`held_out_above_band`); without any effect, training
     records must hold no more than noise either (`HypothesisSet.negligible`).
     """
-    band = hypotheses.noise_band.by_equation
+    band = hypotheses.noise_band
     out = [
         (e, f"the repeatable energy is {plain(energy / band[e], 2)} times the band")
         for e, energy in winner.excess_energy.items()

@@ -23,8 +23,8 @@ from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.data.nuisance_terms import within_plausible_slope
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.data.set_aside import judging_rows
-from analysis.trace.judge.curves import rows_within
+from analysis.trace.data.set_aside import in_judging_block
+from analysis.trace.judge.curves import within_knots
 from analysis.trace.result import FreeCurves
 from analysis.trace.search.exact_fit import DesignMatrix, ExactFit, design_matrix
 from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
@@ -70,7 +70,7 @@ def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> Exact
 
 def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     """Return `refitted_to_held_out` by the design matrix of the held-out rows."""
-    model = _at_temperature(rows, model)
+    model = _with_fitted_temperature(rows, model)
     fixed = {c.parameter for e in effects_among(model.terms) for c in e.coefficients(rig)} | {KAPPA}
     # A coefficient that no row contains would be moved by rounding alone.
     visible = np.sum(rows.matrix**2, axis=0) + np.diag(model.information) > 0.0
@@ -98,7 +98,7 @@ def refitted_names(before: ExactFit, after: ExactFit) -> list[str]:
     ]
 
 
-def _at_temperature(rows: DesignMatrix, model: ExactFit) -> ExactFit:
+def _with_fitted_temperature(rows: DesignMatrix, model: ExactFit) -> ExactFit:
     if KAPPA not in rows.names:
         return model
     column = rows.matrix[:, rows.names.index(KAPPA)]
@@ -133,14 +133,17 @@ def errors(
     groups: list[Group] = []
     for c in members:
         with_lines = replace(c, filtering=replace(c.filtering, lines=()))
-        whole = model_rows(rig, after.terms, c)
-        judging = [model_rows(rig, before.terms, with_lines), whole]
+        after_rows = model_rows(rig, after.terms, c)
+        judging = [model_rows(rig, before.terms, with_lines), after_rows]
         if c.group in divided:
-            judging = [{e: judging_rows(r) for e, r in rows.items()} for rows in judging]
-        floor_rows.append(judging[1] if repeats[c.group] > 1 else whole)
-        groups += [c.group] * len(whole)
+            judging = [
+                {e: r.at(in_judging_block(r.time)) for e, r in rows.items()} for rows in judging
+            ]
+        floor_rows.append(judging[1] if repeats[c.group] > 1 else after_rows)
+        groups += [c.group] * len(after_rows)
         for part, rows in zip(parts, judging, strict=True):
-            part += [(e, rows_within(rig, (curves or {}).get(e, ()), c, rows[e])) for e in rows]
+            for e, r in rows.items():
+                part.append((e, r.at(within_knots(rig, (curves or {}).get(e, ()), c, r))))
     split = floors(rig, after.terms, members, floor_rows, after.beta, others, noise_ratio)
     floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
@@ -163,9 +166,10 @@ def errors(
 
 def rms_of(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
     """Return the rms of every equation's held-out residual, SI, repeats averaged."""
-    rest = held_out_residual(holdout_data, model)
+    residual = held_out_residual(holdout_data, model)
     return _rms_by_equation(
-        (s.equation, rest[s.where] * s.noise / np.sqrt(s.repeats)) for s in holdout_data.segments
+        (s.equation, residual[s.where] * s.noise / np.sqrt(s.repeats))
+        for s in holdout_data.segments
     )
 
 
@@ -274,10 +278,10 @@ def disturbed_equations(
     before = {e: max(0.0, v) for e, v in hypotheses.empty.excess_energy.items()}
     return [
         e
-        for e, now in winner.excess_energy.items()
-        if now > before[e] + hypotheses.noise_band.by_equation[e]
-        and now > TRACE.harm_ratio * before[e]
-        and now > alternative.excess_energy[e]
+        for e, energy in winner.excess_energy.items()
+        if energy > before[e] + hypotheses.noise_band[e]
+        and energy > TRACE.harm_ratio * before[e]
+        and energy > alternative.excess_energy[e]
     ]
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
+from analysis.regression.least_squares import column_scale
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
@@ -53,10 +54,9 @@ def flip_blocks(train_data: RegressionData) -> NDArray[np.int64]:
     return out
 
 
-def sign_flipped(
-    train_data: RegressionData, count: int, rng: np.random.Generator, residual: Array
-) -> Array:
-    """Return averages (M, count) of `residual` (R, M) after random sign flips of its blocks."""
+def sign_flipped(train_data: RegressionData, rng: np.random.Generator, residual: Array) -> Array:
+    """Return averages (M, flips) of `residual` (R, M) after random sign flips of its blocks."""
+    count = TRACE.sign_flips
     numbers = flip_blocks(train_data)
     M = train_data.base.shape[0]
     out = np.zeros((M, count))
@@ -79,7 +79,7 @@ def null_maximum(
     rng: np.random.Generator,
 ) -> Array:
     """Return the largest energy (flips,) that any candidate at any shape removes, by flip."""
-    r = sign_flipped(train_data, TRACE.sign_flips, rng, residual)
+    r = sign_flipped(train_data, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
@@ -117,11 +117,10 @@ def effect_errors(train_data: RegressionData, model: ExactFit, used: Used) -> Ef
     names, J = jacobian(train_data, model, used)
     base = basis_of_others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
-    scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
-    scale[scale == 0] = 1.0
+    scale = column_scale(J_p)  # units differ by many powers of ten
     error = parameter_covariance(train_data, J_p / scale, model.residual)
-    values = {**shape_values(train_data.rig, used), **model.parameters(train_data.rig)}
-    value = np.array([values.get(n, np.nan) for n in names])
+    known = {**shape_values(train_data.rig, used), **model.parameters(train_data.rig)}
+    value = np.array([known.get(n, np.nan) for n in names])
     return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
 
 

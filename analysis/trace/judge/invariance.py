@@ -78,7 +78,7 @@ def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
     return numbers
 
 
-def _parts(
+def _row_parts(
     train_data: RegressionData, base: Array, joint: int | None
 ) -> Iterator[tuple[str, Array, Array, NDArray[np.int64] | None]]:
     """Yield the parts of the rows: name, mask (M,), basis of `base` in them, `_blocks_as_noise`."""
@@ -89,7 +89,7 @@ def _parts(
             yield label, mask, orthonormal(base[mask]), blocks
 
 
-def _shift(
+def _coefficient_shift(
     column: Array, residual: Array, base: Array, blocks: NDArray[np.int64] | None
 ) -> tuple[float, float]:
     """Return the change of a coefficient in a part of the rows, and its standard error.
@@ -129,7 +129,7 @@ def _energy_of_larger_effect(
     return most if most > own_energy else 0.0
 
 
-def _column_off_others(columns: Array, k: int) -> Array:
+def _orthogonal_column(columns: Array, k: int) -> Array:
     """Return column k (m,) projected orthogonal to the other columns."""
     others, column = np.delete(columns, k, axis=1), columns[:, k]
     if not others.shape[1]:
@@ -156,7 +156,7 @@ def invariance(
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
     J_all = J - base @ (base.T @ J)
-    column_energy = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
+    column_energy = [float(np.sum(_orthogonal_column(J_all, k) ** 2)) for k in range(len(names))]
     # A number that the effect's other numbers can replace is no size of its own: then the whole
     # effect is judged.
     replaceable = {
@@ -168,14 +168,14 @@ def invariance(
     if replaceable:
         out += _whole_effect_differences(train_data, model, used, base, joint)
         sizes -= replaceable
-    for label, mask, B, blocks in _parts(train_data, base, joint):
+    for label, mask, B, blocks in _row_parts(train_data, base, joint):
         J_part = J[mask] - B @ (B.T @ J[mask])
         for k, name in enumerate(names):
             if name not in sizes:
                 continue
             if np.linalg.norm(J_part[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
-            column = _column_off_others(J_part, k)
+            column = _orthogonal_column(J_part, k)
             size = float(column @ column)
             # A part with little information shows the tail of the form, not the size.
             if (
@@ -184,7 +184,7 @@ def invariance(
                 or not np.isfinite(value.value[k])
             ):
                 continue
-            shift, error = _shift(column, model.residual[mask], B, blocks)
+            shift, error = _coefficient_shift(column, model.residual[mask], B, blocks)
             form_error = np.sqrt(
                 SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
             )
@@ -213,14 +213,14 @@ def _whole_effect_differences(
     whole = contribution(train_data, model, used)
     total_energy = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
     out = []
-    for label, mask, B, blocks in _parts(train_data, base, joint):
+    for label, mask, B, blocks in _row_parts(train_data, base, joint):
         part = whole[mask] - B @ (B.T @ whole[mask])
         size = float(part @ part)
         if size <= TRACE.informative_share * total_energy or size < 0.01 * float(
             whole[mask] @ whole[mask]
         ):
             continue
-        shift, error = _shift(part, model.residual[mask], B, blocks)
+        shift, error = _coefficient_shift(part, model.residual[mask], B, blocks)
         if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
             error, TRACE.invariance_tolerance / TRACE.standard_errors
         ):

@@ -180,10 +180,8 @@ def _form_error_energy(
         in hypothesis.keys
         for effect in effects_among(other.effects)
     )
-    left = sum(
-        max(0.0, v - hypotheses.noise_band.by_equation[e]) for e, v in other.excess_energy.items()
-    )
-    return left if is_near else 0.0
+    remaining = sum(max(0.0, v - hypotheses.noise_band[e]) for e, v in other.excess_energy.items())
+    return remaining if is_near else 0.0
 
 
 def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:

@@ -105,7 +105,7 @@ def _rival(
     effect: Effect, ratio: float, training_ratio: float, tied: bool,
     moved: tuple[str, float] | None = None,
 ) -> Rival:  # fmt: skip
-    return Rival(effect.name, place_of(effect), ratio, training_ratio, tied, effect.where, moved)
+    return Rival(effect.name, effect.place, ratio, training_ratio, tied, effect.where, moved)
 
 
 def moved_parameter(
@@ -123,7 +123,7 @@ def moved_parameter(
     std = deviations(train_data, rival.fit)
     largest: tuple[str, float] | None = None
     rig = train_data.rig
-    left_out = _of_law(rig, law)
+    left_out = _law_parameters(rig, law)
     for c in (c for term in baseline_of(rig) for c in term.coefficients(rig)):
         if c.parameter in left_out:
             continue
@@ -234,7 +234,7 @@ def errors_by_alternatives(
     model's (Buckland, Burnham and Augustin, Biometrics 53, 1997). Parameters of the baseline's term
     of the law that an alternative leaves out are not compared with it.
     """
-    compared = [(other.parameters, _of_law(model.rig, law)) for other, law in alternatives]
+    compared = [(other.parameters, _law_parameters(model.rig, law)) for other, law in alternatives]
     errors = {}
     for name, estimate in model.parameters.items():
         others = [found[name] for found, out in compared if name in found and name not in out]
@@ -247,7 +247,7 @@ def errors_by_alternatives(
     return errors
 
 
-def _of_law(rig: Rig, law: str) -> set[str]:
+def _law_parameters(rig: Rig, law: str) -> set[str]:
     """Return the parameters of the baseline's term of a law ('': of none)."""
     terms = [term for term in baseline_of(rig) if law and term.name.endswith(law)]
     return {c.parameter for term in terms for c in term.coefficients(rig)}
@@ -303,16 +303,16 @@ def _is_refused_simpler_name(
 class TieTest:
     """Comparison of other fits with the best one, in the equations in which an effect acts.
 
-    `left` (M,) is the whitened residual of the best fit, `without` (M,) that without the effect.
+    `residual` (M,) is the whitened one of the best fit, `without` (M,) that without the effect.
     """
 
     def __init__(
-        self, data: RegressionData, equations: Collection[str], left: Array, without: Array
+        self, data: RegressionData, equations: Collection[str], residual: Array, without: Array
     ) -> None:
         self.data, self.rows = data, data.in_equations(equations)
-        self.left = left[self.rows]
-        self.energy = float(self.left @ self.left)
-        self.taken = float(without[self.rows] @ without[self.rows]) - self.energy
+        self.residual = residual[self.rows]
+        self.energy = float(self.residual @ self.residual)
+        self.removed = float(without[self.rows] @ without[self.rows]) - self.energy
 
     def ratio(self, other: Array) -> float:
         """Return the residual rms of another fit (M,) over that of the best."""
@@ -324,12 +324,11 @@ class TieTest:
 
         For an effect that removes less energy than remains, the ratio is of the removed energy.
         """
-        change = other[self.rows] - self.left
-        lost = float(change @ (other[self.rows] + self.left))
-        share = (tie**2 - 1.0) * min(self.energy, max(self.taken, 0.0))
-        return (
-            lost < share or loss_in_deviations(other[self.rows], self.left) <= TRACE.standard_errors
-        )
+        residual = other[self.rows]
+        lost = float((residual - self.residual) @ (residual + self.residual))
+        allowed = (tie**2 - 1.0) * min(self.energy, max(self.removed, 0.0))
+        deviations = loss_in_deviations(residual, self.residual)
+        return lost < allowed or deviations <= TRACE.standard_errors
 
 
 def rivals_in_words(rivals: Sequence[Rival]) -> str:
@@ -344,8 +343,3 @@ def rivals_in_words(rivals: Sequence[Rival]) -> str:
         f"{words} {nearest.name} at {nearest.location}: {nearest.ratio:.2f} times the held-out rms"
         f"{in_training}"
     )
-
-
-def place_of(effect: Effect) -> str:
-    """Return an effect's place in words."""
-    return str(getattr(effect, "place", effect.where))

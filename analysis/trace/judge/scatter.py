@@ -20,6 +20,7 @@ from analysis.identify.estimators.equations import Pieces, segments
 from analysis.identify.geometry import wider
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.least_squares import column_scale
 from analysis.simulation.model import Model
 from analysis.terms.base import joint_of
 from analysis.trace.data.regression_data import RegressionData, Segment
@@ -123,7 +124,7 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         residual = fit.residual[contribution(train_data, fit, used) != 0.0]
         excess = max(float(residual @ residual) - len(residual), TRACE.form_noise)
         share = excess / (excess + max(0.0, other.energy - fit.energy))
-        incomparable = _of_other_meaning(rig, fit, other)
+        incomparable = _incomparable_coefficients(rig, fit, other)
         for name, value in other.beta.items():
             if name in incomparable:
                 continue
@@ -132,7 +133,7 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
 
 
-def _of_other_meaning(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:
+def _incomparable_coefficients(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:
     """Return the coefficients of effects whose other form gives them another meaning."""
     return {
         c.parameter
@@ -146,8 +147,7 @@ def _of_other_meaning(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:
 def _growth_shift_squares(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     """Return the squared shifts by effects that do not grow in proportion (2), by name."""
     names, X = tangent(train_data, fit)
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0] = 1.0
+    scale = column_scale(X)
     squares = dict.fromkeys(names, 0.0)
     for used in fit.terms:
         if not isinstance(used.term, Effect) or used.term.free:
@@ -179,17 +179,16 @@ def with_form_errors(
     """
     rows = design_matrix(train_data, fit.terms)
     size = np.linalg.norm(rows.matrix, axis=0)
-    more = _variance_from_shapes(
-        train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names
-    )
+    unit = rows.matrix / column_scale(rows.matrix)
+    variance = _variance_from_shapes(train_data, fit, unit, rows.names)
     errors = {}
     for k, name in enumerate(rows.names):
         old = model.parameters.get(name)
         if old is None or not old.identified or size[k] == 0:
             continue
         # The rows may hold the reciprocal: relative sizes are the same.
-        relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
-        errors[name] = abs(old.value) * float(relative)
+        error = np.hypot(np.sqrt(variance[k]) / size[k], shift.get(name, 0.0))
+        errors[name] = abs(old.value) * float(error / abs(fit.beta[name]))
     return with_errors(model, errors)
 
 

@@ -105,7 +105,7 @@ class _LineFit:
     count: int
 
 
-def _fitted(
+def _fitted_line(
     rig: Rig, conditioned: ConditionedRecord, fit: ExactFit, line: Line, chosen: bool
 ) -> _LineFit | None:
     """Fit a sine to a model's residual in one record; return None where the joint is locked.
@@ -145,9 +145,9 @@ def judged_line(
     the held-out records, SI.
     """
     joint, frequency = line
-    fits = [_fitted(rig, c, fit, line, False) for c in train]
+    fits = [_fitted_line(rig, c, fit, line, False) for c in train]
     train_fits = [f for f in fits if f is not None]
-    fits = [_fitted(rig, c, fit, line, c.group in divided) for c in holdout]
+    fits = [_fitted_line(rig, c, fit, line, c.group in divided) for c in holdout]
     held_out_fits = [f for f in fits if f is not None]
     amplitude = _mean_amplitude(rig, joint, train_fits)
     before, after = sum(f.before for f in held_out_fits), sum(f.after for f in held_out_fits)
@@ -159,7 +159,7 @@ def judged_line(
         for f in train_fits
         if abs(f.amplitude - amplitude.value) > max(tolerance, TRACE.standard_errors * f.error)
     ]
-    p = _probability(train_fits)
+    p = _noise_probability(train_fits)
     limit, effect = torque_limit(rig, joint), PeriodicDisturbance(f"joint {joint + 1}")
     size = f"amplitude {plain(amplitude.value, 2)} of the {plain(limit, 2)} that may be"
     share = f"{100 * removed:.0f} % of the energy above noise"
@@ -194,7 +194,7 @@ def _mean_amplitude(rig: Rig, joint: int, fits: Sequence[_LineFit]) -> Estimate:
     return _estimate(mean, unit, max(spread, 1.0 / math.sqrt(float(weight.sum()))))
 
 
-def _probability(fits: Sequence[_LineFit]) -> float:
+def _noise_probability(fits: Sequence[_LineFit]) -> float:
     """Return Fisher's probability that noise has as large a line at any frequency."""
     share = 1.0 - sum(f.after for f in fits) / max(sum(f.before for f in fits), 1e-300)
     count = sum(f.count for f in fits) / 2

@@ -71,9 +71,8 @@ def absorbed_effects(
     """Return what further effects among the candidates `effects` would add, None if there are none.
 
     Another name of a law that acts in the set has the shape with which it was fitted in place of
-    that name. A special case of an effect of the set is no further effect. Beside a free form there
-    is none, since its curve absorbs any similar effect. Rows of a joint in motion limit no
-    breakaway.
+    that name. Special cases of effects of the set are left out, and all effects beside a free form,
+    since its curve absorbs similar ones. Rows of a joint in motion limit no breakaway.
     """
     train_data = hypotheses.train_data
     in_motion = train_data.records[0].filtering.in_motion
@@ -81,19 +80,19 @@ def absorbed_effects(
     if any(effect.free for effect in named):
         return None
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
-    asked = [
+    further = [
         effect for effect in effects
         if effect.key not in winner.keys
         and not (effect.beside and effect.joint in in_motion)
-        and not any(is_special_case(effect, other) for other in named)
+        and not any(is_special_case(effect, rival) for rival in named)
     ]  # fmt: skip
-    fitted = {
-        effect_in(other): other.shape
-        for own in winner.effects for _, other in hypotheses.replacements(winner, own)
-        if law_of(effect_in(other)) == law_of(effect_in(own))
+    shape_by_effect = {
+        effect_in(rival): rival.shape
+        for member in winner.effects for _, rival in hypotheses.replacements(winner, member)
+        if law_of(effect_in(rival)) == law_of(effect_in(member))
     }  # fmt: skip
-    tried = [smallest_effect(effect, train_data.rig, fitted.get(effect, ())) for effect in asked]
-    small = [explanation for explanation in tried if explanation is not None]
+    explanations = (smallest_effect(e, train_data.rig, shape_by_effect.get(e, ())) for e in further)
+    small = [explanation for explanation in explanations if explanation is not None]
     if not small:
         return None
     names, X = tangent(train_data, winner.fit)
@@ -134,35 +133,35 @@ def detection_limits(
     if absorbed is None:
         return []
     data, residual = absorbed.data, winner.fit.residual
-    known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
-    found = []
+    half_widths = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
+    limits = []
     for k, explanation in enumerate(absorbed.explanations):
         shown = absorbed.shown[:, k]
-        energy, times = float(shown @ shown), 0.0
+        energy, factor = float(shown @ shown), 0.0
         if energy > 0.0:  # else nothing remains in the residual, and no size can be stated
             most_noise = IDENTIFY.normal_quantile * energy**0.5
-            times = float((abs(shown @ residual) + most_noise) / energy)
-        moved = dict(zip(absorbed.names, times * absorbed.taken[:, k], strict=True))
-        shifts = _parameter_shifts(data, moved, known)
+            factor = float((abs(shown @ residual) + most_noise) / energy)
+        changes = dict(zip(absorbed.names, factor * absorbed.taken[:, k], strict=True))
+        shifts = _parameter_shifts(data, changes, half_widths)
         most = max(shifts, key=lambda name: shifts[name], default="")
         if most and shifts[most] > 1.0:  # the parameter would be 0 or of the other sign
-            times, shifts = times / shifts[most], {most: 1.0}
+            factor, shifts = factor / shifts[most], {most: 1.0}
         if most and shifts[most] >= TRACE.noted_shift:
-            size = _effect_size(data, explanation, times)
-            possible = is_possible(data.rig, model, explanation, times)
-            place = _places(explanation)
-            found.append(
+            size = _effect_size(data, explanation, factor)
+            possible = is_possible(data.rig, model, explanation, factor)
+            place = _reported_places(explanation)
+            limits.append(
                 DetectionLimit(
                     explanation.keys[0]["name"], *place, *size, most, shifts[most], possible
                 )
             )  # fmt: skip
-    once: dict[str, DetectionLimit] = {}
-    for limit in sorted(found, key=lambda f: -f.shift):
-        once.setdefault(limit.name, limit)
-    return list(once.values())
+    by_name: dict[str, DetectionLimit] = {}
+    for limit in sorted(limits, key=lambda f: -f.shift):
+        by_name.setdefault(limit.name, limit)
+    return list(by_name.values())
 
 
-def _places(explanation: Explanation) -> tuple[str, str]:
+def _reported_places(explanation: Explanation) -> tuple[str, str]:
     """Return the place of an effect as reported, and as the catalogue has it."""
     first, *others = explanation.keys
     if not others:
@@ -172,29 +171,29 @@ def _places(explanation: Explanation) -> tuple[str, str]:
 
 
 def _parameter_shifts(
-    data: RegressionData, moved: Mapping[str, float], known: Mapping[str, float]
+    data: RegressionData, changes: Mapping[str, float], half_widths: Mapping[str, float]
 ) -> dict[str, float]:
     """Return the relative change of the parameters that change by more than their interval.
 
-    `moved` are changes of the rows' coefficients and of shapes, `known` the half-widths of the
+    `changes` are those of the rows' coefficients and of shapes, `half_widths` those of the
     intervals, by name.
     """
     shapes = {n: v for u in data.terms for n, v in shape_values(data.rig, u).items()}
     before = {**data.beta, **shapes}
-    after = {n: v + moved.get(n, 0.0) for n, v in before.items()}
-    old, new = (
+    after = {n: v + changes.get(n, 0.0) for n, v in before.items()}
+    values_before, values_after = (
         {**{n: b[n] for n in shapes}, **parameter_values(data.rig, data.terms, b)}
         for b in (before, after)
     )
     return {
-        name: abs(new[name] / old[name] - 1.0)
-        for name, half in known.items()
-        if old.get(name) and abs(new[name] - old[name]) > half
+        name: abs(values_after[name] / values_before[name] - 1.0)
+        for name, half in half_widths.items()
+        if values_before.get(name) and abs(values_after[name] - values_before[name]) > half
     }
 
 
 def _effect_size(
-    data: RegressionData, explanation: Explanation, times: float
+    data: RegressionData, explanation: Explanation, factor: float
 ) -> tuple[str, float, str, float]:
     """Return name, size and unit of the number that says how large an effect is, and its neutral.
 
@@ -203,26 +202,26 @@ def _effect_size(
     used = explanation.effects[0]
     for c in used.term.coefficients(data.rig):
         if explanation.beta.get(c.parameter):
-            return c.parameter, abs(explanation.beta[c.parameter]) * times, c.unit, 0.0
+            return c.parameter, abs(explanation.beta[c.parameter]) * factor, c.unit, 0.0
     shapes = shapes_of(data.rig, used)
     k = next(k for k, s in enumerate(shapes) if used.shape[k] != (s.neutral or 0.0))
     neutral = shapes[k].neutral or 0.0
-    return shapes[k].parameter, abs(used.shape[k] - neutral) * times, shapes[k].unit, neutral
+    return shapes[k].parameter, abs(used.shape[k] - neutral) * factor, shapes[k].unit, neutral
 
 
-def is_possible(rig: Rig, model: Model, explanation: Explanation, times: float) -> bool:
-    """Return whether effects of `times` their smallest size are physical, as the smallest are."""
+def is_possible(rig: Rig, model: Model, explanation: Explanation, factor: float) -> bool:
+    """Return whether effects of `factor` their smallest size are physical, as the smallest are."""
     known = {name: e.value for name, e in model.parameters.items() if e.identified}
 
-    def problem(used: Used, times: float) -> str:
+    def problem(used: Used, factor: float) -> str:
         effect, shape = effect_in(used), list(used.shape)
         for k, s in enumerate(shapes_of(rig, used)[: len(effect.shape_of_smallest_size())]):
             neutral = s.neutral or 0.0
-            shape[k] = neutral + times * (shape[k] - neutral)
-        values = known | {name: times * value for name, value in explanation.beta.items()}
+            shape[k] = neutral + factor * (shape[k] - neutral)
+        values = known | {name: factor * value for name, value in explanation.beta.items()}
         return effect.problem(rig, values, shape)
 
-    return all(not problem(u, times) or bool(problem(u, 1.0)) for u in explanation.effects)
+    return all(not problem(u, factor) or bool(problem(u, 1.0)) for u in explanation.effects)
 
 
 def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:
@@ -235,13 +234,13 @@ def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:
         by_parameter.setdefault(limit.parameter, limit)
     stated = list(dict.fromkeys((*by_parameter.values(), *limits)))
     return [
-        f"not excluded by these records: {d.name} at {place_in_words(d.at)} {_up_to(d)} "
+        f"not excluded by these records: {d.name} at {place_in_words(d.at)} {_limit_in_words(d)} "
         "without a residual above the noise"
         for d in stated[: TRACE.most_detection_limits]
     ]
 
 
-def _up_to(limit: DetectionLimit) -> str:
+def _limit_in_words(limit: DetectionLimit) -> str:
     if not limit.possible:
         return f"of any possible size, which would change {limit.parameter}"
     size = f"{plain(limit.size, 2)} {typeset(limit.unit)}".strip()
@@ -271,30 +270,30 @@ def sets_with_small_effect(
     """
     if absorbed is None:
         return []
-    left, found = held_out_residual(holdout_data, winner.fit), []
-    for effects in _clearest(absorbed, winner):
+    residual, larger_sets = held_out_residual(holdout_data, winner.fit), []
+    for effects in _clearest_effects(absorbed, winner):
         larger = hypotheses.refined([*winner.effects, *effects])
         if (
             winner.fit.energy - larger.fit.energy > TRACE.suggested_deviations**2
             and not hypotheses.physical_problem(larger)
-            and loses_by_restriction(left, held_out_residual(holdout_data, larger.fit))
+            and loses_by_restriction(residual, held_out_residual(holdout_data, larger.fit))
             and (moved := moved_parameter(hypotheses.train_data, winner, larger, least=0.0))
         ):
-            found.append((larger, moved))
-    least = min((o.fit.energy for o, _ in found), default=0.0)
-    return [(o, moved) for o, moved in found if o.fit.energy <= least + SEARCH.number_price]
+            larger_sets.append((larger, moved))
+    least = min((o.fit.energy for o, _ in larger_sets), default=0.0)
+    return [(o, moved) for o, moved in larger_sets if o.fit.energy <= least + SEARCH.number_price]
 
 
-def _clearest(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[tuple[Used, ...]]:
-    """Return what exceeds its noise most, in units of its standard deviation.
+def _clearest_effects(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[tuple[Used, ...]]:
+    """Return the effects that exceed their noise by most standard deviations.
 
-    Effects at both chambers come after single ones, so that none of these is left out for them.
+    Effects at both chambers are counted apart from single ones, so that they displace none.
     """
     size = np.linalg.norm(absorbed.shown, axis=0)
-    along = np.abs(absorbed.shown.T @ winner.fit.residual)
-    deviations = np.divide(along, size, out=np.zeros_like(along), where=size > 0)
-    order = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.suggested_deviations]
-    effects = [absorbed.explanations[k].effects for k in order]
+    product = np.abs(absorbed.shown.T @ winner.fit.residual)
+    deviations = np.divide(product, size, out=np.zeros_like(product), where=size > 0)
+    clear = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.suggested_deviations]
+    effects = [absorbed.explanations[k].effects for k in clear]
     single, both = ([e for e in effects if len(e) == count] for count in (1, 2))
     return [*single[: TRACE.most_rivals], *both[: TRACE.most_rivals]]
 

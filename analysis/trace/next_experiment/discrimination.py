@@ -28,17 +28,10 @@ from analysis.regression.rows import Rows, matrix_of
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.cache import RowCache
-from analysis.trace.data.conditioned_record import (
-    model_rows,
-    prepared_signals,
-    trace_filtering,
-)
+from analysis.trace.data.candidates import effect_in
+from analysis.trace.data.conditioned_record import model_rows, prepared_signals, trace_filtering
 from analysis.trace.data.noise_floor import stated_noise
-from analysis.trace.data.regression_data import (
-    RegressionData,
-    candidate_columns,
-    variant_columns,
-)
+from analysis.trace.data.regression_data import RegressionData, candidate_columns, variant_columns
 from analysis.trace.next_experiment.excitations import CandidateExcitation
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import EXPERIMENT
@@ -67,7 +60,7 @@ class Explanation:
         return tuple(
             {
                 "name": u.term.name,
-                "where": str(getattr(u.term, "place", u.term.where)),
+                "where": effect_in(u).place,
                 "at": u.term.where,
                 "shape": list(u.shape),
             }
@@ -82,12 +75,12 @@ def smallest_effect(effect: Effect, rig: Rig, shape: tuple[float, ...] = ()) -> 
     With poor excitation an effect of this size may leave no residual: the verdict `clean` does not
     exclude it then.
     """
-    own = effect.shape_of_smallest_size()
-    if effect.absorbed(rig) or not (own or effect.smallest_coefficients):
+    size_shape = effect.shape_of_smallest_size()
+    if effect.absorbed(rig) or not (size_shape or effect.smallest_coefficients):
         return None
-    usual = effect.shape_of(rig, shape)
+    shapes = effect.shape_of(rig, shape)
     names = [c.parameter for c in effect.coefficients(rig)]
-    used = Used(effect, (*own, *usual[len(own) :]))
+    used = Used(effect, (*size_shape, *shapes[len(size_shape) :]))
     return Explanation((used,), dict(zip(names, effect.smallest_coefficients, strict=False)))
 
 
@@ -131,15 +124,15 @@ def noise_ratios(train_data: RegressionData) -> dict[str, float]:
     Faster excitations have filters of larger bandwidth and so more noise; multiplied with this
     ratio, the stated noise predicts it.
     """
-    by_family: dict[str, list[float]] = {}
+    by_equation: dict[str, list[float]] = {}
     for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):
         stated = stated_noise(train_data.rig, train_data.terms, conditioned, rows, train_data.beta)
         for floor in train_data.floors:
             if floor.group == conditioned.group and stated.get(floor.equation, 0.0) > 0:
-                by_family.setdefault(floor.equation, []).append(
+                by_equation.setdefault(floor.equation, []).append(
                     floor.noise / stated[floor.equation]
                 )
-    return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in by_family.items()}
+    return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in by_equation.items()}
 
 
 def measurement_view(
@@ -154,8 +147,8 @@ def measurement_view(
     record = excitation.played.record
     filters = trace_filtering(record)
     conditioned = ConditionedRecord(-1, record, condition(rig, record, filters.channels), filters)
-    every = model_rows(rig, train_data.terms, conditioned)
-    rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
+    rows_of_record = model_rows(rig, train_data.terms, conditioned)
+    rows = {e: r for e, r in rows_of_record.items() if e in measured and len(r.rhs)}
     stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
     signals = prepared_signals(rig, train_data.terms, conditioned)
@@ -196,13 +189,11 @@ class ComparisonRows:
             if self._old is not None:
                 before = self._old.columns(used)
             else:
-                found = variant_columns(self.train_data, [used])
-                before = {
-                    n: c for one in found for n, c in zip(one.names, one.columns.T, strict=True)
-                }
-            self._known[used] = (
-                before if self.view is None else self._with_view_columns(used, before)
-            )
+                before = {}
+                for variant in variant_columns(self.train_data, [used]):
+                    before |= dict(zip(variant.names, variant.columns.T, strict=True))
+            with_view = self.view is not None
+            self._known[used] = self._with_view_columns(used, before) if with_view else before
         return self._known[used]
 
     def _with_view_columns(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
@@ -227,7 +218,7 @@ class ComparisonRows:
                     total += column * (explanation.beta.get(name, 0.0) if name else 1.0)
         return total
 
-    def imitation_columns(self, explanation: Explanation) -> Array:
+    def fit_columns(self, explanation: Explanation) -> Array:
         """Return the columns (m, k) of an explanation's fit, derivatives by its shapes included."""
         blocks = [self.base]
         for used in explanation.effects:
@@ -249,7 +240,7 @@ class ComparisonRows:
         Many explanations are compared with one `wrong`, whose columns are factored once.
         """
         if wrong.key not in self._fitted:
-            self._fitted[wrong.key] = orthonormal(self.imitation_columns(wrong), RANK)
+            self._fitted[wrong.key] = orthonormal(self.fit_columns(wrong), RANK)
         y, basis = self.prediction(true), self._fitted[wrong.key]
         return np.asarray(y - basis @ (basis.T @ y))
 
@@ -269,8 +260,8 @@ def separation(
 ) -> tuple[float, str]:
     """Return the separation [noise] by an experiment, and its equation (see the module)."""
     assert new.view is not None
-    distances = []
-    for true, wrong in _directions(question):
+    separations = []
+    for true, wrong in _ordered_pairs(question):
         before, after = old.energy(true, wrong), new.energy(true, wrong)
         by_equation = {
             e: float(
@@ -279,15 +270,15 @@ def separation(
             for e, r in new.view.rows.items()
         }
         largest = max(by_equation, key=lambda e: by_equation[e], default="")
-        distances.append((by_equation.get(largest, 0.0), largest))
-    return min(distances)
+        separations.append((by_equation.get(largest, 0.0), largest))
+    return min(separations)
 
 
 def present_separation(question: OpenQuestion, old: ComparisonRows) -> float:
     """Return the separation [noise] by the records already taken, in their largest segment."""
     return min(
         largest_rms(old.train_data, old.residual(true, wrong))
-        for true, wrong in _directions(question)
+        for true, wrong in _ordered_pairs(question)
     )
 
 
@@ -298,6 +289,6 @@ def largest_rms(train_data: RegressionData, residual: Array) -> float:
     )
 
 
-def _directions(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
-    there = (question.one, question.other)
-    return (there, there[::-1]) if question.both_ways else (there,)
+def _ordered_pairs(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
+    forward = (question.one, question.other)
+    return (forward, forward[::-1]) if question.both_ways else (forward,)

@@ -113,7 +113,7 @@ class CandidateExcitation:
 
 def joint_settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[JointSetting]:
     """Return the joint settings of the steps of the records, and that of all joints free."""
-    out: list[JointSetting] = []
+    settings: list[JointSetting] = []
     for conditioned in records:
         closed, held = {}, {}
         for joint in conditioned.record.locked:
@@ -123,9 +123,9 @@ def joint_settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[Joint
                 held[joint - 1] = float(np.copysign(half, piston))
             else:
                 closed[joint - 1] = round(piston, 3) + 0.0  # no -0
-        out.append(JointSetting(closed, held))
-    out.append(JointSetting({}, {}))
-    return [s for k, s in enumerate(out) if s.moving(rig) and s not in out[:k]]
+        settings.append(JointSetting(closed, held))
+    settings.append(JointSetting({}, {}))
+    return [s for k, s in enumerate(settings) if s.moving(rig) and s not in settings[:k]]
 
 
 def excitations(
@@ -149,7 +149,7 @@ def excitation(
 ) -> CandidateExcitation | None:
     """Return a family in a setting, scaled to its share of the limits; None where impossible."""
     tones = {j: _tone(j, family, rng) for j in setting.moving(rig)}
-    step = _step(rig, setting, family, tones)
+    step = _twin_step(rig, setting, family, tones)
     goal = EXPERIMENT.fill * family.level
     best: CandidateExcitation | None = None
     try:
@@ -171,8 +171,8 @@ def excitation(
 
 
 def _flattened(rig: Rig, played: Played, tone: Tone) -> Tone:
-    known = forecast_of(rig, played, tone.joint, tone.lines)
-    return replace(tone, spectrum=known.flattened(tone.spectrum, EXPERIMENT.phase_rounds)[0])
+    forecast = forecast_of(rig, played, tone.joint, tone.lines)
+    return replace(tone, spectrum=forecast.flattened(tone.spectrum, EXPERIMENT.phase_rounds)[0])
 
 
 def _tone(joint: int, family: Family, rng: np.random.Generator) -> Tone:
@@ -183,7 +183,7 @@ def _tone(joint: int, family: Family, rng: np.random.Generator) -> Tone:
     return Tone(joint, lines, size * np.exp(2j * np.pi * rng.random(len(lines))), ())
 
 
-def _step(
+def _twin_step(
     rig: Rig, setting: JointSetting, family: Family, tones: Mapping[int, Tone]
 ) -> TwinStep:  # fmt: skip
     period = round(rig.sample_rate / family.base)
@@ -214,12 +214,13 @@ def protocol(
         "description": "; ".join(candidate.text for candidate in chosen),
         "joints": len(rig.joints),
         "steps": [
-            _as_step(rig, candidate, k, scale, rng) for k, candidate in enumerate(chosen, start=1)
+            _step_mapping(rig, candidate, k, scale, rng)
+            for k, candidate in enumerate(chosen, start=1)
         ],
     }
 
 
-def _as_step(
+def _step_mapping(
     rig: Rig,
     candidate: CandidateExcitation,
     number: int,
@@ -273,13 +274,13 @@ def _other_phases(tone: Tone, n: int, rng: np.random.Generator) -> Spectrum:
 
     `n` is the number of samples of a period.
     """
-    size, best, least = np.abs(tone.spectrum), tone.spectrum, np.inf
+    size, best_spectrum, least_peak = np.abs(tone.spectrum), tone.spectrum, np.inf
     for _ in range(EXPERIMENT.phase_draws):
         spectrum = size * np.exp(2j * np.pi * rng.random(len(size)))
-        full = np.zeros((2, n // 2 + 1), dtype=np.complex128)
-        full[0, tone.lines], full[1, tone.lines] = spectrum, spectrum / (1j * tone.lines)
+        signals = np.zeros((2, n // 2 + 1), dtype=np.complex128)
+        signals[0, tone.lines], signals[1, tone.lines] = spectrum, spectrum / (1j * tone.lines)
         # Of the command and of its integral, which the piston follows.
-        peak = float(np.prod(np.ptp(np.fft.irfft(full, n, axis=1), axis=1)))
-        if peak < least:
-            best, least = spectrum, peak
-    return best
+        peak = float(np.prod(np.ptp(np.fft.irfft(signals, n, axis=1), axis=1)))
+        if peak < least_peak:
+            best_spectrum, least_peak = spectrum, peak
+    return best_spectrum

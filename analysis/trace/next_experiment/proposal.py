@@ -66,59 +66,59 @@ class PredictedAnswer:
 
 def propose(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect], verdict: str,
-    moves: Sequence[Dependence],
+    clues: Sequence[Dependence],
 ) -> Mapping[str, Any] | None:  # fmt: skip
     """Return the next experiment as plain data, None where none would give an answer.
 
-    `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
+    Its `protocol` and `holdout` are contents of protocol files; `present` and `predicted` are the
     weakest question's separation in units of one record's noise.
     """
     train_data = hypotheses.train_data
-    old = ComparisonRows(train_data)
-    questions = _questions(hypotheses, winner, effects, verdict, old)
-    if not questions and not (verdict == UNEXPLAINED and moves):
+    present = ComparisonRows(train_data)
+    questions = _open_questions(hypotheses, winner, effects, verdict, present)
+    if not questions and not (verdict == UNEXPLAINED and clues):
         return None
     rng = np.random.default_rng(EXPERIMENT.seed)
-    tried = list(ex.excitations(rig_with_estimates(train_data), train_data.records, rng))
-    if not tried:
+    candidates = list(ex.excitations(rig_with_estimates(train_data), train_data.records, rng))
+    if not candidates:
         return _experiment_in_words(effects, questions) if verdict == CONFOUNDED else None
-    measured = noise_ratios(train_data)
-    views = [measurement_view(train_data, candidate, measured) for candidate in tried]
+    ratios = noise_ratios(train_data)
+    views = [measurement_view(train_data, candidate, ratios) for candidate in candidates]
     kind = SHOW if verdict == CLEAN else TELL
-    best = _best_steps(questions, tried, views, old)
-    if best is not None:
-        return _proposal(train_data, kind, *best)
-    if verdict == UNEXPLAINED and moves:
-        return _covering_experiment(train_data, winner, moves, tried, views)
+    chosen = _best_steps(questions, candidates, views, present)
+    if chosen is not None:
+        return _proposal(train_data, kind, *chosen)
+    if verdict == UNEXPLAINED and clues:
+        return _covering_experiment(train_data, winner, clues, candidates, views)
     return None
 
 
 def rig_with_estimates(train_data: RegressionData) -> Rig:
     """Return the rig with nominal values from the records, so that its twin is more accurate."""
-    plain = tuple(map(Used, baseline_of(train_data.rig)))
-    parameters = parameter_values(train_data.rig, plain, train_data.beta)
-    before, most = train_data.rig.nominal, EXPERIMENT.parameter_ratio
-    likely = {
+    baseline = tuple(map(Used, baseline_of(train_data.rig)))
+    parameters = parameter_values(train_data.rig, baseline, train_data.beta)
+    stated, most = train_data.rig.nominal, EXPERIMENT.parameter_ratio
+    plausible = {
         name: value
         for name, value in parameters.items()
         # A parameter that the records hardly determine may have any estimate.
-        if (nominal := before.get(name, abs(value))) != 0.0 and 1 / most < value / nominal < most
+        if (nominal := stated.get(name, abs(value))) != 0.0 and 1 / most < value / nominal < most
     }
-    return train_data.rig.model_copy(update={"nominal": {**before, **likely}})
+    return train_data.rig.model_copy(update={"nominal": {**stated, **plausible}})
 
 
-def _questions(
+def _open_questions(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
     effects: Sequence[JudgedEffect],
     verdict: str,
-    old: ComparisonRows,
+    present: ComparisonRows,
 ) -> list[PredictedAnswer]:
     if verdict == CLEAN:
         rig = hypotheses.train_data.rig
-        small = [smallest_effect(effect, rig) for effect in dict.fromkeys(hypotheses.effects)]
-        asked = [OpenQuestion(h, Explanation(), False) for h in small if h is not None]
-        answers = [PredictedAnswer(q, present_separation(q, old)) for q in asked]
+        smallest = [smallest_effect(effect, rig) for effect in dict.fromkeys(hypotheses.effects)]
+        questions = [OpenQuestion(h, Explanation(), False) for h in smallest if h is not None]
+        answers = [PredictedAnswer(q, present_separation(q, present)) for q in questions]
         return [a for a in answers if a.present < LEAST_SEPARATION]
     if verdict == CONFOUNDED:
         others = tied_sets(hypotheses, winner, effects)
@@ -127,7 +127,7 @@ def _questions(
         pairs = _undecided_questions(hypotheses)
     else:
         return []
-    return [PredictedAnswer(q, present_separation(q, old)) for q in pairs]
+    return [PredictedAnswer(q, present_separation(q, present)) for q in pairs]
 
 
 def explanation(hypothesis: Hypothesis) -> Explanation:
@@ -137,48 +137,49 @@ def explanation(hypothesis: Hypothesis) -> Explanation:
 
 def _undecided_questions(hypotheses: HypothesisSet) -> list[OpenQuestion]:
     """Return questions between the best set and others that leave about as little."""
-    allowed = [
-        o for o in hypotheses.fitted.values() if o.effects and not hypotheses.physical_problem(o)
-    ]
-    allowed.sort(key=lambda o: o.total)
-    if not allowed or allowed[0].total >= hypotheses.empty.total:
+    fitted = [o for o in hypotheses.fitted.values() if o.effects]
+    possible = [o for o in fitted if not hypotheses.physical_problem(o)]
+    possible.sort(key=lambda o: o.total)
+    if not possible or possible[0].total >= hypotheses.empty.total:
         return []
-    best = allowed[0]
-    limit = max(EXPERIMENT.near_energy * best.total, best.total + 0.1 * hypotheses.noise_band.total)
+    best, band = possible[0], sum(hypotheses.noise_band.values())
+    limit = max(EXPERIMENT.near_energy * best.total, best.total + 0.1 * band)
     # A set that only adds effects to the best one is no other explanation.
-    near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys]
-    near = near[: EXPERIMENT.rivals]
-    return [OpenQuestion(explanation(best), explanation(o)) for o in near]
+    others = [o for o in possible[1:] if o.total <= limit and not best.keys <= o.keys]
+    others = others[: EXPERIMENT.rivals]
+    return [OpenQuestion(explanation(best), explanation(o)) for o in others]
 
 
 def _best_steps(
-    asked: Sequence[PredictedAnswer],
-    tried: Sequence[ex.CandidateExcitation],
+    questions: Sequence[PredictedAnswer],
+    candidates: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
-    old: ComparisonRows,
+    present: ComparisonRows,
 ) -> tuple[list[ex.CandidateExcitation], list[PredictedAnswer]] | None:
     """Return the steps that answer most questions, and their answers; None if there is none."""
-    if not asked:
+    if not questions:
         return None
     table: list[list[PredictedAnswer]] = []
     for view in views:
-        new = ComparisonRows(old.train_data, view, old)
-        found = (separation(a.question, old, new) for a in asked)
-        table.append(
-            [replace(a, predicted=s, equation=e) for a, (s, e) in zip(asked, found, strict=True)]
-        )
+        new = ComparisonRows(present.train_data, view, present)
+        row = []
+        for answer in questions:
+            predicted, equation = separation(answer.question, present, new)
+            row.append(replace(answer, predicted=predicted, equation=equation))
+        table.append(row)
     chosen: list[int] = []
-    while len(chosen) < min(EXPERIMENT.steps, len(tried)):
-        worth = [_total_answered(_best_answers(table, [*chosen, k])) for k in range(len(tried))]
-        k = int(np.argmax(worth))
+    count = len(candidates)
+    while len(chosen) < min(EXPERIMENT.steps, count):
+        scores = [_total_answered(_best_answers(table, [*chosen, k])) for k in range(count)]
+        k = int(np.argmax(scores))
         before = _total_answered(_best_answers(table, chosen)) if chosen else 0.0
-        if worth[k] - before < EXPERIMENT.least_step_gain:
+        if scores[k] - before < EXPERIMENT.least_step_gain:
             break
         chosen.append(k)
     if not chosen:
         return None
     answered = [a for a in _best_answers(table, chosen) if a.open]
-    return ([tried[k] for k in chosen], answered) if answered else None
+    return ([candidates[k] for k in chosen], answered) if answered else None
 
 
 def _best_answers(
@@ -195,25 +196,25 @@ def _total_answered(answers: Sequence[PredictedAnswer]) -> float:
 def _covering_experiment(
     train_data: RegressionData,
     winner: Hypothesis,
-    moves: Sequence[Dependence],
-    tried: Sequence[ex.CandidateExcitation],
+    clues: Sequence[Dependence],
+    candidates: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
     """Return an experiment beyond the range or the lines of the records, None if none is."""
-    found = wider_range(train_data, moves, views, EXPERIMENT.least_gain)
-    found = found or more_lines(train_data, moves, tried)
-    if found is None:
+    extension = wider_range(train_data, clues, views, EXPERIMENT.least_gain)
+    extension = extension or more_lines(train_data, clues, candidates)
+    if extension is None:
         return None
-    now = largest_rms(train_data, winner.fit.residual)
+    present_rms = largest_rms(train_data, winner.fit.residual)
     return {
         "kind": COVER,
         "separates": [],
-        "covers": {"variable": found.variable, "times": found.times},
-        "present": now,
-        "predicted": now * (found.times if found.variable != LINES else 1.0),
-        "equation": found.equation,
-        "text": f"{tried[found.index].text}: {found.words}",
-        **_protocols(train_data, [tried[found.index]]),
+        "covers": {"variable": extension.variable, "times": extension.times},
+        "present": present_rms,
+        "predicted": present_rms * (extension.times if extension.variable != LINES else 1.0),
+        "equation": extension.equation,
+        "text": f"{candidates[extension.index].text}: {extension.words}",
+        **_protocols(train_data, [candidates[extension.index]]),
     }
 
 
@@ -224,7 +225,7 @@ def _proposal(
     answers: Sequence[PredictedAnswer],
 ) -> Mapping[str, Any]:
     weakest = min(answers, key=lambda a: a.predicted)
-    separates = _names(answers)
+    separates = _separated_effects(answers)
     what = (
         f"predicted separation {weakest.predicted:.1f} times the noise, {weakest.present:.1f} with "
         "the present records"
@@ -250,7 +251,7 @@ def _proposal(
     }  # fmt: skip
 
 
-def _names(answers: Sequence[PredictedAnswer]) -> list[dict[str, str]]:
+def _separated_effects(answers: Sequence[PredictedAnswer]) -> list[dict[str, str]]:
     """Return names and places of the effects that only one side of a question has, each once."""
     names: dict[tuple[str, str], None] = {}
     for answer in answers:
@@ -275,23 +276,23 @@ def _protocols(
 
 
 def _experiment_in_words(
-    effects: Sequence[JudgedEffect], asked: Sequence[PredictedAnswer]
+    effects: Sequence[JudgedEffect], questions: Sequence[PredictedAnswer]
 ) -> Mapping[str, Any] | None:
     """Describe an experiment in words, for rigs without a twin."""
     pairs = [(e.name, r.name) for e in effects for r in e.rivals if r.tied]
     texts = [_separated_by(*pair) for pair in pairs]
     return {
         "kind": TELL,
-        "separates": _names(asked),
+        "separates": _separated_effects(questions),
         "text": next((t for t in texts if t), "another amplitude and frequency"),
     }
 
 
 def _separated_by(name: str, rival: str) -> str:
     """Return the excitation that separates two effects, from the one that confounds the other."""
-    for one, other in ((rival, name), (name, rival)):
-        kind = known()[one]
-        if issubclass(kind, Effect) and other in kind.confounders:
+    for first, second in ((rival, name), (name, rival)):
+        kind = known()[first]
+        if issubclass(kind, Effect) and second in kind.confounders:
             return kind.separated_by
     return ""
 
@@ -308,31 +309,31 @@ class RangeExtension:
 
 
 def wider_range(
-    train_data: RegressionData, moves: Sequence[Dependence], views: Sequence[MeasurementView],
+    train_data: RegressionData, clues: Sequence[Dependence], views: Sequence[MeasurementView],
     least: float,
 ) -> RangeExtension | None:  # fmt: skip
     """Return the excitation with the widest range of a clue's variable, None if none is wider.
 
-    The first clue in `moves` is used for which an excitation reaches `least` times the range of the
+    The first clue in `clues` is used for which an excitation reaches `least` times the range of the
     records.
     """
-    for clue in moves:
+    for clue in clues:
         joint = joint_of(clue.equation)
-        own = [s for s in train_data.records if joint + 1 not in s.record.locked]
+        moving = [s for s in train_data.records if joint + 1 not in s.record.locked]
         for name in (n for n in (clue.variable, clue.by) if n and n != TIME):
-            seen = [variables(train_data.rig, s.signals, joint).get(name) for s in own]
-            values = [v for v in seen if v is not None]
+            of_records = [variables(train_data.rig, s.signals, joint).get(name) for s in moving]
+            values = [v for v in of_records if v is not None]
             if not values:
                 continue
             low, high = np.percentile(np.concatenate(values), [1, 99]).tolist()
-            reach = [_range_ratio(view, joint, name, low, high) for view in views]
-            k = int(np.argmax(reach))
-            if reach[k] >= least:
+            ratios = [_range_ratio(view, joint, name, low, high) for view in views]
+            k = int(np.argmax(ratios))
+            if ratios[k] >= least:
                 words = (
-                    f"covers {reach[k]:.1f} times the range of {name}, on which the remaining "
+                    f"covers {ratios[k]:.1f} times the range of {name}, on which the remaining "
                     "residual depends"
                 )
-                return RangeExtension(k, name, reach[k], clue.equation, words)
+                return RangeExtension(k, name, ratios[k], clue.equation, words)
     return None
 
 
@@ -345,21 +346,24 @@ def _range_ratio(view: MeasurementView, joint: int, name: str, low: float, high:
 
 
 def more_lines(
-    train_data: RegressionData, moves: Sequence[Dependence], tried: Sequence[CandidateExcitation]
+    train_data: RegressionData,
+    clues: Sequence[Dependence],
+    candidates: Sequence[CandidateExcitation],
 ) -> RangeExtension | None:
     """Return the excitation with most lines where the records of the clue's joint have few.
 
     A single sine gives one path through a nonlinearity, which many forms fit equally well.
     """
-    equation = moves[0].equation
+    equation = clues[0].equation
     joint = joint_of(equation)
-    held = [len(s.record.lines) for s in train_data.records if joint + 1 not in s.record.locked]
-    counts = [len(one.tones[joint].lines) if joint in one.tones else 0 for one in tried]
-    if not held or not min(held) or not counts:
+    records = [c.record for c in train_data.records if joint + 1 not in c.record.locked]
+    present = [len(record.lines) for record in records]
+    counts = [len(c.tones[joint].lines) if joint in c.tones else 0 for c in candidates]
+    if not present or not min(present) or not counts:
         return None
     k = int(np.argmax(counts))
-    times = counts[k] / max(held)
+    times = counts[k] / max(present)
     if times < EXPERIMENT.line_ratio:
         return None
-    words = f"excites joint {joint + 1} at {counts[k]} frequencies instead of {max(held)}"
+    words = f"excites joint {joint + 1} at {counts[k]} frequencies instead of {max(present)}"
     return RangeExtension(k, LINES, times, equation, words)

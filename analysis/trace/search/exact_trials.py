@@ -31,7 +31,7 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> 
     Repeated while the set leaves more than noise. A set within the tolerance for its forms is
     replaced only by one that leaves a tenth, or only noise.
     """
-    band = hypotheses.noise_band.by_equation
+    band = hypotheses.noise_band
     while above := {e for e, v in current.excess_energy.items() if v > band[e]}:
         tried = [
             hypotheses.refined_below(energy, effects)

@@ -66,9 +66,7 @@ def geometry_for_smaller_set(
             continue
         moved, band = replace(hypothesis, excess_energy=left), hypotheses.noise_band
         is_as_small = all(
-            v <= max(band.by_equation[e], winner.excess_energy[e])
-            if explained
-            else hypotheses.negligible(e, v)
+            v <= max(band[e], winner.excess_energy[e]) if explained else hypotheses.negligible(e, v)
             for e, v in left.items()
         )
         if is_as_small and (best is None or is_preferred(moved, best[0], band)):

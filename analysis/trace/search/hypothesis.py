@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,8 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
+# Energy above noise, by equation, up to which a residual counts as noise.
+NoiseBand = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -78,18 +80,6 @@ def of_one_law(effect: Effect, other: Effect) -> bool:
     return is_special_case(effect, other) or is_special_case(other, effect)
 
 
-@dataclass(frozen=True)
-class NoiseBand:
-    """The energy above noise, `by_equation`, up to which a residual counts as noise."""
-
-    by_equation: dict[str, float]
-
-    @property
-    def total(self) -> float:
-        """The sum over equations."""
-        return sum(self.by_equation.values())
-
-
 def negative_body(rig: Rig, fit: ExactFit, baseline: ExactFit) -> str:
     """Return in words which inertia M or weight W of a fit is negative ('' if none is).
 
@@ -127,12 +117,12 @@ def noise_band(data: RegressionData) -> NoiseBand:
     rows = data.row_counts
     for s in data.segments:
         band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * s.count
-    return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
+    return {e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()}
 
 
 def within_band(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
     """Return whether every equation's energy above noise lies within its band."""
-    return all(value <= limit.by_equation[e] for e, value in excess_energy.items())
+    return all(value <= limit[e] for e, value in excess_energy.items())
 
 
 def log_energy_ratio(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand) -> float:
@@ -142,9 +132,8 @@ def log_energy_ratio(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand
     so that the form error of a large effect does not hide a small effect in other equations.
     """
     return sum(
-        float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
+        float(np.log((max(0.0, v) + limit[e]) / (max(0.0, other.excess_energy[e]) + limit[e])))
         for e, v in hypothesis.excess_energy.items()
-        for band in (limit.by_equation[e],)
     )
 
 
@@ -169,8 +158,8 @@ def is_preferred(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand) ->
 
 def spoils_equation(hypothesis: Hypothesis, reference: Hypothesis, limit: NoiseBand) -> bool:
     """Return whether an equation keeps more than under `reference`, by more than noise."""
-    band, reference_energy = limit.by_equation, reference.excess_energy
-    return any(v > reference_energy[e] + band[e] for e, v in hypothesis.excess_energy.items())
+    before = reference.excess_energy
+    return any(v > before[e] + limit[e] for e, v in hypothesis.excess_energy.items())
 
 
 def removes_too_little(without: Hypothesis, hypothesis: Hypothesis, limit: NoiseBand) -> bool:

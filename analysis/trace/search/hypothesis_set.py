@@ -222,7 +222,7 @@ class HypothesisSet:
     def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
         band = self.noise_band
-        singles = [self.refined(effects) for effects in self._singles(candidates, r)]
+        singles = [self.refined(effects) for effects in self._best_singles(candidates, r)]
         current = self.prune(self.best([self.empty, *singles]))
         if within_band(current.excess_energy, band):
             return current
@@ -257,7 +257,7 @@ class HypothesisSet:
         That is `SEARCH.residual_limit` as an rms over the noise, or `SEARCH.form_share` of what the
         baseline leaves.
         """
-        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band.by_equation[equation]
+        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band[equation]
         return energy <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
     def completed_to_noise(self, current: Hypothesis) -> Hypothesis:
@@ -294,7 +294,9 @@ class HypothesisSet:
 
         return linear_fit.project(data, columns, size, allowed, mask)
 
-    def _singles(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
+    def _best_singles(
+        self, candidates: linear_fit.CandidateColumns, r: Array
+    ) -> list[tuple[Used, ...]]:
         g = linear_fit.gains(
             candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
         )
@@ -419,14 +421,14 @@ class HypothesisSet:
         An effect that was chosen before the last one was added may be wrong beside it, and one
         effect may have been chosen in place of two (`confounders.composites`).
         """
-        seen = {current.keys}
+        tried = {current.keys}
         while sets := confusable_sets(self.train_data, self.effects, current):
             pruned = self.prune(self.best([current, *(self.refined(s, current) for s in sets)]))
             other = self.best([current, pruned])  # one that lost an effect again may be worse
-            if other.keys in seen:
+            if other.keys in tried:
                 break
             current = other
-            seen.add(current.keys)
+            tried.add(current.keys)
         return current
 
     def extended_in(self, current: Hypothesis, equations: Collection[str]) -> Hypothesis | None:

@@ -43,12 +43,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 
-def refine(
-    data: RegressionData,
-    terms: Sequence[Used],
-    rival: ExactFit | None = None,
-    steps: int = SEARCH.steps,
-) -> ExactFit:
+def refine(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None = None) -> ExactFit:
     """Return the fit with searched shapes of all effects that are not among the data's own terms.
 
     The search starts from the shapes given. Of the forms of an effect the one that leaves least, at
@@ -64,14 +59,12 @@ def refine(
     (`RegressionData.relative`). The fit returned is of rows over their noise.
     """
     if not rescale(data, terms):
-        return _refined(data, terms, rival, steps)
-    relative_fit = _refined(replace(data, relative=True), terms, rival, steps)
+        return _refined(data, terms, rival)
+    relative_fit = _refined(replace(data, relative=True), terms, rival)
     return fit_coefficients(data, relative_fit.terms)
 
 
-def _refined(
-    data: RegressionData, terms: Sequence[Used], rival: ExactFit | None, steps: int
-) -> ExactFit:
+def _refined(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None) -> ExactFit:
     """Return the fit of `refine` to rows of the size that `data.relative` states."""
     in_rival: Sequence[int] = ()
     rival_energy = math.inf
@@ -86,18 +79,18 @@ def _refined(
             if continued.energy > max(limit, SEARCH.promising_drop * start.energy):
                 return continued
             terms = continued.terms
-    fit = _with_searched_shapes(data, terms, steps)
+    fit = _with_searched_shapes(data, terms)
     for k in range(len(terms)):
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         if k in in_rival and fit.energy > rival_energy:
             continue
-        fit = _with_details(data, _in_best_form(data, fit, k, steps), k, steps)
+        fit = _with_details(data, _in_best_form(data, fit, k), k)
     return fit
 
 
-def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
+def _with_details(data: RegressionData, fit: ExactFit, place: int) -> ExactFit:
     """Return the fit with details of the form of term number `place`, where they remove enough."""
     used = fit.terms[place]
     starts = effect_in(used).detailed_shapes(data.rig, used.shape)
@@ -110,20 +103,18 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         if _predicted_gain(data, fit, used, start) >= 0.5 * least_gain
     ]
     nearest = sorted(promising, key=lambda model: model.energy)[: SEARCH.detail_starts]
-    searched = [_with_searched_shapes(data, model.terms, steps) for model in nearest]
+    searched = [_with_searched_shapes(data, model.terms) for model in nearest]
     detailed = min(searched, key=lambda model: model.energy, default=fit)
     if fit.energy - detailed.energy <= least_gain:
         return fit
     # A form that fitted better without the details need not do so with them.
-    detailed = _in_best_form(data, detailed, place, steps)
+    detailed = _in_best_form(data, detailed, place)
     earned = fit.energy - detailed.energy > least_gain
     sure = earned and _determines_shapes(data, detailed, detailed.terms[place], used)
-    return detailed if sure and not _replaces_detail(data, fit, detailed, used, steps) else fit
+    return detailed if sure and not _replaces_detail(data, fit, detailed, used) else fit
 
 
-def _replaces_detail(
-    data: RegressionData, fit: ExactFit, detailed: ExactFit, used: Used, steps: int
-) -> bool:
+def _replaces_detail(data: RegressionData, fit: ExactFit, detailed: ExactFit, used: Used) -> bool:
     """Return whether another effect beside `used` leaves as little as details of its form.
 
     Over part of its range, a gain and an offset of a sensor resemble a curved characteristic.
@@ -133,8 +124,7 @@ def _replaces_detail(
         effect for effect in effect_in(used).alternatives_to_detail() if effect not in present
     ]
     beside = (
-        _with_searched_shapes(data, (*fit.terms, at_start(data.rig, effect)), steps)
-        for effect in others
+        _with_searched_shapes(data, (*fit.terms, at_start(data.rig, effect))) for effect in others
     )
     return any(model.energy <= detailed.energy + SEARCH.number_price for model in beside)
 
@@ -148,7 +138,9 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, undetail
     presliding distance that decreases with speed.
     """
     shapes = shapes_of(data.rig, used)
-    if any(map(_at_end, shapes, used.shape)) or effect_in(used).outside(data.rig, used.shape):
+    if any(map(_detail_at_bound, shapes, used.shape)) or effect_in(used).outside(
+        data.rig, used.shape
+    ):
         return False
     names, columns = tangent(data, fit)
     misfit = math.sqrt(max(1.0, fit.energy / len(fit.residual)))
@@ -165,14 +157,14 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, undetail
     return True
 
 
-def _at_end(shape: Shape, value: float) -> bool:
+def _detail_at_bound(shape: Shape, value: float) -> bool:
     """Return whether a detail lies at its high bound, or at a low one below 0."""
     margin = 1e-3 * (shape.high - shape.low)
     low = shape.low + margin if shape.low < 0.0 else -math.inf
     return shape.detail and not shape.saturates and not low <= value <= shape.high - margin
 
 
-def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
+def _in_best_form(data: RegressionData, fit: ExactFit, place: int) -> ExactFit:
     """Return the fit with the term number `place` in the form that leaves least.
 
     Each further free number of a form must be significant (`TRACE.standard_errors`): an exponent
@@ -189,7 +181,7 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
     while True:
         used = fit.terms[place]
         others = [
-            _with_searched_shapes(data, with_term(fit.terms, used, Used(used.term, shape)), steps)
+            _with_searched_shapes(data, with_term(fit.terms, used, Used(used.term, shape)))
             for shape in effect_in(used).other_form_starts(data.rig, used.shape)
         ]
         best = min(others, key=priced, default=fit)
@@ -210,7 +202,10 @@ def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Use
     return float(column @ fit.residual) ** 2 / size if size > 0 else 0.0
 
 
-def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
+def _with_searched_shapes(
+    data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps
+) -> ExactFit:
+    """Return the fit whose searched shapes start at those of the terms, after at most `steps`."""
     free = _free_shapes(data, terms)
     if not free:
         return fit_coefficients(data, terms)
@@ -292,7 +287,7 @@ def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[tuple[Used,
             continue
         for shape in used.term.other_form_starts(data.rig, used.shape):
             terms = with_term(fit.terms, used, Used(used.term, shape))
-            out.append((used, _with_searched_shapes(data, terms, SEARCH.steps)))
+            out.append((used, _with_searched_shapes(data, terms)))
     return out
 
 
@@ -311,7 +306,7 @@ def at_best_size(data: RegressionData, used: Used, others: Sequence[Used]) -> Us
             ),
         )
 
-    return _least(data, [scaled(share) for share in SEARCH.start_shares], others)
+    return _best_start(data, [scaled(share) for share in SEARCH.start_shares], others)
 
 
 def at_best_point(data: RegressionData, effect: Effect, others: Sequence[Used]) -> Used:
@@ -322,10 +317,11 @@ def at_best_point(data: RegressionData, effect: Effect, others: Sequence[Used]) 
     shapes = effect.shapes(data.rig)
     if not any(s.neutral is not None and s.low < s.neutral for s in shapes):
         return at_start(data.rig, effect)
-    return _least(data, [Used(effect, point) for point in shape_grid(effect, data.rig)], others)
+    starts = [Used(effect, point) for point in shape_grid(effect, data.rig)]
+    return _best_start(data, starts, others)
 
 
-def _least(data: RegressionData, starts: Sequence[Used], others: Sequence[Used]) -> Used:
+def _best_start(data: RegressionData, starts: Sequence[Used], others: Sequence[Used]) -> Used:
     """Return the start that leaves least energy in the data's model with the others."""
     return min(starts, key=lambda used: fit_coefficients(data, (*data.terms, *others, used)).energy)
 

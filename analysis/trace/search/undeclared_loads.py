@@ -113,7 +113,7 @@ def undeclared_load(records: TraceRuns, effects: Sequence[Effect] = ()) -> Undec
         (holdout, loaded_records(rig, terms, holdout, load, divided=not judge)),
         (judge, loaded_records(rig, terms, judge, load, divided=False) if judge else frozenset()),
     ]
-    carry = [word for runs, loaded in loaded_by_task for word in _in_words(runs, loaded)]
+    carry = [word for runs, loaded in loaded_by_task for word in _loaded_names(runs, loaded)]
     weighed = "" if load.shows_inertia else ", by its weight alone"
     words = (
         f"no record states a load: by the torque balances {' '.join(dict.fromkeys(carry))} carry "
@@ -125,7 +125,7 @@ def undeclared_load(records: TraceRuns, effects: Sequence[Effect] = ()) -> Undec
     return UndeclaredLoad(stated, words, load.shows_inertia)
 
 
-def _in_words(runs: Sequence[Run], loaded: frozenset[Key]) -> list[str]:
+def _loaded_names(runs: Sequence[Run], loaded: frozenset[Key]) -> list[str]:
     """Return the names of loaded steps, and of loaded records of steps that are partly loaded."""
     out = []
     for number, run in enumerate(runs):
@@ -146,15 +146,15 @@ def fitted_load(rig: Rig, terms: Sequence[Used], runs: Sequence[Run]) -> LoadFit
     rows = _load_rows(rig, terms, runs)
     basis = orthonormal(rows.data.base)
     before = rows.residual - basis @ (basis.T @ rows.residual)
-    steps = _steps(runs, rows.keys)
+    steps = _step_masks(runs, rows.keys)
     loaded = _first_guess(rows, basis, before, steps)
     for _ in range(DATA.load_rounds):
-        mass, change = _fit(rows, loaded)
-        states = _states(rows, rows.residual - rows.data.base @ change, mass)
+        mass, change = _fitted_mass(rows, loaded)
+        states = _records_with_load(rows, rows.residual - rows.data.base @ change, mass)
         if (states == loaded).all():
             break
         loaded = states
-    mass, change = _fit(rows, loaded)
+    mass, change = _fitted_mass(rows, loaded)
     after = rows.residual - rows.data.base @ change - mass * rows.with_load(loaded)
     start = float(before @ before)
     removed, excess = start - float(after @ after), start - len(before)
@@ -182,7 +182,7 @@ def loaded_records(
     for s in rows.data.segments if divided else ():
         used[s.where] = ~in_judging_block(rows.data.source(s)[1].time)
     rows = replace(rows, column=rows.column * used)
-    return rows.chosen(_states(rows, rows.residual, load.mass))
+    return rows.chosen(_records_with_load(rows, rows.residual, load.mass))
 
 
 def with_loads(runs: Sequence[Run], loaded: frozenset[Key]) -> tuple[Run, ...]:
@@ -221,7 +221,7 @@ def _load_rows(
     return _LoadRows(data, column, data.mean_residual, record_number, keys)
 
 
-def _steps(runs: Sequence[Run], keys: Sequence[Key]) -> list[Mask]:
+def _step_masks(runs: Sequence[Run], keys: Sequence[Key]) -> list[Mask]:
     """Return masks (U,) of the records of each step of each run, of each record if all are one."""
     step_of = {(n, r.name): (n, r.step) for n, run in enumerate(runs) for r in run.records}
     step_of_record = [step_of[key] for key in keys]
@@ -256,7 +256,7 @@ def _first_guess(rows: _LoadRows, basis: Array, residual: Array, steps: Sequence
     return np.asarray(np.array(steps)[best].any(axis=0))
 
 
-def _fit(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:
+def _fitted_mass(rows: _LoadRows, loaded: Mask) -> tuple[float, Array]:
     """Return the mass [kg] and the changes (k,) of the baseline's coefficients."""
     matrix = np.column_stack((rows.data.base, rows.with_load(loaded)))
     solution = shortest(matrix, rows.residual, TRACE.rank_limit)
@@ -289,7 +289,7 @@ def _inertia_agrees(rows: _LoadRows, basis: Array, loaded: Mask) -> bool | None:
     return bool(abs(weight - inertia) <= allowed + TRACE.standard_errors * deviation)
 
 
-def _states(rows: _LoadRows, residual: Array, mass: float) -> Mask:
+def _records_with_load(rows: _LoadRows, residual: Array, mass: float) -> Mask:
     """Return a mask (U,) of the records in which the load reduces `residual` (M,)."""
     added = mass * rows.column
     return np.asarray(rows.sums(residual * added) > 0.5 * rows.sums(added * added))

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from analysis.trace.free_forms import _simplest_first
 
-BAND = SimpleNamespace(by_equation={"flow_cap_1": 100.0}, total=100.0)
+BAND = {"flow_cap_1": 100.0}
 
 
 def set_of(laws: int, energy: float, numbers: int) -> Any:

@@ -86,7 +86,7 @@ def test_an_extension_that_ended_in_a_local_minimum_is_fitted_again(rig: Rig) ->
 def test_of_two_equally_simple_sets_the_one_that_spoils_no_equation_is_preferred(rig: Rig) -> None:
     """In all it leaves 1 % more, which another effect makes; a torque it leaves a hundredth."""
     s = searched(rig, *pair_of_runs(rig, c_internal=LEAK), "internal_leakage", "torque_offset")
-    band = s.hypotheses.noise_band.by_equation
+    band = s.hypotheses.noise_band
 
     def leaving(name: str, torque: float, flow: float) -> Hypothesis:
         times = {"torque_2": torque, "flow_cap_2": flow, "flow_rod_2": flow}

@@ -172,7 +172,7 @@ def test_only_effects_that_one_answer_lacks_are_separated() -> None:
     shared = at["internal_leakage", "joint 1"]
     lag, delay = at["sensor_lag", "joint 1 rod"], at["channel_delay", "joint 1 rod"]
     question = OpenQuestion(Explanation((shared, lag)), Explanation((shared, delay)))
-    assert proposal._names([proposal.PredictedAnswer(question, 0.0)]) == [
+    assert proposal._separated_effects([proposal.PredictedAnswer(question, 0.0)]) == [
         {"name": "sensor_lag", "where": "joint 1 rod"},
         {"name": "channel_delay", "where": "joint 1 rod"},
     ]

@@ -126,7 +126,7 @@ def _one_candidate(
     candidates: linear_fit.CandidateColumns, train_data: Any, residual: Array, rng: Any
 ) -> Array:
     """Return the gain of the candidate that stands first under each flip, of no other."""
-    r = inference.sign_flipped(train_data, TRACE.sign_flips, rng, residual)
+    r = inference.sign_flipped(train_data, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     size = np.maximum(np.diag(candidates.K), 1e-300)
     first = int(np.argmax(size > candidates.visibility_limit))
