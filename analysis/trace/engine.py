@@ -24,12 +24,7 @@ from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.trace_rows import TraceRuns, trace_rows, with_other_motions_apart
 from analysis.trace.finding import Finding
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
-from analysis.trace.in_motion import (
-    find,
-    held_out_ratios,
-    joints_with_friction,
-    rest_phase_notes,
-)
+from analysis.trace.in_motion import find, held_out_ratios, joints_with_friction, rest_phase_notes
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import CurveRange
 from analysis.trace.judge.unrepeated import phase_notes, unlocked_lines, unrepeated_notes
@@ -77,7 +72,7 @@ def trace(
     progress: Callable[[float], None] | None = None,
     judge: Sequence[Run] = (),
 ) -> Trace:
-    """Say what the baseline lacks on `runs`, name it or refuse to, and judge it by other records.
+    """Return the effects that the baseline lacks on `runs`, with their errors on other records.
 
     All parameters are fitted to `runs`. Records of `holdout` choose between effects and forms.
     Those of `judge` are read once, after everything is chosen: they give the errors, and may turn
@@ -87,7 +82,7 @@ def trace(
     `effects`: the candidates, by default the whole catalogue at every place.
     `seed`: of the sign flips.
     `families`: the families of equations to trace, torque or flow. They share no parameter, so that
-    a remainder in one does not hide an effect in the other.
+    a residual in one does not hide an effect in the other.
     `look_ahead`: design the next experiment.
     `terms`: a model's terms in place of the baseline's; shapes of its effects are not searched.
     `free_forms`: try mechanisms whose curve the data give where no named effect explains.
@@ -97,39 +92,39 @@ def trace(
     judging records that are equal to others, and for records that are too short.
     """
     started = time.perf_counter()
-    for given in (runs, holdout, judge):
-        refuse_malformed(given)
+    for task_runs in (runs, holdout, judge):
+        refuse_malformed(task_runs)
     rig = ck.common_rig([*runs, *holdout, *judge])
     refuse_repeated_records(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
     effects = catalogue(rig) if effects is None else effects
     options = _Options(effects, seed, look_ahead, free_forms)
-    apart, notes = with_other_motions_apart(
+    separated, notes = with_other_motions_apart(
         with_common_bandwidth(with_loads_stated([*runs, *holdout, *judge]))
     )
-    stated = iter(apart)
-    train, unseen, judging = (tuple(next(stated) for _ in x) for x in (runs, holdout, judge))
+    in_order = iter(separated)
+    train, unseen, judging = (tuple(next(in_order) for _ in x) for x in (runs, holdout, judge))
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
-    result = _of_rig(rig, _traced(records, options, progress or (lambda _: None)))
+    result = _with_stated_rig(rig, _traced(records, options, progress or (lambda _: None)))
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
     may_be_load &= all(used.term.name != Payload.name for used in known)
     load = None
     if result.verdict == UNEXPLAINED and MECHANICAL in families and may_be_load:
-        beside = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
-        load = undeclared_load(records, beside)
+        refused = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
+        load = undeclared_load(records, refused)
     if load is None:
         return result
-    again = _of_rig(rig, _traced(load.records, options, lambda _: None))
+    again = _with_stated_rig(rig, _traced(load.records, options, lambda _: None))
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
         seconds = time.perf_counter() - started
         return replace(again, notes=(*notes, load.words, *again.notes), seconds=seconds)
     return replace(result, notes=(*result.notes, load.words)) if load.shows_inertia else result
 
 
-def _of_rig(rig: Rig, result: Trace) -> Trace:
+def _with_stated_rig(rig: Rig, result: Trace) -> Trace:
     """Return a trace whose models are of the rig as stated in its file."""
     before, after = (replace(m, rig=rig) for m in (result.model_before, result.model_after))
     return replace(result, model_before=before, model_after=after)
@@ -151,9 +146,9 @@ class _Options:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What a trace begins with: rows without unlocked lines, candidates, the baseline identified.
+    """The input of the search: rows without unlocked lines, candidates, the identified baseline.
 
-    `as_recorded` are the training rows with the lines, `notes` what the baseline shows.
+    `as_recorded` are the training rows with the lines, `notes` those on the baseline's parameters.
     """
 
     records: TraceRuns
@@ -181,8 +176,8 @@ def _prepared(records: TraceRuns, options: _Options) -> _Prepared:
         *(c.detail for c in baseline.checks if c.name == GEOMETRY and rig.uncertain_numbers),
     )
     candidates = Candidates(
-        _not_in_model(options.effects, known, moving),
-        _not_in_model(free_mechanisms(rig), known) if options.free_forms else [],
+        _lacking_candidates(options.effects, known, moving),
+        _lacking_candidates(free_mechanisms(rig), known) if options.free_forms else [],
         options.seed,
     )
     return _Prepared(records, rows, as_recorded.train, candidates, baseline.model, notes)
@@ -196,74 +191,74 @@ def _with_free_runs(
     Effects with which the free run fails or is far worse than without them are not named. A free
     run with parameters of the model without them (`held_out.completed`) is no evidence against it.
     """
-    before = prepared.baseline
+    baseline = prepared.baseline
 
     def fit(finding: Finding) -> FittedModel:
         choosing, named = prepared.rows.choosing_runs, prepared.candidates.named
-        return model_with_effects(prepared.records, choosing, before, named, finding)
+        return model_with_effects(prepared.records, choosing, baseline, named, finding)
 
     fitted = fit(finding)
-    simulated = held_out.completed(fitted.model, before)
-    first, last = held_out.free_runs(records.unseen, before, simulated)
-    if simulated is fitted.model and (worse := held_out.worse_free_run(first, last)):
+    simulated = held_out.completed(fitted.model, baseline)
+    runs_before, runs_after = held_out.free_runs(records.unseen, baseline, simulated)
+    if simulated is fitted.model and (worse := held_out.worse_free_run(runs_before, runs_after)):
         finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
-        fitted, last = fit(finding), first
-    return finding, fitted, (first, last)
+        fitted, runs_after = fit(finding), runs_before
+    return finding, fitted, (runs_before, runs_after)
 
 
-def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]) -> Trace:
+def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], None]) -> Trace:
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
     started = time.perf_counter()
     prepared = _prepared(records, options)
-    before = prepared.baseline
+    baseline = prepared.baseline
 
     def columns(share: float) -> None:
-        done(PREPARED + (COLUMNS - PREPARED) * share)
+        progress(PREPARED + (COLUMNS - PREPARED) * share)
 
     def searched(p: _Prepared) -> Finding:
         return find(p.records, p.rows, p.candidates, columns)
 
     finding = searched(prepared)
-    if known := unstated_noise(prepared.records, finding):
-        prepared = replace(prepared, records=known[0], rows=known[1])
+    if scaled := unstated_noise(prepared.records, finding):
+        prepared = replace(prepared, records=scaled[0], rows=scaled[1])
         finding = searched(prepared)
-    if by_geometry := _traced_within_tolerances(records, options, finding, done):
+    if by_geometry := _traced_within_tolerances(records, options, finding, progress):
         return by_geometry
-    done(JUDGED)
+    progress(JUDGED)
     records = replace(prepared.records, lines=finding.rows.filtering.lines)
     finding, fitted, free_runs = _with_free_runs(prepared, records, finding)
     hypotheses, rows, train_data = finding.hypotheses, finding.rows, finding.rows.train
     lines = spectral_lines(train_data, finding.winner.fit.residual)
-    moves, formulas = (
+    clues, formulas = (
         ((), ())
         if finding.verdict in (CLEAN, EXPLAINED) or finding.trained_on_noise
         else clues_to(train_data, rows.choosing, finding.winner, lines)
     )
     further = (
-        propose(hypotheses, finding.winner, finding.named, finding.verdict, moves)
+        propose(hypotheses, finding.winner, finding.named, finding.verdict, clues)
         if options.look_ahead
         else None
     )
-    winner, after = fitted.winner, fitted.model
+    winner, model = fitted.winner, fitted.model
     if winner is not finding.winner:
         lines = spectral_lines(train_data, winner.fit.residual)
     # Everything is chosen. From here on the judging rows are read, and nothing is chosen by them.
-    first, last = (
+    fit_before, fit_after = (
         held_out.refitted_to_held_out(rows.judging, fit)
         for fit in (hypotheses.empty.fit, winner.fit)
     )
     curves = CurveRange(rows.judging, winner.fit).limits
     error = held_out.errors(
-        records.rig, rows.members, first, last, rows.divided, curves, train_data.floors,
+        records.rig, rows.members, fit_before, fit_after, rows.divided, curves, train_data.floors,
         records.noise_ratio,
     )  # fmt: skip
-    verdict, kept = _final_verdict(records, finding, winner)
-    hidden = []
+    verdict, judging_notes = _final_verdict(records, finding, winner)
+    limits = []
     if verdict != UNEXPLAINED:
         absorbed = fitted.absorbed
         if winner is not finding.winner:
             absorbed = absorbed_effects(hypotheses, prepared.candidates.named, winner)
-        hidden = detection_limits(absorbed, winner, after)
+        limits = detection_limits(absorbed, winner, model)
     notes = [
         *unseen_load_notes(records.train, records.unseen),
         *prepared.rows.notes,
@@ -278,45 +273,45 @@ def _traced(records: TraceRuns, options: _Options, done: Callable[[float], None]
         ),
         *phase_notes(finding.named, records.lines),
         *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
-        *refitted_notes(winner.fit, last, after),
-        *(why for _, why in shared_parameters(winner, after).values()),
+        *refitted_notes(winner.fit, fit_after, model),
+        *(why for _, why in shared_parameters(winner, model).values()),
         *record_condition_notes(train_data, winner),
-        *undetermined_notes(after, before, finding.rows.filtering.in_motion),
-        *kept,
+        *undetermined_notes(model, baseline, finding.rows.filtering.in_motion),
+        *judging_notes,
         *fitted.notes,
-        *detection_limit_notes(hidden),
+        *detection_limit_notes(limits),
     ]
     runs_before, runs_after = free_runs
-    left = 0.0
+    remaining = 0.0
     if verdict != CLEAN and not finding.trained_on_noise:
-        left = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
+        remaining = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
     result = Trace(
         verdict, fitted.effects, error.noise, error.before, error.after,
-        runs_before.fit, runs_after.fit, before, after,
-        left, moves, further,
-        prepared.as_recorded.floors, first, last, tuple(notes),
+        runs_before.fit, runs_after.fit, baseline, model,
+        remaining, clues, further,
+        prepared.as_recorded.floors, fit_before, fit_after, tuple(notes),
         refused=finding.refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
         lines=lines, formulas=formulas,
         free_curves=held_out.free_curves(runs_before, runs_after),
-        detection_limits=tuple(hidden), seconds=time.perf_counter() - started,
+        detection_limits=tuple(limits), seconds=time.perf_counter() - started,
     )  # fmt: skip
     notes += tolerated_error_notes(result)
     return replace(result, notes=tuple(notes), sentence=sentence(result))
 
 
 def _traced_within_tolerances(
-    records: TraceRuns, options: _Options, finding: Finding, done: Callable[[float], None]
+    records: TraceRuns, options: _Options, finding: Finding, progress: Callable[[float], None]
 ) -> Trace | None:
-    """Return a simpler answer beside a geometry within the rig file's tolerances, None without."""
+    """Return a simpler answer with a geometry within the rig file's tolerances, None if none."""
     if options.geometry_exact:
         return None
     explained = finding.verdict != UNEXPLAINED
     geometry = geometry_for_smaller_set(finding.hypotheses, finding.winner, explained)
     if geometry is None:
         return None
-    again = _traced(records.of_rig(geometry.rig), replace(options, geometry_exact=True), done)
+    again = _traced(records.of_rig(geometry.rig), replace(options, geometry_exact=True), progress)
     sizes = [
         (len(effects), sum(len(e.parameters) for e in effects))
         for effects in (again.effects, finding.named)
@@ -324,8 +319,8 @@ def _traced_within_tolerances(
     if again.verdict == UNEXPLAINED or (explained and sizes[0] >= sizes[1]):
         return None
     for equation, ratio in held_out_ratios(finding.rows, finding.winner).items():
-        most = max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio)
-        if again.after[equation] > most * again.noise_floor[equation]:
+        largest = max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio)
+        if again.after[equation] > largest * again.noise_floor[equation]:
             return None
     note = geometry_note(geometry, finding.named, explained)
     return replace(again, notes=(note, *again.notes))
@@ -334,33 +329,34 @@ def _traced_within_tolerances(
 def _final_verdict(
     records: TraceRuns, finding: Finding, winner: Hypothesis
 ) -> tuple[str, list[str]]:
-    """Return the verdict after the judging rows, and notes on what they keep or cannot show.
+    """Return the verdict after the judging rows, and notes on equations above the band there.
 
-    Where only torque balances with friction of the set keep too much, their rows are judged again
+    Where these are torque balances in which friction of the set acts, their rows are judged again
     with weights by speed, 0 at rest.
     """
     if finding.verdict == UNEXPLAINED:
         return UNEXPLAINED, []
-    kept, words = judging_rows_above_band(finding.rows.judging, finding.hypotheses.empty, winner)
-    joints = joints_with_friction(winner, kept)
+    judging, empty = finding.rows.judging, finding.hypotheses.empty
+    above_band, notes = judging_rows_above_band(judging, empty, winner)
+    joints = joints_with_friction(winner, above_band)
     if joints and not finding.rows.filtering.in_motion:
         rows = trace_rows(records, moving_filtering(joints))
         hypotheses = HypothesisSet(rows.train, [])
         moving = hypotheses.refined(winner.effects)
         if not judging_rows_above_band(rows.judging, hypotheses.empty, moving)[0]:
-            kept, words = set(), rest_phase_notes(joints, included=True)
-    return (UNEXPLAINED if kept else finding.verdict), words
+            above_band, notes = set(), rest_phase_notes(joints, included=True)
+    return (UNEXPLAINED if above_band else finding.verdict), notes
 
 
 def judging_rows_above_band(
     judge_data: RegressionData, before: Hypothesis, after: Hypothesis
 ) -> tuple[set[str], list[str]]:
-    """Return the equations whose judging rows keep more than the band, and notes on them."""
-    known = CurveRange(judge_data, after.fit)
-    above = gates.held_out_above_band(known.rows, before.fit, after.fit)
-    kept = [(e, figure) for e, figure in above if e not in known.beyond]
-    words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
-    return {e for e, _ in kept}, [*words, *known.notes]
+    """Return the equations whose judging rows are above the band, and notes on them."""
+    within_curves = CurveRange(judge_data, after.fit)
+    above = gates.held_out_above_band(within_curves.rows, before.fit, after.fit)
+    remaining = [(e, figure) for e, figure in above if e not in within_curves.beyond]
+    notes = [f"{e}: {figure} in the records that judge" for e, figure in remaining]
+    return {e for e, _ in remaining}, [*notes, *within_curves.notes]
 
 
 def _remaining_fraction(
@@ -371,18 +367,18 @@ def _remaining_fraction(
     `as_recorded` are the training rows before any sine was taken out of them.
     """
     noise = {(f.group, f.equation): f.noise for f in as_recorded.floors}
-    taken = sum(
+    sine_energy = sum(
         s.count * max(0.0, (noise[s.group, s.equation] / s.noise) ** 2 - 1)
         for s in hypotheses.train_data.segments
     )
-    start = hypotheses.empty.total + taken
+    start = hypotheses.empty.total + sine_energy
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
-def _not_in_model(
+def _lacking_candidates(
     candidates: Sequence[Effect], known: Sequence[Used], moving: int = 1
 ) -> list[Effect]:
     """Return the candidates that the model lacks and that can act where `moving` joints move."""
     in_model = {u.term.key for u in known}
-    fresh = [c for c in candidates if c.key not in in_model]
-    return [c for c in fresh if c.least_joints <= moving]
+    lacking = [c for c in candidates if c.key not in in_model]
+    return [c for c in lacking if c.least_joints <= moving]

@@ -1,4 +1,4 @@
-"""What is found on given rows: effects, the set of those that passed, the verdict, what remains."""
+"""The finding on given rows: judged effects, the set of those that passed, verdict, remainders."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from rig.model.units import plain
 
 
 class Remainder(NamedTuple):
-    """An equation that keeps more than noise, and how much in `words`.
+    """An equation that keeps more than noise, with the amount in `words`.
 
-    `veto`: it speaks against the named effects, and makes the verdict `unexplained`. Without a veto
-    a further effect may still act in the equation.
+    `veto`: it refutes the named effects and makes the verdict `unexplained`. Without a veto a
+    further effect may still act in the equation.
     """
 
     equation: str
@@ -36,9 +36,9 @@ def remainders(
 ) -> tuple[Remainder, ...]:
     """Return the equations in which a set leaves more than noise and tolerances allow.
 
-    First those above the band (`gates.equations_above_band`), which speak against the set, then
-    those whose training energy above noise exceeds `TRACE.visible_deviations` standard deviations
-    of the noise's own energy and `TRACE.visible_share` of what the baseline leaves.
+    First those above the band (`gates.equations_above_band`), which refute the set, then those
+    whose training energy above noise exceeds `TRACE.visible_deviations` standard deviations of the
+    noise's own energy and `TRACE.visible_share` of what the baseline leaves.
     """
     out = [
         Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
@@ -49,14 +49,14 @@ def remainders(
         share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
         if winner.effects and e not in listed and visible and share > TRACE.visible_share:
-            allowed = gates.form_share(holdout_data.rig, effects_among(winner.effects), e)
+            form_share = gates.form_share(holdout_data.rig, effects_among(winner.effects), e)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            out.append(Remainder(e, words + tolerance_words(share, allowed), False))
+            out.append(Remainder(e, words + tolerance_words(share, form_share), False))
     return tuple(out)
 
 
 def tolerance_words(share: float, allowed: float) -> str:
-    """Say why a remaining share of the energy does not speak against the named effects.
+    """Return in words why a remaining share of the energy does not refute the named effects.
 
     `allowed` is the share that their forms may miss (`gates.form_share`).
     """
@@ -120,7 +120,7 @@ def has_tied_rival(effects: tuple[JudgedEffect, ...]) -> bool:
 
 
 def remainder_notes(
-    verdict: str, left: Sequence[Remainder], in_noise: bool, named: bool
+    verdict: str, remaining: Sequence[Remainder], in_noise: bool, named: bool
 ) -> tuple[str, ...]:
     """State what remains in each equation, where the verdict itself does not say it.
 
@@ -128,18 +128,18 @@ def remainder_notes(
     """
     out = []
     if verdict == UNEXPLAINED and (named or in_noise):
-        out += [f"{r.equation}: {r.words}" for r in left if r.veto]
-    return (*out, *(f"{r.equation}: {r.words}" for r in left if not r.veto))
+        out += [f"{r.equation}: {r.words}" for r in remaining if r.veto]
+    return (*out, *(f"{r.equation}: {r.words}" for r in remaining if not r.veto))
 
 
 def without_unnamed_effects(finding: Finding) -> Finding:
     """Return a finding whose set (`winner`) holds only the effects that are named."""
     named = {(f.name, f.at) for f in finding.named}
     hypotheses, winner = finding.hypotheses, finding.winner
-    kept = [u for u in winner.effects if u.term.key in named]
-    if len(kept) == len(winner.effects):
+    named_effects = [u for u in winner.effects if u.term.key in named]
+    if len(named_effects) == len(winner.effects):
         return finding
-    winner = hypotheses.refined(kept)
-    left = remainders(hypotheses, winner, finding.rows.choosing) if kept else ()
-    notes = remainder_notes(finding.verdict, left, in_noise=False, named=bool(kept))
-    return replace(finding, winner=winner, remainders=left, notes=notes)
+    winner = hypotheses.refined(named_effects)
+    remaining = remainders(hypotheses, winner, finding.rows.choosing) if named_effects else ()
+    notes = remainder_notes(finding.verdict, remaining, in_noise=False, named=bool(named_effects))
+    return replace(finding, winner=winner, remainders=remaining, notes=notes)

@@ -1,11 +1,10 @@
 """The model with the effects that a trace found, and the intervals of its parameters.
 
-Shapes of effects with a hidden state are searched by multiple shooting too, from those found with
-the rows (see `analysis.identify.output_error.hidden_states`). They are used where the model with
-them is closer to held-out records in simulation and the errors of held-out rows do not grow.
-Otherwise the shapes from the rows are kept, and the interval of each shape is extended to include
-both values: two estimates that differ by more than their errors show that the effect's form is
-simpler than the real one.
+Shapes of effects with a hidden state are also searched by multiple shooting, from those found with
+the rows (see `analysis.identify.output_error.hidden_states`). They are used where they bring the
+simulation closer to held-out records and do not increase the errors of held-out rows. Otherwise the
+shapes from the rows are kept, and each interval is extended to include both values: estimates that
+differ by more than their errors show that the effect's form is simpler than the real one.
 """
 
 from __future__ import annotations
@@ -80,21 +79,21 @@ class FittedModel:
 def model_with_effects(
     records: TraceRuns,
     choosing_runs: Sequence[Run],
-    before: Model,
+    baseline: Model,
     candidates: Sequence[Effect],
     finding: Finding,
 ) -> FittedModel:
     """Identify the model with the effects found, hidden states by multiple shooting.
 
-    `before` is the baseline's model, `choosing_runs` and `candidates` are those of the search.
+    `baseline` is the baseline's model, `choosing_runs` and `candidates` are those of the search.
     """
     runs, rows = records.train, finding.rows
-    after, from_tolerances = _identified_with_effects(runs, finding.winner, before, rows)
+    model, from_tolerances = _identified_with_effects(runs, finding.winner, baseline, rows)
     winner, shots = shoot_hidden_states(
-        runs, choosing_runs, after, rows.train, rows.choosing, finding.winner
+        runs, choosing_runs, model, rows.train, rows.choosing, finding.winner
     )
     if winner is not finding.winner:
-        after, from_tolerances = _identified_with_effects(runs, winner, before, rows)
+        model, from_tolerances = _identified_with_effects(runs, winner, baseline, rows)
     from_tolerances |= shape_errors(rows.train, winner.fit)
     others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
     absorbed = None
@@ -103,43 +102,44 @@ def model_with_effects(
     larger = sets_with_small_effect(finding.hypotheses, absorbed, finding.winner, rows.choosing)
     others += [(hypothesis, "") for hypothesis, _ in larger]
     alternatives = [
-        (_identified_with_effects(runs, other, before, rows)[0], law) for other, law in others
+        (_identified_with_effects(runs, other, baseline, rows)[0], law) for other, law in others
     ]
     if finding.verdict == UNEXPLAINED:
-        alternatives.append((_by_held_out(finding, winner, after), ""))
-    by_alternatives = errors_by_alternatives(after, alternatives)
-    after = with_errors(after, by_alternatives)
+        alternatives.append((_fitted_to_choosing_rows(finding, winner, model), ""))
+    by_alternatives = errors_by_alternatives(model, alternatives)
+    model = with_errors(model, by_alternatives)
     effects = tuple(
         with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shots)
         for f in finding.named
     )
-    after = with_effect_values(after, effects)
+    model = with_effect_values(model, effects)
     shared = {
-        name: _with_curve(after.parameters[name], name, used, rows.train, finding.winner)
-        for name, (used, _) in shared_parameters(finding.winner, after).items()
+        name: _with_curve(model.parameters[name], name, used, rows.train, finding.winner)
+        for name, (used, _) in shared_parameters(finding.winner, model).items()
     }
-    after = replace(after, parameters={**after.parameters, **shared})
+    model = replace(model, parameters={**model.parameters, **shared})
     notes = small_effect_notes(finding.winner, larger)
-    return FittedModel(winner, after, effects, tuple(notes), absorbed)
+    return FittedModel(winner, model, effects, tuple(notes), absorbed)
 
 
-def _by_held_out(finding: Finding, winner: Hypothesis, model: Model) -> Model:
-    """Return the model with what choosing rows give for parameters that a residual may move.
+def _fitted_to_choosing_rows(finding: Finding, winner: Hypothesis, model: Model) -> Model:
+    """Return the model with parameters fitted to the choosing rows in families above the noise.
 
-    It has the parameters of the families of rows that keep more than noise: by other motions or on
-    another day an unknown cause moves them otherwise. The rows are fitted, not the records: those
-    would lack the judging blocks, which long filters reach from everywhere.
+    An unknown cause biases them otherwise in other motions or on another day. The rows are fitted,
+    not the records: without the judging blocks, long filters would leave hardly any row.
     """
     rows = finding.rows.choosing
     fit = fit_coefficients(rows, winner.fit.terms)
     values = fit.parameters(rows.rig)
     relative = {n: d / abs(fit.beta[n]) for n, d in deviations(rows, fit).items() if fit.beta[n]}
     families = set(map(family_of, equations_above_noise(finding.rows, winner)))
-    moved = {n for family in families for n in parameters_of(model.rig, model.terms, family)}
+    open_parameters = {
+        n for family in families for n in parameters_of(model.rig, model.terms, family)
+    }
     parameters = {
         n: replace(e, value=values[n], std=relative[n] * abs(values[n]))
         for n, e in model.parameters.items()
-        if n in moved and n in relative and e.identified
+        if n in open_parameters and n in relative and e.identified
     }
     return replace(model, parameters=parameters)
 
@@ -149,7 +149,8 @@ def _with_curve(
 ) -> Estimate:
     """Return a parameter that a free curve shares; its interval includes the whole curve.
 
-    Half of it is the parameter itself and what would add as much to the rows as the curve does.
+    Its half-width is the parameter itself plus the change that adds as much to the rows as the
+    curve does.
     """
     fit = winner.fit
     rows = design_matrix(data, fit.terms)
@@ -163,39 +164,39 @@ def _with_curve(
 
 
 def with_effect_values(model: Model, effects: Sequence[JudgedEffect]) -> Model:
-    """Return the model with a value for each number of the effects that it lacks.
+    """Return the model with the effects' estimates of parameters that it has not identified.
 
-    The records determine a curve as a whole, even where one of its values is mostly noise, and a
-    level beside others; without that value the model could not be simulated. It is the effect's,
-    with its interval.
+    The records determine a curve as a whole even where one of its values is mostly noise; without
+    that value the model could not be simulated.
     """
-    known = {n: e for f in effects for n, e in f.parameters.items()}
-    parameters = {n: e if e.identified else known.get(n, e) for n, e in model.parameters.items()}
+    effect_values = {n: e for f in effects for n, e in f.parameters.items()}
+    parameters = {
+        n: e if e.identified else effect_values.get(n, e) for n, e in model.parameters.items()
+    }
     return replace(model, parameters=parameters)
 
 
 def _identified_with_effects(
-    runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows
+    runs: Sequence[Run], winner: Hypothesis, baseline: Model, rows: TraceRows
 ) -> tuple[Model, dict[str, float]]:
     """Return the model identified together with the effects of a set, and errors by tolerance.
 
-    Its intervals include the uncertainty of shapes and forms. The second value is the part of each
-    standard error that the tolerances of the rig's geometry make, by parameter name.
+    Its intervals include the uncertainty of shapes and forms. The second value is the standard
+    error of each parameter by the tolerances of the rig's geometry, by name.
     """
     if not winner.effects:
-        return before, {}
-    train_data, own = rows.train, rows.filtering
+        return baseline, {}
+    train_data, used = rows.train, rows.filtering
 
     def like_rows(filtering: Filtering) -> Filtering:
-        return replace(
-            filtering, in_motion=own.in_motion, full_weight=own.full_weight, lines=own.lines
-        )
+        filtering = replace(filtering, in_motion=used.in_motion, lines=used.lines)
+        return replace(filtering, full_weight=used.full_weight)
 
-    found = identified(runs, (*train_data.terms, *winner.effects), like_rows)
+    identification = identified(runs, (*train_data.terms, *winner.effects), like_rows)
     shift = form_shift(train_data, winner.fit)
-    model = with_form_errors(train_data, winner.fit, found.model, shift)
-    geometry = found.geometry
-    by_geometry = {} if geometry is None else geometry.uncertainties(found.estimates)
+    model = with_form_errors(train_data, winner.fit, identification.model, shift)
+    geometry = identification.geometry
+    by_geometry = {} if geometry is None else geometry.uncertainties(identification.estimates)
     return at_nominal_temperature(model), by_geometry
 
 
@@ -210,12 +211,12 @@ def identified(
     returns the filters of a record in place of the default ones.
     """
     nuisances = (BulkTemperature, DrivePath, SpoolPath)
-    kept = ordered([u for u in terms if not isinstance(u.term, nuisances)])
+    fitted_terms = ordered([u for u in terms if not isinstance(u.term, nuisances)])
 
     def filtering(record: Record) -> Filtering:
         return changed(default_filtering(record))
 
-    return coupled(runs, kept, filtering, estimator=ESTIMATOR)
+    return coupled(runs, fitted_terms, filtering, estimator=ESTIMATOR)
 
 
 def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> JudgedEffect:
@@ -230,46 +231,42 @@ def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> 
 def shoot_hidden_states(
     runs: Sequence[Run],
     holdout: Sequence[Run],
-    after: Model,
+    model: Model,
     train_data: RegressionData,
     holdout_data: RegressionData,
     winner: Hypothesis,
 ) -> tuple[Hypothesis, list[ShootingEstimate]]:
     """Return the set after multiple shooting of its effects with a hidden state, and their shapes.
 
-    `after` is the identified model of the set `winner`; electric rigs are returned unchanged.
+    `model` is the identified model of the set `winner`; electric rigs are returned unchanged.
     """
     shots: list[ShootingEstimate] = []
-    if after.rig.electric or not hidden_effects(after):
+    if model.rig.electric or not hidden_effects(model):
         return winner, shots
-    ready = completed([*runs, *holdout], after)
-    if ready is None:
+    complete = completed([*runs, *holdout], model)
+    if complete is None:
         return winner, shots
-    after = ready
-    for effect in hidden_effects(after):
-        shot_effect = shot(runs, after, effect)
+    model = complete
+    for effect in hidden_effects(model):
+        shot_effect = shot(runs, model, effect)
         if shot_effect is None:
             continue
-        other = _with_shapes_of(after.rig, after.terms, effect, shot_effect)
-        before, now = (
-            window_error(holdout, model, effect) for model in (after, replace(after, terms=other))
-        )
-        fitted = fit_coefficients(
-            train_data, _with_shapes_of(after.rig, winner.fit.terms, effect, shot_effect)
-        )
-        rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
-        better = now < TRACE.shooting_ratio * before and all(
-            again[e] <= TRACE.shooting_cost * rows[e] for e in rows
-        )
-        shots.append(
-            replace(shot_effect, before=before, after=now, taken=better and shot_effect.settled)
-        )
-        if shots[-1].taken:
+        shot_terms = _with_shapes_of(model.rig, model.terms, effect, shot_effect)
+        shot_model = replace(model, terms=shot_terms)
+        before, after = (window_error(holdout, m, effect) for m in (model, shot_model))
+        fit_terms = _with_shapes_of(model.rig, winner.fit.terms, effect, shot_effect)
+        shot_fit = fit_coefficients(train_data, fit_terms)
+        rms, rms_shot = (rms_of(holdout_data, fit) for fit in (winner.fit, shot_fit))
+        better = after < TRACE.shooting_ratio * before
+        better = better and all(rms_shot[e] <= TRACE.shooting_cost * rms[e] for e in rms)
+        taken = better and shot_effect.settled
+        shots.append(replace(shot_effect, before=before, after=after, taken=taken))
+        if taken:
             winner = replace(
-                winner, effects=_with_shapes_of(after.rig, winner.effects, effect, shot_effect),
-                fit=fitted, excess_energy=energy_above_noise(train_data, fitted.residual),
+                winner, effects=_with_shapes_of(model.rig, winner.effects, effect, shot_effect),
+                fit=shot_fit, excess_energy=energy_above_noise(train_data, shot_fit.residual),
             )  # fmt: skip
-            after = replace(after, terms=other)
+            model = shot_model
     return winner, shots
 
 
@@ -277,9 +274,9 @@ def _with_shapes_of(
     rig: Rig, terms: Sequence[Used], effect: Effect, shot: ShootingEstimate
 ) -> tuple[Used, ...]:
     """Return the terms with the shapes from shooting; shapes that it did not search are kept."""
-    found = {name: estimate.value for name, estimate in shot.shapes.items()}
+    values = {name: estimate.value for name, estimate in shot.shapes.items()}
     return tuple(
-        Used(u.term, tuple({**shape_values(rig, u), **found}.values())) if u.term == effect else u
+        Used(u.term, tuple({**shape_values(rig, u), **values}.values())) if u.term == effect else u
         for u in terms
     )
 
@@ -290,9 +287,9 @@ def with_shots(judged: JudgedEffect, shots: Sequence[ShootingEstimate]) -> Judge
         if (result.name, result.where) == (judged.name, judged.where):
             shapes = dict(result.shapes)
             if not result.taken:
-                for name, new in result.shapes.items():
-                    rows = judged.parameters[name]
-                    low, high = min(rows.ci95[0], new.value), max(rows.ci95[1], new.value)
-                    shapes[name] = replace(rows, ci95=(low, high))
+                for name, shot_shape in result.shapes.items():
+                    estimate, value = judged.parameters[name], shot_shape.value
+                    low, high = estimate.ci95
+                    shapes[name] = replace(estimate, ci95=(min(low, value), max(high, value)))
             return replace(judged, parameters={**judged.parameters, **shapes}, shot=result)
     return judged

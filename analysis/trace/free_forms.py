@@ -31,35 +31,36 @@ log = logging.getLogger(__name__)
 
 
 def explained_by_free_form(
-    found: Finding, free: Sequence[Effect], rng: np.random.Generator
+    finding: Finding, free: Sequence[Effect], rng: np.random.Generator
 ) -> Finding | None:
     """Return an explanation by the first set with a free form that gives one.
 
     None where none does, and where none is needed: named effects explain to within the tolerance
     for their forms, with one mechanism or only noise left. A free form of the mechanisms `free`
     joins the named effects that passed, or replaces those of one mechanism; it never joins a name
-    of its own mechanism at the same place. Every gate of every effect must hold with it, no
-    remainder may speak against the set, and no named effect may fit as well as the free form. Where
-    the named effects explain, `_is_better` must hold too. `rng` draws the sign flips.
+    of its own mechanism at the same place. Every effect must pass every gate with it, no remainder
+    may have a veto, and no named effect may fit as well as the free form. Where the named effects
+    explain, `_is_better` must hold too. `rng` draws the sign flips.
     """
-    hypotheses, winner = found.hypotheses, found.winner
-    explained = found.verdict != UNEXPLAINED
+    hypotheses, winner = finding.hypotheses, finding.winner
+    explained = finding.verdict != UNEXPLAINED
     if not free or (explained and not (winner.effects and _may_be_replaced(hypotheses, winner))):
         return None
     extended = hypotheses.with_candidates(free)
     named = {kind.name for kind in extended.effects if not kind.free}
     sets = _sets_with_free_form(extended, winner, explained)
     for hypothesis in _simplest_first(extended, sets):
-        compared = CurveRange(found.rows.choosing, hypothesis.fit).rows
-        effects = gates.judge_effects(extended, hypothesis, compared, rng)
-        left = remainders(extended, hypothesis, compared)
+        within_range = CurveRange(finding.rows.choosing, hypothesis.fit).rows
+        effects = gates.judge_effects(extended, hypothesis, within_range, rng)
+        remaining = remainders(extended, hypothesis, within_range)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
-        log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in left], failed)
-        passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in left)
+        words = [r.words for r in remaining]
+        log.info("free form %s: %s %s", sorted(hypothesis.keys), words, failed)
+        passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in remaining)
         ties = any(r.tied and r.name in named for f in effects if f.free for r in f.rivals)
         if passed and not ties:
             verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
-            return Finding(found.rows, extended, hypothesis, verdict, effects, left)
+            return Finding(finding.rows, extended, hypothesis, verdict, effects, remaining)
     return None
 
 
@@ -71,37 +72,38 @@ def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
 
 
 def _sets_with_free_form(
-    wide: HypothesisSet, winner: Hypothesis, explained: bool
+    hypotheses: HypothesisSet, winner: Hypothesis, explained: bool
 ) -> list[Hypothesis]:
     """Return the physical sets with a free form that leave little enough (see the caller)."""
-    most = _most_mechanisms(wide, winner) if explained else math.inf
+    most = _most_mechanisms(hypotheses, winner) if explained else math.inf
     out: list[Hypothesis] = []
-    for start in _sets_to_extend(wide, winner, explained):
+    for start in _sets_to_extend(hypotheses, winner, explained):
         if len(start.laws) >= most:
             continue
-        for single in wide.extensions(start, free=True):
+        for single in hypotheses.extensions(start, free=True):
             # An effect that removes so little would be needless beside a further one.
-            if removes_too_little(start, single, wide.noise_band):
+            if removes_too_little(start, single, hypotheses.noise_band):
                 continue
-            larger = [_with_further_effect(wide, single)] if len(single.laws) < most else []
+            may_grow_further = len(single.laws) < most
+            larger = [_with_further_effect(hypotheses, single)] if may_grow_further else []
             for hypothesis in (single, *larger):
-                explains = _explains_what_it_alters(wide, start, hypothesis)
-                better = not explained or _is_better(wide, winner, hypothesis)
-                if explains and better and not wide.physical_problem(hypothesis):
-                    out.append(wide.prune(hypothesis))
+                explains = _explains_what_it_alters(hypotheses, start, hypothesis)
+                better = not explained or _is_better(hypotheses, winner, hypothesis)
+                if explains and better and not hypotheses.physical_problem(hypothesis):
+                    out.append(hypotheses.prune(hypothesis))
     return out
 
 
-def _most_mechanisms(wide: HypothesisSet, winner: Hypothesis) -> int:
+def _most_mechanisms(hypotheses: HypothesisSet, winner: Hypothesis) -> int:
     """Return how many mechanisms a set may have that replaces one that explains by names alone.
 
     As many only where the names leave more than the tolerance for their forms: a level of friction
     that changes along the stroke misses what a curve follows.
     """
-    return len(winner.laws) - wide.within_form_tolerance(winner)
+    return len(winner.laws) - hypotheses.within_form_tolerance(winner)
 
 
-def _is_better(wide: HypothesisSet, winner: Hypothesis, hypothesis: Hypothesis) -> bool:
+def _is_better(hypotheses: HypothesisSet, winner: Hypothesis, hypothesis: Hypothesis) -> bool:
     """Return whether a set with a free form may replace one that explains by names alone.
 
     With fewer mechanisms it must leave at most `SEARCH.free_form_ratio` of the energy, with as many
@@ -109,72 +111,78 @@ def _is_better(wide: HypothesisSet, winner: Hypothesis, hypothesis: Hypothesis) 
     """
     fewer = len(hypothesis.laws) < len(winner.laws)
     ratio = SEARCH.free_form_ratio if fewer else SEARCH.free_form_ratio_alike
-    possible = len(hypothesis.laws) <= _most_mechanisms(wide, winner)
+    possible = len(hypothesis.laws) <= _most_mechanisms(hypotheses, winner)
     return possible and hypothesis.total < ratio * winner.total
 
 
-def _explains_what_it_alters(wide: HypothesisSet, start: Hypothesis, other: Hypothesis) -> bool:
+def _explains_what_it_alters(
+    hypotheses: HypothesisSet, start: Hypothesis, other: Hypothesis
+) -> bool:
     """Return whether the equations in which a set removes energy keep no more than form error.
 
-    Held-out records judge the others: what they keep may be too little to speak against the set.
+    Held-out records judge the others, whose residual may be too small to refuse the set.
     """
     removed = {e: start.excess_energy[e] - v for e, v in other.excess_energy.items()}
     return all(
-        wide.negligible(e, v) or removed[e] < SEARCH.altered_share * start.excess_energy[e]
+        hypotheses.negligible(e, v) or removed[e] < SEARCH.altered_share * start.excess_energy[e]
         for e, v in other.excess_energy.items()
     )
 
 
-def _simplest_first(wide: HypothesisSet, sets: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _simplest_first(hypotheses: HypothesisSet, sets: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the sets to judge: those near the least energy first, the simplest of them first.
 
-    Sets of more mechanisms than one that leaves no more than form error come last, unless they
-    leave only noise: two lines in series with an edge fit nearly any curve of that edge.
+    Sets of more mechanisms than one within form error come last, unless they leave only noise: two
+    pressure drops in series with a metering edge fit nearly any curve of that edge.
     """
     least = min((hypothesis.total for hypothesis in sets), default=0.0)
-    near = SEARCH.free_form_near * least
-    fewest = min((len(o.laws) for o in sets if wide.within_form_tolerance(o)), default=len(sets))
+    energy_limit = SEARCH.free_form_near * least
+    counts = (len(o.laws) for o in sets if hypotheses.within_form_tolerance(o))
+    fewest = min(counts, default=len(sets))
 
     def needless(o: Hypothesis) -> bool:
-        return len(o.laws) > fewest and not within_band(o.excess_energy, wide.noise_band)
+        return len(o.laws) > fewest and not within_band(o.excess_energy, hypotheses.noise_band)
 
-    ordered = sorted(sets, key=lambda o: (needless(o), o.total > near, o.size[1], o.total))
+    ordered = sorted(sets, key=lambda o: (needless(o), o.total > energy_limit, o.size[1], o.total))
     return list({o.keys: o for o in ordered}.values())[: SEARCH.free_forms_judged]
 
 
-def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
-    """Return the set with one more effect for the equations that keep too much, if there is one.
+def _with_further_effect(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
+    """Return the set with one more effect for the equations above form error, if there is one.
 
-    Where all keep no more than form error, an effect must leave only noise. Two curves in one
-    balance are no explanation: together they follow whatever is in it.
+    Where all are within form error, the effect must leave only noise. Two curves in one balance are
+    no explanation: together they fit any residual in it.
     """
-    above_form_error = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
+    energy = hypothesis.excess_energy
+    above_form_error = {e for e, v in energy.items() if not hypotheses.negligible(e, v)}
     larger: Hypothesis | None = None
     if not above_form_error:
-        larger = wide.completed_to_noise(hypothesis)
+        larger = hypotheses.completed_to_noise(hypothesis)
     elif may_grow(hypothesis.effects):
-        larger = wide.extended_in(hypothesis, above_form_error)
-    return hypothesis if larger is None or _curves_share_a_balance(wide, larger) else larger
+        larger = hypotheses.extended_in(hypothesis, above_form_error)
+    return hypothesis if larger is None or _curves_share_a_balance(hypotheses, larger) else larger
 
 
-def _curves_share_a_balance(wide: HypothesisSet, hypothesis: Hypothesis) -> bool:
+def _curves_share_a_balance(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> bool:
     """Return whether two free forms of a set act in the same family of rows of one joint."""
     curves = [e for e in effects_among(hypothesis.effects) if e.free]
-    rig = wide.train_data.rig
+    rig = hypotheses.train_data.rig
     return any(
         act_at_one_joint(a, b) and bool(families_of(rig, a) & families_of(rig, b))
         for a, b in itertools.combinations(curves, 2)
     )
 
 
-def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, explained: bool) -> list[Hypothesis]:
+def _sets_to_extend(
+    hypotheses: HypothesisSet, winner: Hypothesis, explained: bool
+) -> list[Hypothesis]:
     """Return the sets that a free form may join: the winner, and it without one mechanism.
 
     A free form is tried in place of a mechanism or of all, and beside all where the winner does not
     explain the records.
     """
-    out = [wide.empty] if explained else [wide.empty, winner]
+    out = [hypotheses.empty] if explained else [hypotheses.empty, winner]
     for law in dict.fromkeys(map(law_of, effects_among(winner.effects))):
-        kept = [u for u in winner.effects if law_of(effect_in(u)) != law]
-        out.append(wide.refined(kept))
+        other_effects = [u for u in winner.effects if law_of(effect_in(u)) != law]
+        out.append(hypotheses.refined(other_effects))
     return list({o.keys: o for o in out}.values())

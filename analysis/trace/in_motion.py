@@ -1,4 +1,4 @@
-"""What is found on all rows, and in motion only where rests hide the law of friction."""
+"""The search on all rows, and in motion only where joints at rest hide the law of friction."""
 
 from __future__ import annotations
 
@@ -29,57 +29,59 @@ from analysis.trace.settings import TRACE
 
 
 def find(
-    records: TraceRuns, rows: TraceRows, candidates: Candidates, done: Callable[[float], None]
+    records: TraceRuns, rows: TraceRows, candidates: Candidates, progress: Callable[[float], None]
 ) -> Finding:
-    """Return what the model lacks: `search_and_judge`, in motion only where that is needed.
+    """Return the finding of `search_and_judge`, on rows in motion only where that is needed.
 
-    No curve of the speed meets the rows of a joint that rests: there free forms are tried in motion
-    first. Torques at `records.lines` are judged beside the effects found. Where one is refused, it
-    is left in the rows, and all is searched again.
+    No friction curve over speed fits the rows of a joint at rest: there free forms are tried in
+    motion first. Torques at `records.lines` are judged beside the effects found. Where one is
+    refused, it is left in the rows, and the search is repeated.
     """
     joints = {e.joint for e in candidates.named if e.family == "friction"}
-    rest = any(_rests(rows.train.records, joint) for joint in joints)
-    on_all_rows = search_and_judge(rows, replace(candidates, free=()) if rest else candidates, done)
-    found = searched_in_motion(records, candidates, on_all_rows)
-    if rest and found is on_all_rows:
-        found = with_free_form(found, candidates)
-    found = without_unnamed_effects(found)
+    rests = any(_rests(rows.train.records, joint) for joint in joints)
+    tried = replace(candidates, free=()) if rests else candidates
+    on_all_rows = search_and_judge(rows, tried, progress)
+    finding = searched_in_motion(records, candidates, on_all_rows)
+    if rests and finding is on_all_rows:
+        finding = with_free_form(finding, candidates)
+    finding = without_unnamed_effects(finding)
     if not records.lines:
-        return found
-    judged = _judged_lines(records, found)
-    refused = gates.refused_effects(judged)
+        return finding
+    judged_lines = _judged_lines(records, finding)
+    refused = gates.refused_effects(judged_lines)
     if refused:
-        kept = [line for line, e in zip(records.lines, judged, strict=True) if e not in refused]
-        fewer = replace(records, lines=tuple(kept))
-        found = find(fewer, trace_rows(fewer), candidates, done)
-        return replace(found, effects=(*found.effects, *refused))
-    verdict = EXPLAINED if found.verdict == CLEAN else found.verdict
-    return replace(found, effects=(*found.effects, *judged), verdict=verdict)
+        judged = zip(records.lines, judged_lines, strict=True)
+        fewer = replace(records, lines=tuple(line for line, e in judged if e not in refused))
+        finding = find(fewer, trace_rows(fewer), candidates, progress)
+        return replace(finding, effects=(*finding.effects, *refused))
+    verdict = EXPLAINED if finding.verdict == CLEAN else finding.verdict
+    return replace(finding, effects=(*finding.effects, *judged_lines), verdict=verdict)
 
 
-def _judged_lines(records: TraceRuns, found: Finding) -> tuple[JudgedEffect, ...]:
+def _judged_lines(records: TraceRuns, finding: Finding) -> tuple[JudgedEffect, ...]:
     """Return the torques at `records.lines` with their gates, beside the effects found."""
-    rows, fit = found.rows, found.winner.fit
+    rows, fit = finding.rows, finding.winner.fit
     train, holdout = (
         conditioned_records(records.rig, runs, families=records.families)
         for runs in (records.train, records.holdout)
     )
     judged = []
     for line in records.lines:
-        own = [s for s in rows.choosing.segments if s.equation == equation("torque", line[0])]
-        noise = float(np.sqrt(np.mean([s.noise**2 for s in own]))) if own else np.inf
+        balance = equation("torque", line[0])
+        squares = [s.noise**2 for s in rows.choosing.segments if s.equation == balance]
+        noise = float(np.sqrt(np.mean(squares))) if squares else np.inf
         judged.append(judged_line(records.rig, line, fit, train, holdout, rows.divided, noise))
     return tuple(judged)
 
 
 def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Finding) -> Finding:
-    """Search again in rows weighted by speed, where a joint's torque balance keeps too much.
+    """Search again in rows weighted by speed, where a joint's torque balance is above the noise.
 
-    While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
-    these rows, and they hide the law in motion, and effects of other balances with it. The result
-    is used if friction acts in each joint whose rows are weighted and it is better (`_is_better`),
-    and the balances of other joints are looked at next. Where it lacks a breakaway that all rows
-    show, slow samples get more weight.
+    While a joint rests, dry friction is any force up to its breakaway: no law of the speed fits
+    these rows, and they hide the law in motion, and with it effects in other balances. The result
+    is used if friction acts in each joint whose rows are weighted and it is better (`_is_better`);
+    then the balances of other joints are searched. Where it lacks a breakaway that all rows show,
+    slow samples get more weight.
     """
     above_noise, joints = _joints_to_weight(
         finding, [e for e in candidates.named if e.family == "friction"]
@@ -90,32 +92,32 @@ def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Find
 
     def searched(joints: Collection[int], full_weight: float) -> Finding:
         unweighted = finding.rows.train.cache.without_family("mechanical")
-        moving = moving_filtering({*weighted, *joints}, full_weight)
-        rows = trace_rows(records, moving, unweighted)
-        found = search_and_judge(rows, candidates, lambda _: None)
+        filtering = moving_filtering({*weighted, *joints}, full_weight)
+        rows = trace_rows(records, filtering, unweighted)
+        moving = search_and_judge(rows, candidates, lambda _: None)
         resting = rest_phase_notes(rows.filtering.in_motion, included=False)
-        return replace(found, notes=(*resting, *found.notes))
+        return replace(moving, notes=(*resting, *moving.notes))
 
     for full_weight in (1.0, TRACE.breakaway_speed):
-        found = searched(joints, full_weight)
-        acting = joints_with_friction(found.winner, above_noise)
+        moving = searched(joints, full_weight)
+        acting = joints_with_friction(moving.winner, above_noise)
         if acting and acting != joints:  # an effect of several balances had spread friction
-            found = searched(acting, full_weight)
-        unmet = joints_with_friction(found.winner, above_noise) != acting
-        if acting <= weighted or unmet or not _is_better(found, finding, acting):
+            moving = searched(acting, full_weight)
+        unmet = joints_with_friction(moving.winner, above_noise) != acting
+        if acting <= weighted or unmet or not _is_better(moving, finding, acting):
             return finding
-        if not any(_hides_breakaway(found, finding, joint) for joint in acting):
+        if not any(_hides_breakaway(moving, finding, joint) for joint in acting):
             break
     else:
         return finding
-    found = replace(found, notes=(*_breakaway_notes(found, finding, acting), *found.notes))
+    notes = *_breakaway_notes(moving, finding, acting), *moving.notes
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
-    found = replace(found, effects=(*found.effects, *failed))
-    return searched_in_motion(records, candidates, found)
+    moving = replace(moving, notes=notes, effects=(*moving.effects, *failed))
+    return searched_in_motion(records, candidates, moving)
 
 
 def _joints_to_weight(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:
-    """Return the equations that keep too much, and the joints (0-based) whose rests may cause it.
+    """Return the equations above the noise, and the joints (0-based) whose rests may cause it.
 
     These have friction in the set, or, where the residual is `unexplained`, may have it and rest.
     """
@@ -124,10 +126,10 @@ def _joints_to_weight(finding: Finding, friction: Sequence[Effect]) -> tuple[set
     above_noise = equations_above_noise(finding.rows, finding.winner)
     joints = joints_with_friction(finding.winner, above_noise)
     if finding.verdict == UNEXPLAINED:
-        against = {r.equation for r in finding.remainders if r.veto}
-        may = {e.joint for e in friction if equation("torque", e.joint) in against}
-        joints |= {joint for joint in may if _rests(finding.rows.train.records, joint)}
-        above_noise |= against
+        above_band = {r.equation for r in finding.remainders if r.veto}
+        friction_joints = {e.joint for e in friction if equation("torque", e.joint) in above_band}
+        joints |= {joint for joint in friction_joints if _rests(finding.rows.train.records, joint)}
+        above_noise |= above_band
     return above_noise, joints
 
 
@@ -141,44 +143,44 @@ def _rests(records: Sequence[ConditionedRecord], joint: int) -> bool:
     return False
 
 
-def _is_better(found: Finding, finding: Finding, joints: Collection[int]) -> bool:
-    """Return whether a finding with rows of `joints` weighted by speed does better than `finding`.
+def _is_better(moving: Finding, on_all_rows: Finding, joints: Collection[int]) -> bool:
+    """Return whether the finding `moving`, with rows of `joints` weighted by speed, is better.
 
     It must remove most of the energy of all rows, rests included. It explains what was unexplained,
     or it leaves at most `TRACE.noted_ratio` noise floors in the balances of `joints`, and explains
-    too or has fewer equations that speak against it.
+    too or has fewer remainders with a veto.
     """
-    total = finding.hypotheses.refined(found.winner.effects).total
-    if total / finding.hypotheses.empty.total > 1.0 - TRACE.least_removed:
+    total = on_all_rows.hypotheses.refined(moving.winner.effects).total
+    if total / on_all_rows.hypotheses.empty.total > 1.0 - TRACE.least_removed:
         return False
-    explains = found.verdict in (EXPLAINED, CONFOUNDED)
-    if explains and finding.verdict == UNEXPLAINED:
+    explains = moving.verdict in (EXPLAINED, CONFOUNDED)
+    if explains and on_all_rows.verdict == UNEXPLAINED:
         return True
-    fewer = sum(r.veto for r in found.remainders) < sum(r.veto for r in finding.remainders)
-    ratios = held_out_ratios(found.rows, found.winner)
+    fewer = sum(r.veto for r in moving.remainders) < sum(r.veto for r in on_all_rows.remainders)
+    ratios = held_out_ratios(moving.rows, moving.winner)
     meets_noise = all(ratios[equation("torque", joint)] <= TRACE.noted_ratio for joint in joints)
     return (explains or fewer) and meets_noise
 
 
-def _hides_breakaway(found: Finding, finding: Finding, joint: int) -> bool:
-    """Return whether `found` lacks a part of a joint's friction in `finding`, and rests show it.
+def _hides_breakaway(moving: Finding, on_all_rows: Finding, joint: int) -> bool:
+    """Return whether `moving` lacks a breakaway of `joint` (0-based) that rows at rest show.
 
     At rest friction is any force up to its breakaway: forces near standstill that exceed the level
-    in motion are a breakaway above it, whatever law it follows. `joint` is 0-based.
+    in motion are a breakaway above it, whatever law it follows.
     """
-    lost = {(e.name, e.at) for e in finding.named} - found.winner.keys
-    if not any(e.key in lost for e in _friction_of(finding.winner, joint)):
+    lost = {(e.name, e.at) for e in on_all_rows.named} - moving.winner.keys
+    if not any(e.key in lost for e in _friction_of(on_all_rows.winner, joint)):
         return False
-    return force_at_standstill(finding.rows.train, found.winner, joint) > TRACE.breakaway_ratio
+    return force_at_standstill(on_all_rows.rows.train, moving.winner, joint) > TRACE.breakaway_ratio
 
 
-def _breakaway_notes(found: Finding, finding: Finding, joints: Collection[int]) -> list[str]:
+def _breakaway_notes(moving: Finding, on_all_rows: Finding, joints: Collection[int]) -> list[str]:
     """Return a note on each of `joints` (0-based) with a breakaway that the set lacks."""
     out = []
     for joint in sorted(joints):
-        if any(e.beside for e in _friction_of(found.winner, joint)):
+        if any(e.beside for e in _friction_of(moving.winner, joint)):
             continue
-        ratio = force_at_standstill(finding.rows.train, found.winner, joint)
+        ratio = force_at_standstill(on_all_rows.rows.train, moving.winner, joint)
         if ratio > TRACE.breakaway_ratio:
             out.append(
                 f"{equation('torque', joint)}: near standstill friction reaches {ratio:.2g} times "
@@ -188,33 +190,33 @@ def _breakaway_notes(found: Finding, finding: Finding, joints: Collection[int]) 
 
 
 def force_at_standstill(data: RegressionData, winner: Hypothesis, joint: int) -> float:
-    """Return how large friction near standstill is over the level that a set has in motion.
+    """Return the ratio of friction near standstill to the level that a set has in motion.
 
     In rows `data` of all samples at which `joint` (0-based) is slower than `TRACE.breakaway_speed`
-    times its rms speed, friction is what the set's other terms leave. The result is the value that
-    all but `TRACE.breakaway_rows` of them stay below, by three times the noise. It is 0 where the
-    set's friction has no level: its size goes with a pressure or the speed.
+    times its rms speed, friction is the residual of the set's other terms, less three times the
+    noise. The result is its quantile 1 - `TRACE.breakaway_rows`, and 0 where the set's friction has
+    no level, since it is proportional to a pressure or the speed.
     """
     of_friction = [c for e in _friction_of(winner, joint) for c in e.coefficients(data.rig)]
     if any(c.unit != force_unit(data.rig, joint) for c in of_friction):
         return 0.0
     rows = design_matrix(data, winner.fit.terms)
-    own = [c.parameter for c in of_friction]
-    levels = np.array([winner.fit.beta[name] for name in own])
-    in_set = rows.matrix[:, [rows.names.index(name) for name in own]] @ levels
-    force = np.abs(rows.residual(winner.fit.beta) + in_set)
+    names = [c.parameter for c in of_friction]
+    levels = np.array([winner.fit.beta[name] for name in names])
+    friction = rows.matrix[:, [rows.names.index(name) for name in names]] @ levels
+    force = np.abs(rows.residual(winner.fit.beta) + friction)
     ratios = []
     for s in data.segments:
         if s.equation != equation("torque", joint):
             continue
-        conditioned, raw = data.source(s)
-        signals, at = conditioned.signals, conditioned.samples_at(raw.time)
+        conditioned, rows_of_balance = data.source(s)
+        signals, at = conditioned.signals, conditioned.samples_at(rows_of_balance.time)
         speed = np.abs(signals.sd[at, joint])
         slow = speed < TRACE.breakaway_speed * float(np.sqrt(np.mean(speed**2)))
         lever = np.abs(signals.G[at, joint]) * np.sqrt(s.repeats) / s.noise
         ratios.append(((force[s.where] - 3.0) / (float(np.sum(np.abs(levels))) * lever))[slow])
-    together = np.concatenate(ratios)
-    return float(np.quantile(together, 1.0 - TRACE.breakaway_rows)) if len(together) else 0.0
+    all_ratios = np.concatenate(ratios)
+    return float(np.quantile(all_ratios, 1.0 - TRACE.breakaway_rows)) if len(all_ratios) else 0.0
 
 
 def _friction_in(winner: Hypothesis) -> list[Effect]:

@@ -48,38 +48,38 @@ class Candidates:
 
 
 def search_and_judge(
-    rows: TraceRows, candidates: Candidates, done: Callable[[float], None]
+    rows: TraceRows, candidates: Candidates, progress: Callable[[float], None]
 ) -> Finding:
-    """Search the candidates for what the model lacks and judge it on the choosing rows.
+    """Search the candidates for the effects that the model lacks; judge them on the choosing rows.
 
-    `done` receives the share of the candidates' columns that is computed.
+    `progress` receives the share of the candidates' columns that is computed.
     """
     hypotheses, choosing = HypothesisSet(rows.train, candidates.named), rows.choosing
     in_noise = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    winner = improved_by_exact_trials(hypotheses, hypotheses.run(done))
+    winner = improved_by_exact_trials(hypotheses, hypotheses.run(progress))
     if in_noise:
         winner = _shown_by_held_out_rows(hypotheses, winner, choosing)
     rng = np.random.default_rng(candidates.seed)
-    found = Judge(rows, hypotheses, candidates.free, rng).best_finding(winner)
-    named = any(map(gates.passes_gates, found.effects))
-    notes = remainder_notes(found.verdict, found.remainders, in_noise, named)
-    if not in_noise or found.verdict != UNEXPLAINED:
-        return replace(found, notes=notes)
-    notes = (*_held_out_only_notes(rows.train, found.remainders), *notes)
-    if found.winner.effects:
-        return replace(found, notes=notes)
-    return replace(found, effects=(), notes=notes)  # refused: fitted to noise
+    finding = Judge(rows, hypotheses, candidates.free, rng).best_finding(winner)
+    named = any(map(gates.passes_gates, finding.effects))
+    notes = remainder_notes(finding.verdict, finding.remainders, in_noise, named)
+    if not in_noise or finding.verdict != UNEXPLAINED:
+        return replace(finding, notes=notes)
+    notes = (*_held_out_only_notes(rows.train, finding.remainders), *notes)
+    if finding.winner.effects:
+        return replace(finding, notes=notes)
+    return replace(finding, effects=(), notes=notes)  # refused: fitted to noise
 
 
 def _shown_by_held_out_rows(
     hypotheses: HypothesisSet, winner: Hypothesis, choosing: RegressionData
 ) -> Hypothesis:
-    """Return the best fitted set with which the choosing rows hold no more than noise, or `winner`.
+    """Return the best fitted set with which the choosing rows are within the band, or `winner`.
 
-    The training rows hold no more without effects either, but the set must remove from them what
-    its effects and free numbers cost.
+    The training rows are within it without effects, but the set must remove from them the price of
+    its effects and free numbers.
     """
     before = hypotheses.empty.fit.energy
     possible = [
@@ -94,22 +94,23 @@ def _shown_by_held_out_rows(
 def with_free_form(finding: Finding, candidates: Candidates) -> Finding:
     """Return the finding, or an explanation by a free form where one is needed and explains."""
     rng = np.random.default_rng(candidates.seed)
-    found = explained_by_free_form(finding, candidates.free, rng)
-    if found is None:
+    explanation = explained_by_free_form(finding, candidates.free, rng)
+    if explanation is None:
         return finding
-    return replace(found, notes=remainder_notes(found.verdict, found.remainders, False, True))
+    notes = remainder_notes(explanation.verdict, explanation.remainders, False, True)
+    return replace(explanation, notes=notes)
 
 
-def _held_out_only_notes(train_data: RegressionData, left: Sequence[Remainder]) -> list[str]:
+def _held_out_only_notes(train_data: RegressionData, remaining: Sequence[Remainder]) -> list[str]:
     """Say why only held-out records keep too much: what does not repeat, or little excitation."""
-    above = sorted({r.equation for r in left if r.veto})
-    unrepeated = [e for e in above if e in unrepeated_floors(train_data)]
+    above_band = sorted({r.equation for r in remaining if r.veto})
+    unrepeated = [e for e in above_band if e in unrepeated_floors(train_data)]
     out = [
         f"{e}: the training repeats differ from each other too: the cause changes with time or "
         "does not follow the excitation, and more excitation would not show it"
         for e in unrepeated
     ]
-    return out if unrepeated == above else [*out, ONLY_HELD_OUT_MISSED]
+    return out if unrepeated == above_band else [*out, ONLY_HELD_OUT_MISSED]
 
 
 @dataclass(frozen=True)
@@ -130,64 +131,63 @@ class Judge:
         return self.rows.choosing
 
     def best_finding(self, winner: Hypothesis) -> Finding:
-        """Judge the set that the search has found, and try free forms where it does not explain.
+        """Judge the set of the search by its simplest readings; try free forms if it fails.
 
-        Its effects are judged under the simplest names that fit, and where these do not explain,
-        under other names of their laws (`_under_other_names`).
+        Where the simplest readings do not explain, others of their laws are judged first
+        (`_under_other_names`).
         """
         simplest = readings.best_readings(self.hypotheses, winner, self.choosing)
-        found = self.apply_gates(simplest)
-        if found.verdict == UNEXPLAINED:
-            found = self._under_other_names(winner, simplest) or found
-        if found.verdict == CONFOUNDED:
-            found = self._best_tied_set(found)
-        by_free_form = explained_by_free_form(found, self.free, self.rng)
-        if by_free_form is None and found.verdict == UNEXPLAINED:
-            return replace(found, effects=(*found.effects, *self._refused_as_unphysical()))
-        return by_free_form or found
+        finding = self.apply_gates(simplest)
+        if finding.verdict == UNEXPLAINED:
+            finding = self._under_other_names(winner, simplest) or finding
+        if finding.verdict == CONFOUNDED:
+            finding = self._best_tied_set(finding)
+        by_free_form = explained_by_free_form(finding, self.free, self.rng)
+        if by_free_form is None and finding.verdict == UNEXPLAINED:
+            return replace(finding, effects=(*finding.effects, *self._refused_as_unphysical()))
+        return by_free_form or finding
 
     def _under_other_names(self, winner: Hypothesis, simplest: Hypothesis) -> Finding | None:
         """Return an explanation by other names of the laws of a set, None if there is none.
 
-        They are those that the search found, then both parts of a law of which one was refused: of
-        a breakaway the level alone is not the same at all speeds, nor is a breakaway that stands
-        for a level too.
+        They are those that the search found, then both parts of a law, of which one was judged: a
+        level alone, or a breakaway alone, has not the same size at all speeds where both act.
         """
         parts = map(self.hypotheses.refined, self.hypotheses.with_parts_beside(simplest))
         for other in (winner, *sorted(parts, key=lambda o: o.total)):
             if other.keys != simplest.keys:
-                found = self.apply_gates(other)
-                if found.verdict != UNEXPLAINED:
-                    return found
+                finding = self.apply_gates(other)
+                if finding.verdict != UNEXPLAINED:
+                    return finding
         return None
 
-    def _best_tied_set(self, found: Finding) -> Finding:
+    def _best_tied_set(self, finding: Finding) -> Finding:
         """Return the finding with the best of the sets that the records cannot separate."""
-        best = best_tied_set(self.hypotheses, found.winner, found.effects, self.choosing)
-        if best is found.winner:
-            return found
+        best = best_tied_set(self.hypotheses, finding.winner, finding.effects, self.choosing)
+        if best is finding.winner:
+            return finding
         other = self.apply_gates(best)
         all_pass = best.keys <= other.winner.keys
-        return other if all_pass and other.verdict == CONFOUNDED else found
+        return other if all_pass and other.verdict == CONFOUNDED else finding
 
     def _refused_as_unphysical(self) -> tuple[JudgedEffect, ...]:
         """Return the refused effects of the simplest set that explains with an unphysical number.
 
-        Only the gates of what an effect removes and of physics are asked; rivals are left out,
-        since they do not matter for an effect that physics refuses.
+        Only the gates of removed energy and of physics count; rivals do not matter for an effect
+        that is refused as unphysical.
         """
-        near = [
+        explaining = [
             o for o in self.hypotheses.fitted.values()
             if o.effects and self.hypotheses.within_form_tolerance(o)
             and self.hypotheses.physical_problem(o)
         ]  # fmt: skip
-        if not near:
+        if not explaining:
             return ()
-        best = min(near, key=lambda o: (o.size[1], o.total))
+        best = min(explaining, key=lambda o: (o.size[1], o.total))
         effects = gates.judge_effects(self.hypotheses, best, self.choosing, self.rng)
-        asked = (gates.REMOVES, gates.PHYSICAL)
+        tested = (gates.REMOVES, gates.PHYSICAL)
         judged = [
-            replace(f, rivals=(), gates=tuple(g for g in f.gates if g.name in asked))
+            replace(f, rivals=(), gates=tuple(g for g in f.gates if g.name in tested))
             for f in effects
         ]
         return tuple(f for f in judged if not gates.passes_gates(f))
@@ -198,20 +198,20 @@ class Judge:
         Refused effects are among the judged ones only if the verdict is `unexplained`.
         """
         effects, refused, winner = self._passing_set(winner)
-        left = remainders(self.hypotheses, winner, self.choosing)
-        found = Finding(self.rows, self.hypotheses, winner, CLEAN, effects, left)
+        remaining = remainders(self.hypotheses, winner, self.choosing)
+        finding = Finding(self.rows, self.hypotheses, winner, CLEAN, effects, remaining)
         all_refused = bool(refused) and not winner.effects
         if not all_refused:
-            found = self._extended(found)
-        above = {r.equation for r in found.remainders if r.veto}
+            finding = self._extended(finding)
+        above = {r.equation for r in finding.remainders if r.veto}
         if all_refused or above:
-            effects = judged_beside_unknown_cause(
-                self.hypotheses, found.winner, found.effects, above
-            )
-            return replace(found, verdict=UNEXPLAINED, effects=(*effects, *refused))
-        if not found.winner.effects:  # too little remains for any effect to be needed
-            return found
-        return replace(found, verdict=CONFOUNDED if has_tied_rival(found.effects) else EXPLAINED)
+            winner, effects = finding.winner, finding.effects
+            effects = judged_beside_unknown_cause(self.hypotheses, winner, effects, above)
+            return replace(finding, verdict=UNEXPLAINED, effects=(*effects, *refused))
+        if not finding.winner.effects:  # too little remains for any effect to be needed
+            return finding
+        verdict = CONFOUNDED if has_tied_rival(finding.effects) else EXPLAINED
+        return replace(finding, verdict=verdict)
 
     def _passing_set(
         self, winner: Hypothesis
@@ -236,49 +236,48 @@ class Judge:
         """Return the failed effects to leave out: of those of one family at one place, one.
 
         Each of two frictions of a joint removes little beside the other, and one of them is needed.
-        The one without which least is left goes first.
+        The one whose removal leaves least energy is left out.
         """
 
-        def left_without(used: Used) -> float:
+        def energy_without(used: Used) -> float:
             return self.hypotheses.refined(winner.without(used)).total
 
-        least: dict[tuple[str, str], Used] = {}
-        for used in sorted(failed, key=left_without, reverse=True):
-            least[effect_in(used).family, used.term.where] = used
-        return [used for used in failed if used in least.values()]
+        needed: dict[tuple[str, str], Used] = {}
+        for used in sorted(failed, key=energy_without, reverse=True):
+            needed[effect_in(used).family, used.term.where] = used
+        return [used for used in failed if used in needed.values()]
 
-    def _extended(self, found: Finding) -> Finding:
-        """Add effects for equations that keep too much, while all pass and fewer equations do.
+    def _extended(self, finding: Finding) -> Finding:
+        """Add effects for the remainders, while all pass the gates and the remainders get fewer.
 
-        Where no remainder speaks against the set, a further effect must not change whether the
-        answer has a tied rival, unless it completes the explanation or simpler names beside it make
-        the whole set no larger.
+        Where no remainder has a veto, a further effect must not change whether the answer has a
+        tied rival, unless it completes the explanation or the set gets no larger.
         """
-        while found.remainders:
-            winner, left = found.winner, found.remainders
-            equations = {r.equation for r in left}
+        while finding.remainders:
+            winner, remaining = finding.winner, finding.remainders
+            equations = {r.equation for r in remaining}
             larger = self.hypotheses.extended_in(winner, equations)
             if larger is None:
                 break
             judged = gates.judge_effects(self.hypotheses, larger, self.choosing, self.rng)
-            less = remainders(self.hypotheses, larger, self.choosing)
+            remaining_after = remainders(self.hypotheses, larger, self.choosing)
             replaces = not winner.keys <= larger.keys and sum(larger.size) <= sum(winner.size)
             completes = self._completes(winner, larger, equations)
-            needed = replaces or completes or any(r.veto for r in left)
-            if not needed and has_tied_rival(judged) != has_tied_rival(found.effects):
+            needed = replaces or completes or any(r.veto for r in remaining)
+            if not needed and has_tied_rival(judged) != has_tied_rival(finding.effects):
                 break
-            if len(less) >= len(left) or not all(map(gates.passes_gates, judged)):
+            if len(remaining_after) >= len(remaining) or not all(map(gates.passes_gates, judged)):
                 break
-            found = replace(found, effects=judged, winner=larger, remainders=less)
-        return found
+            finding = replace(finding, effects=judged, winner=larger, remainders=remaining_after)
+        return finding
 
     def _completes(
         self, winner: Hypothesis, larger: Hypothesis, equations: Collection[str]
     ) -> bool:
         """Return whether an effect removes all but `SEARCH.further_share` of what `winner` left.
 
-        Only in equations in which the winner's effects act: what they leave there is missing from
-        the explanation, while in others it is a small effect beside it.
+        That holds only in equations in which the winner's effects act: a residual there completes
+        the explanation, while one in other equations is a small effect beside it.
         """
         start = self.hypotheses.empty.excess_energy
         removed = {e: v - winner.excess_energy[e] for e, v in start.items()}
@@ -304,18 +303,18 @@ def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, Tra
     if finding.verdict != UNEXPLAINED or refused:
         return None
     winner = _with_tied_effects(finding)
-    power: dict[str, list[NDArray[np.float64]]] = {}
+    squares: dict[str, list[NDArray[np.float64]]] = {}
     for s in data.segments:  # whitened by the stated noise
         if s.equation not in measured:
-            power.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
-    ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in power.items()}
+            squares.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
+    ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in squares.items()}
     if not ratio or max(ratio.values()) > DATA.unstated_ratio:
         return None
-    moves, formulas = clues_to(data, finding.rows.choosing, winner, ())
-    if formulas or any(m.share > DATA.unstated_clue for m in moves):
+    clues, formulas = clues_to(data, finding.rows.choosing, winner, ())
+    if formulas or any(m.share > DATA.unstated_clue for m in clues):
         return None
-    above = {name: max(1.0, value) for name, value in ratio.items()}
-    records = replace(records, noise_ratio=above)
+    ratio_above_stated = {name: max(1.0, value) for name, value in ratio.items()}
+    records = replace(records, noise_ratio=ratio_above_stated)
     return records, trace_rows(records)
 
 

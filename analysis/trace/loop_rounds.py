@@ -75,39 +75,39 @@ def achieved(
     if not experiment.get("questions"):
         return None
     terms = base_terms(rig, [*before, new])
-    both = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
+    all_data = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
     if experiment["kind"] == SHOW:
         separations = []
         for question in experiment["questions"]:
             (used,) = effects_of(question["one"])
-            shown = smallest_effect(effect_in(used), rig) or Explanation((used,))
-            asked = OpenQuestion(shown, Explanation(), False)
-            separations.append(present_separation(asked, ComparisonRows(both)))
+            smallest = smallest_effect(effect_in(used), rig) or Explanation((used,))
+            question_shown = OpenQuestion(smallest, Explanation(), False)
+            separations.append(present_separation(question_shown, ComparisonRows(all_data)))
         return min(separations)
-    old = regression_data(rig, terms, conditioned_records(rig, before))
+    old_data = regression_data(rig, terms, conditioned_records(rig, before))
     return min(
-        _question_separation(old, both, terms, len(before), q["one"], q["other"])
+        _question_separation(old_data, all_data, terms, len(before), q["one"], q["other"])
         for q in experiment["questions"]
     )
 
 
 def _question_separation(
-    old: RegressionData, both: RegressionData, terms: tuple[Used, ...], index: int,
+    old: RegressionData, all_data: RegressionData, terms: tuple[Used, ...], index: int,
     first: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
     """Return one question's separation: the largest rms difference per new row of an equation."""
 
     def gap(data: RegressionData) -> dict[str, float]:
         """Return the energy above noise that `other` leaves more than `first`, by equation."""
-        one, two = (
+        first_energy, other_energy = (
             energy_above_noise(data, refine(data, (*terms, *effects_of(side))).residual)
             for side in (first, other)
         )
-        return {e: two[e] - one[e] for e in one}
+        return {e: other_energy[e] - first_energy[e] for e in first_energy}
 
-    before, after = gap(old), gap(both)
+    before, after = gap(old), gap(all_data)
     rows: Counter[str] = Counter()
-    for s in both.segments:
+    for s in all_data.segments:
         if s.group[0] == index:
             rows[s.equation] += s.count * s.repeats
     energy = {e: abs(after[e] - before.get(e, 0.0)) for e in rows}
@@ -115,7 +115,7 @@ def _question_separation(
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:
-    """Return the terms that a result names, with the shapes it gives."""
+    """Return the terms that one side of a question names, with their shapes."""
     return [Used(known()[k["name"]](k["at"]), tuple(k["shape"])) for k in side]
 
 

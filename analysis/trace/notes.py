@@ -84,13 +84,13 @@ def _masked_step_notes(train_data: RegressionData) -> list[str]:
 
 def masked_row_notes(kind: str, data: RegressionData) -> list[str]:
     """Name the equations of which at least `TRACE.masked_share` of the rows is left out."""
-    kept: dict[str, int] = {}
+    counts: dict[str, int] = {}
     missing: dict[str, int] = {}
     for s in data.segments:
         _, rows = data.source(s)
-        kept[s.equation] = kept.get(s.equation, 0) + len(rows.rhs)
+        counts[s.equation] = counts.get(s.equation, 0) + len(rows.rhs)
         missing[s.equation] = missing.get(s.equation, 0) + rows.masked
-    shares = {e: missing[e] / max(missing[e] + kept[e], 1) for e in sorted(kept)}
+    shares = {e: missing[e] / max(missing[e] + counts[e], 1) for e in sorted(counts)}
     return [
         f"{equation}: {plain(100 * share, 2)} % of the {kind} rows are left out, since "
         f"{WHY_MASKED}: an effect that acts only there is not seen"
@@ -108,9 +108,9 @@ def undetermined_notes(
     takes the others from it (`held_out.completed`). `in_motion` are the joints (0-based) whose
     torque rows are weighted by speed.
     """
-    lost = [n for n, e in model.parameters.items() if not e.identified]
+    undetermined = [n for n, e in model.parameters.items() if not e.identified]
     known = {} if before is None else before.parameters
-    missing = [n for n in lost if n not in known or known[n].identified]
+    missing = [n for n in undetermined if n not in known or known[n].identified]
     if not missing:
         return []
     where = f", with {', '.join(equation('torque', i) for i in in_motion)} judged in motion alone,"
@@ -128,8 +128,8 @@ def record_condition_notes(train_data: RegressionData, winner: Hypothesis) -> li
     if not terms:
         return []
     signals = signals_of(train_data)
-    said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
-    return [f"{name}: {text}" for name, text in said if text]
+    remarks = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
+    return [f"{name}: {text}" for name, text in remarks if text]
 
 
 def unseen_load_notes(train: Sequence[Run], unseen: Sequence[Run]) -> list[str]:
@@ -178,20 +178,20 @@ def geometry_note(geometry: Geometry, named: Sequence[JudgedEffect], explained: 
 
 
 def not_judged_notes(
-    left: Sequence[Remainder], noise: Mapping[str, float], after: Mapping[str, float]
+    remaining: Sequence[Remainder], noise: Mapping[str, float], after: Mapping[str, float]
 ) -> list[str]:
-    """State what speaks against an explanation where the judging rows do not show it.
+    """State the remainders with a veto that the judging rows do not show.
 
     `noise` and `after` are noise floor and error of the judging rows, by equation.
     """
     words: dict[str, list[str]] = {}
-    for r in left:
+    for r in remaining:
         if r.veto and after[r.equation] <= TRACE.noted_ratio * noise[r.equation]:
             words.setdefault(r.equation, []).append(r.words)
     return [
-        f"{equation}: {', '.join(found)}; the rows that judge hold noise alone, so that the cause "
+        f"{equation}: {', '.join(parts)}; the rows that judge hold noise alone, so that the cause "
         "does not act in all parts of the records"
-        for equation, found in words.items()
+        for equation, parts in words.items()
     ]
 
 
@@ -199,10 +199,10 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
     """State for each effect the parameter that its tied rivals change most."""
     out = []
     for effect in named:
-        moved = [(*r.moved, r) for r in effect.rivals if r.moved]
-        if not moved:
+        changed = [(*r.moved, r) for r in effect.rivals if r.moved]
+        if not changed:
             continue
-        parameter, change, rival = max(moved, key=lambda found: abs(found[1]))
+        parameter, change, rival = max(changed, key=lambda entry: abs(entry[1]))
         size = f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
         out.append(
             f"with {rival.name} at {rival.location} in place of {effect.name}, {parameter} would "

@@ -52,8 +52,9 @@ def sentence(result: Trace) -> str:
             "No residual exceeds the noise: the baseline model explains these records; no effect "
             "is named."
         )
-    named = "; ".join(_effect(e, result.model_before.rig) for e in result.effects)
-    errors = " ".join([_errors(result), *_remarks(result), *_tolerated(result)]).strip()
+    named = "; ".join(_effect_in_words(e, result.model_before.rig) for e in result.effects)
+    remarks = [*_open_number_remarks(result), *_tolerated_error(result)]
+    errors = " ".join([_error_reduction(result), *remarks]).strip()
     if result.verdict == EXPLAINED:
         return f"{_variables_in_words(result.effects)}: {named}. {errors}"
     if result.verdict == CONFOUNDED:
@@ -108,7 +109,7 @@ def _variables_in_words(effects: tuple[JudgedEffect, ...]) -> str:
     return "The residual follows " + " and ".join(variables) if variables else "Explained"
 
 
-def _effect(effect: JudgedEffect, rig: Rig) -> str:
+def _effect_in_words(effect: JudgedEffect, rig: Rig) -> str:
     numbers = ", ".join(numbers_in_words(effect, rig))
     return f"{effect.name.replace('_', ' ')} at {effect.location} ({numbers})"
 
@@ -146,7 +147,7 @@ def _undetermined(effect: JudgedEffect, name: str) -> bool:
     return estimate.half > max(map(abs, alike))
 
 
-def _remarks(result: Trace) -> list[str]:
+def _open_number_remarks(result: Trace) -> list[str]:
     """Return what a note says of each number that the records do not determine."""
     open_numbers = [
         f"{e.name}: {name} " for e in result.effects for name in e.parameters
@@ -156,12 +157,12 @@ def _remarks(result: Trace) -> list[str]:
     return [f"{remark.partition(': ')[2]}." for remark in remarks]
 
 
-def _tolerated(result: Trace) -> list[str]:
+def _tolerated_error(result: Trace) -> list[str]:
     """Say which error of an explanation is above the noise's band, and why it may be."""
-    above = [e for e in result.above_floor if result.remaining_share(e) < 1.0]
-    if result.verdict not in (EXPLAINED, CONFOUNDED) or not above:
+    above_floor = [e for e in result.above_floor if result.remaining_share(e) < 1.0]
+    if result.verdict not in (EXPLAINED, CONFOUNDED) or not above_floor:
         return []
-    e = above[0]
+    e = above_floor[0]
     share = result.remaining_share(e)
     why = f"the form of a named effect may miss {plain(100 * TRACE.held_out_share, 2)} %"
     if any(note.startswith(f"{e}: {WITHOUT_RESTS}") for note in result.notes):
@@ -243,7 +244,7 @@ def equation_of_largest_reduction(result: Trace) -> str:
     return max(result.before, key=fall)
 
 
-def _errors(result: Trace) -> str:
+def _error_reduction(result: Trace) -> str:
     if not result.before:
         return ""
     e = equation_of_largest_reduction(result)
