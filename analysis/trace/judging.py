@@ -102,7 +102,7 @@ def with_free_form(finding: Finding, candidates: Candidates) -> Finding:
 
 
 def _held_out_only_notes(train_data: RegressionData, remaining: Sequence[Remainder]) -> list[str]:
-    """Say why only held-out records keep too much: what does not repeat, or little excitation."""
+    """State why only held-out records are above the band: no repetition, or little excitation."""
     above_band = sorted({r.equation for r in remaining if r.veto})
     unrepeated = [e for e in above_band if e in unrepeated_floors(train_data)]
     out = [

@@ -32,7 +32,7 @@ WITHOUT_RESTS: Final = "judged without the samples at which the joint rests"
 
 
 def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
-    """State where the noise floor is from few data, and which rows are left out."""
+    """State the source of noise floors without repeats, and the rows that are left out."""
     out = []
 
     def steps(source: str, *data: RegressionData) -> str:
@@ -162,7 +162,7 @@ def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
 
 
 def geometry_note(geometry: Geometry, named: Sequence[JudgedEffect], explained: bool) -> str:
-    """State the numbers that are furthest from the rig file's, and the answer with those."""
+    """State the numbers that deviate most from the rig file's, and the answer with the latter."""
     numbers, deviations = geometry.rig.uncertain_numbers, geometry.deviations
     moved = ", ".join(
         f"{numbers[j].name} {abs(deviations[j]):.1f} times {numbers[j].stated} "
@@ -212,7 +212,7 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
 
 
 def shared_parameters(winner: Hypothesis, after: Model) -> dict[str, tuple[Used, str]]:
-    """Return the baseline parameters that free curves share: the curve, and why in words.
+    """Return the baseline parameters that free curves share: curve and reason, by name.
 
     Their value depends on how the curve is centred.
     """

@@ -137,7 +137,7 @@ class JudgedEffect:
     `removed_fraction` is the share of held-out energy above noise that the effect removes in the
     equations where it acts, beside the other effects. `shot` are the shapes of an effect with a
     hidden state by multiple shooting. `mechanism` is the part of the physics in which it acts; a
-    `free` effect is described by its `curves` instead of a name. `left_without` and `left_with` are
+    `free` effect is described by its `curves` instead of a name. `rms_without` and `rms_with` are
     the held-out rms in its equations without and with it, over the noise of the averaged repeats.
     `at` is its place in the catalogue, with sensor or chamber.
     """
@@ -154,8 +154,8 @@ class JudgedEffect:
     mechanism: str = ""
     free: bool = False
     curves: tuple[Curve, ...] = ()
-    left_without: float = math.nan
-    left_with: float = math.nan
+    rms_without: float = math.nan
+    rms_with: float = math.nan
     at: str = ""
 
     @property

@@ -128,7 +128,7 @@ def numbers_in_words(effect: JudgedEffect, rig: Rig) -> list[str]:
 
 
 def _curve_range(curve: Curve) -> str:
-    """Return between which values a curve lies, and over which range of its variable."""
+    """Return the range of a curve's values and that of its variable, in words."""
     ends = (np.min(curve.y), np.max(curve.y), curve.x[0], curve.x[-1])
     low, high, first, last = (plain(v, 3) for v in ends)
     y, x = typeset(curve.unit_y), typeset(curve.unit_x)
@@ -148,7 +148,7 @@ def _undetermined(effect: JudgedEffect, name: str) -> bool:
 
 
 def _open_number_remarks(result: Trace) -> list[str]:
-    """Return what a note says of each number that the records do not determine."""
+    """Return the notes on numbers of the effects that the records do not determine."""
     open_numbers = [
         f"{e.name}: {name} " for e in result.effects for name in e.parameters
         if _undetermined(e, name)
@@ -158,7 +158,7 @@ def _open_number_remarks(result: Trace) -> list[str]:
 
 
 def _tolerated_error(result: Trace) -> list[str]:
-    """Say which error of an explanation is above the noise's band, and why it may be."""
+    """State the largest error of an explanation above the noise, and why it is tolerated."""
     above_floor = [e for e in result.above_floor if result.remaining_share(e) < 1.0]
     if result.verdict not in (EXPLAINED, CONFOUNDED) or not above_floor:
         return []
@@ -206,7 +206,7 @@ def tolerated_error_notes(result: Trace) -> list[str]:
 
 
 def quantity(estimate: Estimate) -> str:
-    """Return value ± 95 % half-width with its unit, or value and ends of a lopsided interval."""
+    """Return value ± 95 % half-width with its unit, or value and ends of an asymmetric interval."""
     low, high = estimate.ci95
     sides, unit = (estimate.value - low, high - estimate.value), typeset(estimate.unit)
     if max(sides) > LOPSIDED * min(sides) > 0.0:

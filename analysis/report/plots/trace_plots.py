@@ -166,14 +166,14 @@ def rival_errors(effect: JudgedEffect, key: str) -> Markup | None:
 
     Sorted by error, each with the reason why it is named or not. None where errors are unknown.
     """
-    if not (np.isfinite(effect.left_without) and np.isfinite(effect.left_with)):
+    if not (np.isfinite(effect.rms_without) and np.isfinite(effect.rms_with)):
         return None
     bars = [
-        ("without the effect", effect.left_without, "", GREY),
-        (_called(effect.name, effect.location), effect.left_with, _verdict(effect), BLUE),
+        ("without the effect", effect.rms_without, "", GREY),
+        (_called(effect.name, effect.location), effect.rms_with, _verdict(effect), BLUE),
     ]
     bars += [
-        (_called(r.name, r.location), r.ratio * effect.left_with, *_against(r))
+        (_called(r.name, r.location), r.ratio * effect.rms_with, *_against(r))
         for r in effect.rivals
     ]
     bars.sort(key=lambda bar: bar[1])

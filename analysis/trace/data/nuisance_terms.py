@@ -8,7 +8,7 @@ the same equations would not reach the noise floor.
 The rows take the spool for linear between its samples. Under a held command a first-order spool of
 time constant tau runs along an exponential there, which in the flows acts as a lead of dt^2/(12
 tau): one column a joint, C T du/dt sqrt(dp) (`analysis.identify.estimators.nuisance.SpoolPath`).
-Without it a quick spool looks like a sensor that is late by some tens of microseconds. The current
+Without it a quick spool resembles a sensor delay of some tens of microseconds. The current
 of an electric drive does the same to its joint's torque (`DrivePath`).
 """
 

@@ -85,7 +85,7 @@ class CurveRange:
     @property
     def notes(self) -> list[str]:
         """A note for every equation of which judging rows lie beyond the range."""
-        left_out = "they speak neither for nor against it, and are left out of the errors"
+        left_out = "they cannot judge it, and are left out of the errors"
         too_few = "too few remain within it to judge it, so that only the rows that choose do"
         return [
             f"{e}: {plain(100 * (rows - self._kept[e]) / rows, 2)} % of the judging rows lie "

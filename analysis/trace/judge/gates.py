@@ -131,8 +131,8 @@ def judge_effects(
                 effect.variable_on(train_data.rig),
                 mechanism=effect.mechanism, free=effect.free, at=effect.where,
                 curves=curves_of(train_data, winner.fit, used),
-                left_without=held_out.rms_in(holdout_data, without, changes),
-                left_with=held_out.rms_in(holdout_data, after, changes),
+                rms_without=held_out.rms_in(holdout_data, without, changes),
+                rms_with=held_out.rms_in(holdout_data, after, changes),
             )
         )  # fmt: skip
     return tuple(out)

@@ -180,7 +180,7 @@ def judged_line(
     return JudgedEffect(
         effect.name, effect.where, parameters, p, removed, (), gates, effect.variable,
         mechanism=effect.mechanism, at=effect.where,
-        left_without=math.sqrt(before) / scale, left_with=math.sqrt(after) / scale,
+        rms_without=math.sqrt(before) / scale, rms_with=math.sqrt(after) / scale,
     )  # fmt: skip
 
 

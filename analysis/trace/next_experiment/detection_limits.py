@@ -54,15 +54,15 @@ Array = NDArray[np.float64]
 class AbsorbedEffects:
     """Further effects at their smallest sizes of interest, beside a set.
 
-    What each adds to the whitened rows of `data` is `shown` (M, n) in the residual and `taken`
-    (k, n) in the coefficients and shapes `names` of the set.
+    Of what each adds to the whitened rows of `data`, `residual` (M, n) remains; the rest is
+    absorbed by `shifts` (k, n) of the coefficients and shapes `names` of the set.
     """
 
     data: RegressionData
     explanations: Sequence[Explanation]
     names: Sequence[str]
-    taken: Array
-    shown: Array
+    shifts: Array
+    residual: Array
 
 
 def absorbed_effects(
@@ -108,7 +108,7 @@ def absorbed_effects(
 
 
 def _pairs_of_chambers(single: Sequence[Explanation]) -> list[tuple[int, int]]:
-    """Return the places in `single` of one effect at the cap and at the rod side of one joint.
+    """Return index pairs in `single` of an effect at the cap side and at the rod side of a joint.
 
     Both chambers' pressures read against vacuum, or both pipes longer than stated, are as likely as
     one alone, and the parameters may absorb more of the two.
@@ -136,12 +136,12 @@ def detection_limits(
     half_widths = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
     limits = []
     for k, explanation in enumerate(absorbed.explanations):
-        shown = absorbed.shown[:, k]
+        shown = absorbed.residual[:, k]
         energy, factor = float(shown @ shown), 0.0
         if energy > 0.0:  # else nothing remains in the residual, and no size can be stated
             most_noise = IDENTIFY.normal_quantile * energy**0.5
             factor = float((abs(shown @ residual) + most_noise) / energy)
-        changes = dict(zip(absorbed.names, factor * absorbed.taken[:, k], strict=True))
+        changes = dict(zip(absorbed.names, factor * absorbed.shifts[:, k], strict=True))
         shifts = _parameter_shifts(data, changes, half_widths)
         most = max(shifts, key=lambda name: shifts[name], default="")
         if most and shifts[most] > 1.0:  # the parameter would be 0 or of the other sign
@@ -195,7 +195,7 @@ def _parameter_shifts(
 def _effect_size(
     data: RegressionData, explanation: Explanation, factor: float
 ) -> tuple[str, float, str, float]:
-    """Return name, size and unit of the number that says how large an effect is, and its neutral.
+    """Return name, size, unit and neutral value of the number that states an effect's size.
 
     The size is the difference from the neutral value, 1 of a gain.
     """
@@ -210,7 +210,7 @@ def _effect_size(
 
 
 def is_possible(rig: Rig, model: Model, explanation: Explanation, factor: float) -> bool:
-    """Return whether effects of `factor` their smallest size are physical, as the smallest are."""
+    """Return whether effects physical at their smallest size are so at `factor` times it."""
     known = {name: e.value for name, e in model.parameters.items() if e.identified}
 
     def problem(used: Used, factor: float) -> str:
@@ -289,8 +289,8 @@ def _clearest_effects(absorbed: AbsorbedEffects, winner: Hypothesis) -> list[tup
 
     Effects at both chambers are counted apart from single ones, so that they displace none.
     """
-    size = np.linalg.norm(absorbed.shown, axis=0)
-    product = np.abs(absorbed.shown.T @ winner.fit.residual)
+    size = np.linalg.norm(absorbed.residual, axis=0)
+    product = np.abs(absorbed.residual.T @ winner.fit.residual)
     deviations = np.divide(product, size, out=np.zeros_like(product), where=size > 0)
     clear = [k for k in np.argsort(-deviations) if deviations[k] > TRACE.suggested_deviations]
     effects = [absorbed.explanations[k].effects for k in clear]

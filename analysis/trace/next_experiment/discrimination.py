@@ -110,7 +110,7 @@ class MeasurementView:
     noise: Mapping[str, float]
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
-        """Return what an effect would add in SI: equation -> name -> column (m,)."""
+        """Return an effect's columns (m,) in SI: equation -> name -> column."""
         return candidate_columns(self.train_data, self.conditioned, self.signals, self.rows, used)
 
     def weight(self, equation: str) -> float:
@@ -157,7 +157,7 @@ def measurement_view(
 
 
 class ComparisonRows:
-    """Whitened rows to compare explanations on: of the training data, then of a view if any.
+    """Whitened rows on which explanations are compared: training data, then those of a view if any.
 
     `base` (m, k) holds the baseline's columns, `equation` (m,) each row's equation.
     """
@@ -209,7 +209,7 @@ class ComparisonRows:
         return out
 
     def prediction(self, explanation: Explanation) -> Array:
-        """Return what an explanation adds to the rows (m,) at its sizes."""
+        """Return the sum (m,) of an explanation's columns times its sizes."""
         total = np.zeros(len(self.equation))
         for used in explanation.effects:
             for name, column in self.columns(used).items():

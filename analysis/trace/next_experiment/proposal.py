@@ -60,7 +60,7 @@ class PredictedAnswer:
 
     @property
     def open(self) -> bool:
-        """Whether the experiment would give an answer that the records do not give."""
+        """Whether the experiment separates the explanations clearly better than the records do."""
         return self.predicted >= max(LEAST_SEPARATION, EXPERIMENT.least_gain * self.present)
 
 
@@ -200,7 +200,7 @@ def _covering_experiment(
     candidates: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
-    """Return an experiment beyond the range or the lines of the records, None if none is."""
+    """Return an experiment with a wider range or more lines than the records, None if none."""
     extension = wider_range(train_data, clues, views, EXPERIMENT.least_gain)
     extension = extension or more_lines(train_data, clues, candidates)
     if extension is None:
@@ -289,7 +289,7 @@ def _experiment_in_words(
 
 
 def _separated_by(name: str, rival: str) -> str:
-    """Return the excitation that separates two effects, from the one that confounds the other."""
+    """Return the stated excitation that separates two confounded effects, '' if none is stated."""
     for first, second in ((rival, name), (name, rival)):
         kind = known()[first]
         if issubclass(kind, Effect) and second in kind.confounders:

@@ -65,7 +65,7 @@ def test_a_model_with_an_undetermined_value_of_a_curve_can_be_simulated(rig: Rig
 
 
 @pytest.mark.parametrize(
-    ("reach", "says"), [(0.9, "neither for nor against"), (0.01, "only the rows that choose")]
+    ("reach", "says"), [(0.9, "they cannot judge it"), (0.01, "only the rows that choose")]
 )
 def test_rows_beyond_a_curve_are_stated_whether_they_judge_or_not(
     rig: Rig, reach: float, says: str

@@ -82,8 +82,8 @@ def test_a_leak_is_named_with_place_and_size_and_its_error_falls_to_the_noise(
     assert (found.name, found.where) == ("internal_leakage", "joint 2")
     assert found.parameters["c_internal_2"].value == pytest.approx(2e-12, rel=0.03, abs=0)
     assert found.removed_fraction > 0.95
-    assert found.left_without > 5.0
-    assert found.left_with == pytest.approx(1.0, abs=0.2)
+    assert found.rms_without > 5.0
+    assert found.rms_with == pytest.approx(1.0, abs=0.2)
     assert found.p_value <= 0.01
     assert leaking.before["flow_cap_2"] > 3 * leaking.noise_floor["flow_cap_2"]
     assert leaking.after["flow_cap_2"] < 1.3 * leaking.noise_floor["flow_cap_2"]

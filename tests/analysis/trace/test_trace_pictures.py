@@ -29,7 +29,7 @@ LEAK = JudgedEffect(
         Rival("external_leakage", "joint 2 rod", 1.05, 1.9, False),
     ),
     (Gate("no rival", False, "cannot be separated from sensor_gain"),),
-    left_without=27.6, left_with=1.5,
+    rms_without=27.6, rms_with=1.5,
 )  # fmt: skip
 
 
@@ -152,7 +152,7 @@ def test_rivals_stand_by_what_they_leave_and_say_why_they_are_not_named() -> Non
 
 
 def test_a_trace_of_before_is_drawn_without_what_nobody_knows() -> None:
-    assert trace_plots.rival_errors(replace(LEAK, left_without=float("nan")), "e0") is None
+    assert trace_plots.rival_errors(replace(LEAK, rms_without=float("nan")), "e0") is None
 
 
 def test_a_sensor_s_effect_is_told_with_its_sensor_and_stored_by_its_joint() -> None:
