@@ -106,11 +106,11 @@ def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
         cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
         into_cap = cap * signals.sd[:, i] + softness * signals.V_cap[:, i] * signals.pd_cap[:, i]
         into_rod = softness * signals.V_rod[:, i] * signals.pd_rod[:, i] - rod * signals.sd[:, i]
-        ahead, astern = signals.u[:, i] > 0.0, signals.u[:, i] < 0.0
+        positive, negative = signals.u[:, i] > 0.0, signals.u[:, i] < 0.0
         if drawn:
-            flow = np.where(ahead, into_cap, 0.0) + np.where(astern, into_rod, 0.0)
+            flow = np.where(positive, into_cap, 0.0) + np.where(negative, into_rod, 0.0)
         else:
-            flow = -np.where(ahead, into_rod, 0.0) - np.where(astern, into_cap, 0.0)
+            flow = -np.where(positive, into_rod, 0.0) - np.where(negative, into_cap, 0.0)
         total += np.maximum(flow, 0.0)
     return total
 
@@ -415,8 +415,8 @@ def _valve_flow(x, level, sign, turbulent, turning, par, drawn):  # type: ignore
         flow, slope = 0.0, 0.0
         for i in range(x.shape[1]):
             u = x[U, i]
-            ahead = (u > 0.0) == drawn  # the cap's edge is the open one
-            p = x[P_CAP, i] if ahead else x[P_ROD, i]
+            at_cap = (u > 0.0) == drawn  # the cap's edge is the open one
+            p = x[P_CAP, i] if at_cap else x[P_ROD, i]
             gain = par[2 + 2 * i] if u > 0.0 else par[3 + 2 * i]
             remaining = sign * (level - p) - drop
             if remaining > 0.0 and u != 0.0:

@@ -41,26 +41,26 @@ def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         return
     i = int(par[0])
     u, w = x[U, i], par[5]
-    ahead = edge(u + w, par[6], par[7]) - max(u, 0.0)
-    astern = edge(w - u, par[6], par[7]) - max(-u, 0.0)
+    positive = edge(u + w, par[6], par[7]) - max(u, 0.0)
+    negative = edge(w - u, par[6], par[7]) - max(-u, 0.0)
     cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
-    out[FLOW_CAP, i] += par[1] * ahead * signed_root(p_s - cap) - par[2] * astern * signed_root(
-        cap - p_t
-    )
-    out[FLOW_ROD, i] += par[4] * astern * signed_root(p_s - rod) - par[3] * ahead * signed_root(
-        rod - p_t
-    )
+    out[FLOW_CAP, i] += par[1] * positive * signed_root(p_s - cap) - par[
+        2
+    ] * negative * signed_root(cap - p_t)
+    out[FLOW_ROD, i] += par[4] * negative * signed_root(p_s - rod) - par[
+        3
+    ] * positive * signed_root(rod - p_t)
 
 
 @dataclass(frozen=True)
 class UnderlapLeakage(ValveEffect):
-    """Edges open by w at the null: opening max(w + u, 0) ahead (u > 0), max(w - u, 0) astern.
+    """Edges open by w at the null: openings max(w + u, 0) and max(w - u, 0).
 
-    Openings added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
-    d- = max(w - u, 0) - max(-u, 0), edges rounded as those of `valve_deadband`, each times its own
-    gain and root (Merritt 1967, chapter 5, open-centre valve). The gains are those of the orifices,
-    whose columns they add to. A negative w is an overlap that is less than what the rounding leaves
-    open at the null.
+    Openings added to the zero-lap orifice: d+ = max(u + w, 0) - max(u, 0) of the edges that open
+    with a positive u, d- = max(w - u, 0) - max(-u, 0) of the others, rounded as those of
+    `valve_deadband`, each times its own gain and root (Merritt 1967, chapter 5, open-centre valve).
+    The gains are those of the orifices, whose columns they add to. A negative w is an overlap that
+    is less than what the rounding leaves open at the null.
     """
 
     name = "underlap_leakage"
@@ -106,17 +106,17 @@ class UnderlapLeakage(ValveEffect):
         i = self.joint
         pp, pm, mp, mm = gain_names(i + 1)
         u, (w, r, c) = signals.u[:, i], self.full_shape(rig, shape)
-        ahead = opened(u + w, r, c) - np.maximum(u, 0.0)
-        astern = opened(w - u, r, c) - np.maximum(-u, 0.0)
+        positive = opened(u + w, r, c) - np.maximum(u, 0.0)
+        negative = opened(w - u, r, c) - np.maximum(-u, 0.0)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
         return {
             equation("flow_cap", i): {
-                pp: ahead * root_of_drop(p_s - cap),
-                pm: -astern * root_of_drop(cap - p_t),
+                pp: positive * root_of_drop(p_s - cap),
+                pm: -negative * root_of_drop(cap - p_t),
             },
             equation("flow_rod", i): {
-                mp: -ahead * root_of_drop(rod - p_t),
-                mm: astern * root_of_drop(p_s - rod),
+                mp: -positive * root_of_drop(rod - p_t),
+                mm: negative * root_of_drop(p_s - rod),
             },
         }
 

@@ -87,8 +87,8 @@ def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
     i = int(par[0])
     later = par[5]
     if phase == PREPARE:
-        ahead = edge(x[U, i] - par[1], par[3], par[4])
-        x[U, i] = ahead - edge(-x[U, i] - par[2], par[3], par[4])
+        positive = edge(x[U, i] - par[1], par[3], par[4])
+        x[U, i] = positive - edge(-x[U, i] - par[2], par[3], par[4])
     elif phase == CONTRIBUTE and later != 0.0:
         u = x[U, i]
         size = abs(u)
@@ -141,12 +141,12 @@ class ValveDeadband(ValveEffect):
 
         The overlaps of a shape without that are the mean of those of both pairs.
         """
-        ahead, astern, r, c, further = self.full_shape(rig, shape)
-        cornered = (ahead, astern, r, c or CORNER, *((further,) if further else ()))
+        w_ahead, w_astern, r, c, further = self.full_shape(rig, shape)
+        cornered = (w_ahead, w_astern, r, c or CORNER, *((further,) if further else ()))
         if further:
             return (cornered,)
-        later = LATER * min(ahead, astern)
-        laps = ahead - 0.5 * later, astern - 0.5 * later
+        later = LATER * min(w_ahead, w_astern)
+        laps = w_ahead - 0.5 * later, w_astern - 0.5 * later
         return (cornered, (*laps, r, c, later), (*laps, r, c, -later))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
@@ -163,17 +163,17 @@ class ValveDeadband(ValveEffect):
         pp, pm, mp, mm = gain_names(i + 1)
         u, size = signals.u[:, i], np.abs(signals.u[:, i])
         less = size - np.minimum(size, opened(size - abs(later), r, c))
-        ahead, astern = np.where(u > 0.0, less, 0.0), np.where(u > 0.0, 0.0, less)
+        positive, negative = np.where(u > 0.0, less, 0.0), np.where(u > 0.0, 0.0, less)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
         if later > 0.0:
             to_cap, to_rod = (
-                {pm: astern * root_of_drop(cap - p_t)},
-                {mp: ahead * root_of_drop(rod - p_t)},
+                {pm: negative * root_of_drop(cap - p_t)},
+                {mp: positive * root_of_drop(rod - p_t)},
             )
         else:
             to_cap, to_rod = (
-                {pp: -ahead * root_of_drop(p_s - cap)},
-                {mm: -astern * root_of_drop(p_s - rod)},
+                {pp: -positive * root_of_drop(p_s - cap)},
+                {mm: -negative * root_of_drop(p_s - rod)},
             )
         return {equation("flow_cap", i): to_cap, equation("flow_rod", i): to_rod}
 
@@ -182,9 +182,9 @@ class ValveDeadband(ValveEffect):
         gains = [values[name] for name in gain_names(self.joint + 1)]
         return np.array([self.joint, *self.full_shape(rig, shape), *gains])
 
-    def opening(self, u: Array, ahead: float, astern: float, r: float, c: float) -> Array:
+    def opening(self, u: Array, w_ahead: float, w_astern: float, r: float, c: float) -> Array:
         """Return the opening (n,) [V] at the spool u (n,) [V], of overlaps and edge form."""
-        return opened(u - ahead, r, c) - opened(-u - astern, r, c)
+        return opened(u - w_ahead, r, c) - opened(-u - w_astern, r, c)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject a shape at its bounds, and edges with a corner that are open at the null."""
@@ -200,13 +200,8 @@ class ValveDeadband(ValveEffect):
 
     def limited_shape(self, shape: Sequence[float]) -> tuple[float, ...]:
         """Limit the rounding: a valve with a larger one is open at its null."""
-        ahead, astern, *form = shape
-        return (
-            ahead,
-            astern,
-            *(min(r, MOST_ROUND * max(ahead, astern)) for r in form[:1]),
-            *form[1:],
-        )
+        most = MOST_ROUND * max(shape[:2])
+        return (*shape[:2], *(min(r, most) for r in shape[2:3]), *shape[3:])
 
 
 @kernel
