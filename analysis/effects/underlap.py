@@ -44,12 +44,10 @@ def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
     positive = edge(u + w, par[6], par[7]) - max(u, 0.0)
     negative = edge(w - u, par[6], par[7]) - max(-u, 0.0)
     cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
-    out[FLOW_CAP, i] += par[1] * positive * signed_root(p_s - cap) - par[
-        2
-    ] * negative * signed_root(cap - p_t)
-    out[FLOW_ROD, i] += par[4] * negative * signed_root(p_s - rod) - par[
-        3
-    ] * positive * signed_root(rod - p_t)
+    into_cap = par[1] * positive * signed_root(p_s - cap)
+    into_rod = par[4] * negative * signed_root(p_s - rod)
+    out[FLOW_CAP, i] += into_cap - par[2] * negative * signed_root(cap - p_t)
+    out[FLOW_ROD, i] += into_rod - par[3] * positive * signed_root(rod - p_t)
 
 
 @dataclass(frozen=True)
