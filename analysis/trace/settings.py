@@ -327,6 +327,8 @@ class SearchSettings:
     near_gain: float = 0.25
     """Energy that a single candidate removes over what the best one removes: one with less is not
     refined (tuned)."""
+    other_starts: int = 3
+    """Number of single effects from which a search begins again that has found no explanation."""
     shape_starts: int = 3
     """Number of points of an effect's shape grid from which a search for its shapes begins."""
     # Refinement.

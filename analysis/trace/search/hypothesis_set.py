@@ -234,12 +234,33 @@ class HypothesisSet:
             others = [o for o in pairs if not current.keys & o.keys]
             far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]
             return self.completed_to_noise(self.prune(self.best([current, *far])))
-        current = self.prune(self.best([self.empty, *singles, *pairs]))
+        current = self._grown(self.prune(self.best([self.empty, *singles, *pairs])))
+        if self.within_form_tolerance(current):
+            return current
+        return self._grown(self._begun_with_another(current, singles))
+
+    def _begun_with_another(self, current: Hypothesis, singles: Sequence[Hypothesis]) -> Hypothesis:
+        """Return the set, or a better pair that begins with a single effect which it lacks.
+
+        A cross-talk may leave less than the true gain while a second effect is missing, and no
+        further effect beside the cross-talk explains what it leaves.
+        """
+        others = [o for o in singles if not o.keys & current.keys and not self.physical_problem(o)]
+        nearest = sorted(others, key=lambda o: o.total)[: SEARCH.other_starts]
+        pairs = [pair for single in nearest for pair in self.extensions(single)]
+        return self.prune(self.best([current, *pairs]))
+
+    def _grown(self, current: Hypothesis) -> Hypothesis:
+        """Return the set with further effects, while each leaves enough less and more than noise.
+
+        A set within the tolerance for its forms grows only to one that leaves noise alone.
+        """
+        band = self.noise_band
         while not within_band(current.excess_energy, band) and may_grow(current.effects):
             grown = self.prune(self.best([current, *self.extensions(current)]))
             if (
                 grown.keys == current.keys
-                or log_energy_ratio(current, grown, self.noise_band) < SEARCH.least_log_gain
+                or log_energy_ratio(current, grown, band) < SEARCH.least_log_gain
             ):
                 break
             current = grown

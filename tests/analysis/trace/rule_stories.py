@@ -42,7 +42,7 @@ from tests.analysis.trace.hidden import (
     pushed,
     understated,
 )
-from tests.studies.foreign.bench import TRAIN, records_of
+from tests.studies.foreign.bench import TRAIN, records_of, runs_of
 from tests.studies.foreign.cases import case_of
 from tests.studies.trace.rules import Rule, switched_off
 
@@ -458,6 +458,19 @@ def a_high_return_pressure_is_found_beside_an_underlap(b: Benches) -> None:
     assert {f.name for f in result.effects} == {"underlap_leakage", "tank_pressure"}
 
 
+def a_gain_beside_a_dead_volume_is_not_taken_for_a_cross_talk(_: Benches) -> None:
+    """The cross-talk of the other side leaves less than the gain alone, but nothing beside it."""
+    train, unseen = runs_of(case_of(212020).bench, 212020)
+    names = (
+        "sensor_gain", "sensor_crosstalk", "dead_volume", "base_inclination", "torque_offset",
+    )  # fmt: skip
+    candidates = catalogue(train.rig, names)
+    result = engine.trace([train], unseen, candidates, look_ahead=False, free_forms=False)
+    assert {(e.name, e.where) for e in result.effects} == {
+        ("sensor_gain", "joint 2 cap"), ("dead_volume", "joint 2 rod"),
+    }  # fmt: skip
+
+
 def levels_whose_difference_the_weight_takes_up_are_confounded_with_one(b: Benches) -> None:
     """98 and 46 N at joint 1, whose lever arm times a constant force is nearly the weight's torque.
 
@@ -644,6 +657,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (equal_levels_by_direction_are_one_level, ("simpler name",)),
     (levels_whose_difference_the_weight_takes_up_are_confounded_with_one, ("open parameters",)),
+    (a_gain_beside_a_dead_volume_is_not_taken_for_a_cross_talk, ("other starts",)),
     (one_level_on_an_inclined_base_is_not_taken_for_two_levels, ("two in place of one",)),
     (two_quiet_levels_are_not_one_level_and_a_torque, ("fewer effects",)),
     (a_breakaway_is_found_with_the_level_below_it_beside_a_lag, ("parts of a law",)),
@@ -669,6 +683,7 @@ SLOW: Final = (
     a_spring_that_fits_like_an_inclination_is_its_rival,
     a_high_return_pressure_is_found_beside_an_underlap,
     wrong_volumes_at_one_joint_name_nothing_at_the_other,
+    a_gain_beside_a_dead_volume_is_not_taken_for_a_cross_talk,
     levels_whose_difference_the_weight_takes_up_are_confounded_with_one,
     one_level_on_an_inclined_base_is_not_taken_for_two_levels,
     a_breakaway_is_found_with_the_level_below_it_beside_a_lag,

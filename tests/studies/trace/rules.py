@@ -219,6 +219,8 @@ RULES: Final = (
          ((engine, "geometry_for_smaller_set", lambda *_: None),)),
     Rule("unstated noise", "where nothing repeats, the noise is the stated one",
          ((engine, "unstated_noise", lambda *_: None),)),
+    Rule("other starts", "a search that explains nothing does not begin with another effect",
+         ((HypothesisSet, "_begun_with_another", lambda _, current, _singles: current),)),
     Rule("look-alikes", "no effect is exchanged for one that looks like it",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
     Rule("two for one", "no effect is exchanged for two that leave less",
