@@ -76,8 +76,6 @@ MOST_ROUND: Final = 1.7
 # Gain at the null over that far from it, above which edges with a corner do not close there; the
 # most rounded dead bands of the odd seeds have 0.02.
 OPEN_AT_NULL: Final = 0.1
-
-
 MOST_LATER: Final = 0.2  # largest further overlap of one pair of edges, over the spool's stroke
 LATER: Final = 0.5  # start of its search, over the smaller overlap
 
