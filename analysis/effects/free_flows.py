@@ -41,7 +41,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.hydraulics import root_of_drop, signed_root
+from analysis.terms.hydraulics import joint_edge_columns, signed_root
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 from rig.model.units import plain
@@ -121,20 +121,20 @@ class MeteringCurve(Effect):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the curve's basis times the root of the pressure drop of the open edge."""
-        i = self.joint
-        u, cap, rod = signals.u[:, i], signals.p_cap[:, i], signals.p_rod[:, i]
+        u, edges = signals.u[:, self.joint], gain_names(self.joint + 1)
         basis = spline(self.shape_of(rig, shape), np.abs(u))[:, 1:-1]
-        p_s, p_t, positive, negative = signals.p_s, signals.p_tank, u > 0.0, u < 0.0
-        drops = {
-            "pp": positive * root_of_drop(p_s - cap), "pm": -(negative * root_of_drop(cap - p_t)),
-            "mp": -(positive * root_of_drop(rod - p_t)), "mm": negative * root_of_drop(p_s - rod),
-        }  # fmt: skip
-        out: Columns = {}
-        for edge, drop in drops.items():
-            kind = "flow_cap" if edge[0] == "p" else "flow_rod"
-            row = out.setdefault(equation(kind, i), {})
-            row |= zip(self._names(edge), (drop[:, None] * basis).T, strict=True)
-        return out
+        names = {gain: self._names(edge) for gain, edge in zip(edges, EDGES, strict=True)}
+        rows = joint_edge_columns(
+            signals, self.joint, np.where(u > 0.0, 1.0, 0.0), np.where(u < 0.0, 1.0, 0.0)
+        )
+        return {
+            e: {
+                name: column
+                for gain, root in row.items()
+                for name, column in zip(names[gain], (root[:, None] * basis).T, strict=True)
+            }
+            for e, row in rows.items()
+        }
 
     def _values(self, values: Mapping[str, float], edge: str) -> Array:
         return np.array([0.0, *(values[name] for name in self._names(edge)), 0.0])

@@ -23,10 +23,9 @@ from analysis.terms.base import (
     Coefficient,
     Columns,
     U,
-    equation,
     kernel,
 )
-from analysis.terms.hydraulics import root_of_drop, signed_root
+from analysis.terms.hydraulics import joint_edge_columns, signed_root
 from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
 
@@ -101,22 +100,10 @@ class UnderlapLeakage(ValveEffect):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the additional openings times the roots, under the orifices' own names."""
-        i = self.joint
-        pp, pm, mp, mm = gain_names(i + 1)
-        u, (w, r, c) = signals.u[:, i], self.full_shape(rig, shape)
+        u, (w, r, c) = signals.u[:, self.joint], self.full_shape(rig, shape)
         positive = opened(u + w, r, c) - np.maximum(u, 0.0)
         negative = opened(w - u, r, c) - np.maximum(-u, 0.0)
-        cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
-        return {
-            equation("flow_cap", i): {
-                pp: positive * root_of_drop(p_s - cap),
-                pm: -negative * root_of_drop(cap - p_t),
-            },
-            equation("flow_rod", i): {
-                mp: -positive * root_of_drop(rod - p_t),
-                mm: negative * root_of_drop(p_s - rod),
-            },
-        }
+        return joint_edge_columns(signals, self.joint, positive, negative)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, gains, underlap, rounding, corner."""

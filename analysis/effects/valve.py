@@ -41,7 +41,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from analysis.terms.hydraulics import root_of_drop, signed_root
+from analysis.terms.hydraulics import joint_edge_columns, signed_root
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 
@@ -157,23 +157,14 @@ class ValveDeadband(ValveEffect):
         *_, r, c, later = self.full_shape(rig, shape)
         if not later:
             return {}
-        i = self.joint
-        pp, pm, mp, mm = gain_names(i + 1)
-        u, size = signals.u[:, i], np.abs(signals.u[:, i])
+        u = signals.u[:, self.joint]
+        size = np.abs(u)
         less = size - np.minimum(size, opened(size - abs(later), r, c))
         positive, negative = np.where(u > 0.0, less, 0.0), np.where(u > 0.0, 0.0, less)
-        cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
-        if later > 0.0:
-            to_cap, to_rod = (
-                {pm: negative * root_of_drop(cap - p_t)},
-                {mp: positive * root_of_drop(rod - p_t)},
-            )
-        else:
-            to_cap, to_rod = (
-                {pp: -positive * root_of_drop(p_s - cap)},
-                {mm: -negative * root_of_drop(p_s - rod)},
-            )
-        return {equation("flow_cap", i): to_cap, equation("flow_rod", i): to_rod}
+        columns = joint_edge_columns(signals, self.joint, -positive, -negative)
+        pp, pm, mp, mm = gain_names(self.joint + 1)
+        of_pair = (pm, mp) if later > 0.0 else (pp, mm)
+        return {e: {n: row[n] for n in of_pair if n in row} for e, row in columns.items()}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, shape, the joint's gains."""

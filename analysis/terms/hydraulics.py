@@ -116,6 +116,14 @@ class Orifice(Term):
         return out
 
 
+def root_of_drop(drop: Array) -> Array:
+    """Return the signed roots [Pa^0.5] of pressure drops (n,) [Pa].
+
+    Not compiled: loading compiled code takes longer than the roots of an identification.
+    """
+    return np.copysign(np.sqrt(np.abs(drop)), drop)
+
+
 def edge_columns(signals: Signals, root: Callable[[Array], Array]) -> Columns:
     """Return the columns of the gains of the excited joints: u times `root` of the pressure drops.
 
@@ -123,19 +131,35 @@ def edge_columns(signals: Signals, root: Callable[[Array], Array]) -> Columns:
     """
     out: Columns = {}
     for i in signals.excited_joints:
-        pp, pm, mp, mm = gain_names(i + 1)
-        u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
-        cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
-        u_positive, u_negative = np.maximum(u, 0.0), np.minimum(u, 0.0)
-        out[equation("flow_cap", i)] = {
-            pp: root(p_s - cap) * u_positive,
-            pm: root(cap - p_t) * u_negative,
-        }
-        out[equation("flow_rod", i)] = {
-            mp: -root(rod - p_t) * u_positive,
-            mm: -root(p_s - rod) * u_negative,
-        }
+        u = signals.u[:, i]
+        out |= joint_edge_columns(signals, i, np.maximum(u, 0.0), np.maximum(-u, 0.0), root)
     return out
+
+
+def joint_edge_columns(
+    signals: Signals,
+    joint: int,
+    positive: Array,
+    negative: Array,
+    root: Callable[[Array], Array] = root_of_drop,
+) -> Columns:
+    """Return the columns of a joint's four gains: openings times `root` of the pressure drops.
+
+    `positive` and `negative` (n,) are the openings [V] of the edges that open with a positive and
+    with a negative spool.
+    """
+    pp, pm, mp, mm = gain_names(joint + 1)
+    cap, rod, p_s, p_t = (
+        signals.p_cap[:, joint], signals.p_rod[:, joint], signals.p_s, signals.p_tank,
+    )  # fmt: skip
+    return {
+        equation("flow_cap", joint): {
+            pp: positive * root(p_s - cap), pm: -(negative * root(cap - p_t)),
+        },
+        equation("flow_rod", joint): {
+            mp: -(positive * root(rod - p_t)), mm: negative * root(p_s - rod),
+        },
+    }  # fmt: skip
 
 
 @functools.lru_cache
@@ -148,14 +172,6 @@ def _gains(joints: int) -> tuple[Coefficient, ...]:
 def signed_root(drop):  # type: ignore[no-untyped-def]
     """Return the signed root [Pa^0.5] of one pressure drop [Pa]."""
     return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
-
-
-def root_of_drop(drop: Array) -> Array:
-    """Return the signed roots [Pa^0.5] of pressure drops (n,) [Pa].
-
-    Not compiled: loading compiled code takes longer than the roots of an identification.
-    """
-    return np.copysign(np.sqrt(np.abs(drop)), drop)
 
 
 TERMS = (Compressibility, Orifice)
