@@ -13,7 +13,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.judge import gates
 from analysis.trace.result import UNEXPLAINED, Gate, JudgedEffect
-from analysis.trace.search.hypothesis import Hypothesis, within_band
+from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
 from rig.model.units import plain
@@ -90,7 +90,7 @@ class Finding:
     @property
     def trained_on_noise(self) -> bool:
         """Whether the training rows hold no more than noise without any effect."""
-        return within_band(self.hypotheses.empty.excess_energy, self.hypotheses.noise_band)
+        return self.hypotheses.within_noise(self.hypotheses.empty)
 
     @property
     def named(self) -> tuple[JudgedEffect, ...]:

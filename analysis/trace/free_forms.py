@@ -22,7 +22,6 @@ from analysis.trace.search.hypothesis import (
     law_of,
     may_grow,
     removes_too_little,
-    within_band,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
@@ -66,7 +65,7 @@ def explained_by_free_form(
 
 def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
     """Return whether a set that explains leaves enough for a free form in its place."""
-    to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
+    to_noise = hypotheses.within_noise(winner)
     several = len(winner.laws) > 1
     return not to_noise and (several or not hypotheses.within_form_tolerance(winner))
 
@@ -141,7 +140,7 @@ def _simplest_first(hypotheses: HypothesisSet, sets: Sequence[Hypothesis]) -> li
     fewest = min(counts, default=len(sets))
 
     def needless(o: Hypothesis) -> bool:
-        return len(o.laws) > fewest and not within_band(o.excess_energy, hypotheses.noise_band)
+        return len(o.laws) > fewest and not hypotheses.within_noise(o)
 
     ordered = sorted(sets, key=lambda o: (needless(o), o.total > energy_limit, o.size[1], o.total))
     return list({o.keys: o for o in ordered}.values())[: SEARCH.free_forms_judged]

@@ -24,7 +24,7 @@ from analysis.trace.judge.rivals import best_tied_set, cost
 from analysis.trace.judge.unrepeated import unrepeated_floors
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_trials import improved_by_exact_trials
-from analysis.trace.search.hypothesis import Hypothesis, effect_of, within_band
+from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH
 
@@ -55,7 +55,7 @@ def search_and_judge(
     `progress` receives the share of the candidates' columns that is computed.
     """
     hypotheses, choosing = HypothesisSet(rows.train, candidates.named), rows.choosing
-    in_noise = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
+    in_noise = hypotheses.within_noise(hypotheses.empty)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
     winner = improved_by_exact_trials(hypotheses, hypotheses.run(progress))

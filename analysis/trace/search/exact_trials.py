@@ -17,7 +17,6 @@ from analysis.trace.search.hypothesis import (
     Key,
     log_energy_ratio,
     may_grow,
-    within_band,
 )
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
@@ -38,7 +37,7 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> 
             for energy, effects in _best_trials(hypotheses, current, above)
         ]
         better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([current, *tried])))
-        to_noise = within_band(better.excess_energy, hypotheses.noise_band)
+        to_noise = hypotheses.within_noise(better)
         tolerated = hypotheses.within_form_tolerance(current) and not to_noise
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain
         if log_energy_ratio(current, better, hypotheses.noise_band) < least:

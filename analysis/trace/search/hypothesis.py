@@ -120,11 +120,6 @@ def noise_band(data: RegressionData) -> NoiseBand:
     return {e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()}
 
 
-def within_band(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
-    """Return whether every equation's energy above noise lies within its band."""
-    return all(value <= limit[e] for e, value in excess_energy.items())
-
-
 def log_energy_ratio(hypothesis: Hypothesis, other: Hypothesis, limit: NoiseBand) -> float:
     """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
 

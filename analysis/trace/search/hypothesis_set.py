@@ -50,7 +50,6 @@ from analysis.trace.search.hypothesis import (
     of_one_law,
     removes_too_little,
     spoils_equation,
-    within_band,
 )
 from analysis.trace.search.refinement import at_best_size, refine
 from analysis.trace.settings import SEARCH
@@ -224,7 +223,7 @@ class HypothesisSet:
         band = self.noise_band
         singles = [self.refined(effects) for effects in self._best_singles(candidates, r)]
         current = self.prune(self.best([self.empty, *singles]))
-        if within_band(current.excess_energy, band):
+        if self.within_noise(current):
             return current
         pairs = [
             self.refined([candidates.entries[m].used for m in pair.members])
@@ -256,7 +255,7 @@ class HypothesisSet:
         A set within the tolerance for its forms grows only to one that leaves noise alone.
         """
         band = self.noise_band
-        while not within_band(current.excess_energy, band) and may_grow(current.effects):
+        while not self.within_noise(current) and may_grow(current.effects):
             grown = self.prune(self.best([current, *self.extensions(current)]))
             if (
                 grown.keys == current.keys
@@ -267,6 +266,10 @@ class HypothesisSet:
             if self.within_form_tolerance(current):
                 return self.completed_to_noise(current)
         return current
+
+    def within_noise(self, hypothesis: Hypothesis) -> bool:
+        """Return whether every equation's energy above noise lies within the noise's band."""
+        return all(v <= self.noise_band[e] for e, v in hypothesis.excess_energy.items())
 
     def within_form_tolerance(self, hypothesis: Hypothesis) -> bool:
         """Return whether every equation keeps no more than noise or the effects' form error."""
@@ -286,10 +289,10 @@ class HypothesisSet:
 
         An effect that leaves less, but more than noise, would only fit the form error.
         """
-        if within_band(current.excess_energy, self.noise_band) or not may_grow(current.effects):
+        if self.within_noise(current) or not may_grow(current.effects):
             return current
         larger = self.extensions(current)
-        best = self.best([o for o in larger if within_band(o.excess_energy, self.noise_band)])
+        best = self.best([o for o in larger if self.within_noise(o)])
         return best if best.effects and self.prune(best).keys == best.keys else current
 
     def _candidate_columns(

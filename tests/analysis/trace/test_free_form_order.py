@@ -7,19 +7,20 @@ from typing import Any, cast
 
 from analysis.trace.free_forms import _simplest_first
 
-BAND = {"flow_cap_1": 100.0}
+BAND = 100.0
 
 
 def set_of(laws: int, energy: float, numbers: int) -> Any:
     """Return a set of `laws` mechanisms that leaves an energy above noise."""
     return SimpleNamespace(
-        laws=set(range(laws)), keys=(laws, energy), size=(laws, numbers), total=energy,
-        excess_energy={"flow_cap_1": energy},
-    )  # fmt: skip
+        laws=set(range(laws)), keys=(laws, energy), size=(laws, numbers), total=energy
+    )
 
 
 def first(*sets: Any) -> Any:
-    wide = SimpleNamespace(within_form_tolerance=lambda o: o.total < 5000.0, noise_band=BAND)
+    wide = SimpleNamespace(
+        within_form_tolerance=lambda o: o.total < 5000.0, within_noise=lambda o: o.total <= BAND
+    )
     return _simplest_first(cast(Any, wide), sets)[0]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from analysis.trace.search.exact_trials import improved_by_exact_trials
-from analysis.trace.search.hypothesis import within_band
 from rig.model.rig import Rig
 from tests.analysis.trace.gate_cases import LEAK, searched
 from tests.analysis.trace.hidden import pair_of_runs
@@ -57,7 +56,7 @@ def test_what_a_dead_band_leaves_above_the_noise_is_an_offset_and_not_an_error_o
     sets = (s := searched(rig, *runs, "valve_deadband", "sensor_offset", *others)).hypotheses
     alone = s.set_of("valve_deadband")
     assert sets.within_form_tolerance(alone)
-    assert not within_band(alone.excess_energy, sets.noise_band)
+    assert not sets.within_noise(alone)
     improved = improved_by_exact_trials(sets, alone)
     assert {name for name, _ in improved.keys} == {"valve_deadband", "sensor_offset"}
-    assert within_band(improved.excess_energy, sets.noise_band)
+    assert sets.within_noise(improved)
