@@ -14,7 +14,13 @@ from analysis.effects.supply import BULK, PortEffect
 from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
-from analysis.identify.estimation import UNBIASED, EstimationJob, Refinement, refine
+from analysis.identify.estimation import (
+    OUTPUT_ERROR,
+    UNBIASED,
+    EstimationJob,
+    Refinement,
+    refine,
+)
 from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows
 from analysis.identify.reduction import (
     RecordReduction,
@@ -38,7 +44,7 @@ _UNREFINED = Check(
     "estimator",
     True,
     "plain: least squares with intervals from the scatter between repeats alone; the other "
-    "estimators, which need every row in memory and linear parameters, were not applied",
+    "estimators, which need every row in memory, were not applied",
 )
 
 
@@ -58,7 +64,7 @@ def coupled(
     InputError for runs of different rigs and for records that cannot be used.
     """
     rig = ck.common_rig(runs)
-    estimator = _applicable_estimator(rig, used, estimator, bootstrap)
+    _refuse_nonlinear(rig, used, estimator)
     built = build_rows(rig, runs, used, filtering, progress)
     job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
     result = conclude(
@@ -151,18 +157,11 @@ def conclude(
     return result.with_checks(statements)
 
 
-def _applicable_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
-    """Return the estimator for a model; raises InputError where it does not apply.
-
-    Parameters that are not linear in the rows (`Term.reduction`) allow plain least squares only.
-    """
+def _refuse_nonlinear(rig: Rig, used: Sequence[Used], estimator: str) -> None:
+    """Raise InputError for output error with parameters that are not linear in the rows."""
     reducing = [use.term.name for use in used if use.term.reduction(rig) is not None]
-    if estimator == PLAIN or not reducing:
-        return estimator
-    if estimator not in ("ls", "auto") or bootstrap:
-        option = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
+    if reducing and estimator == OUTPUT_ERROR:
         raise InputError(
-            f"{option} does not go with {' '.join(reducing)}, not linear in the rows: take ls "
-            "without a bootstrap"
+            f"--estimator {estimator} does not go with {' '.join(reducing)}, not linear in the "
+            "rows: take another estimator"
         )
-    return PLAIN

@@ -41,6 +41,7 @@ from analysis.identify.estimators.shifts import (
 )
 from analysis.identify.estimators.weighted import weighted_least_squares
 from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, with_columns
+from analysis.regression.nonlinear import linearised
 from analysis.regression.rows import parameters_of
 from analysis.regression.solve import MOSTLY_NOISE, Solution
 from analysis.terms.base import Used, inverted
@@ -198,7 +199,9 @@ def _prepare(
     checks: list[Check] = []
     out = []
     for family, solution in solutions.items():
-        columns = parameters_of(job.rig, (*job.terms, *extra), family)
+        unknowns = parameters_of(job.rig, (*job.terms, *extra), family)
+        linear = linearised(job.rig, job.terms, unknowns, values)
+        columns = linear.names
         determined = [n for n in solution.names if n not in solution.unidentifiable]
         if not determined:
             continue
@@ -208,7 +211,11 @@ def _prepare(
         nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
         names = (*determined, *nuisances)
         selected = [columns.index(name) for name in names]
-        blocks = tuple(blocks_of(built, family, selected))
+        every = blocks_of(built, family, range(len(unknowns)))
+        blocks = tuple(
+            replace(b, X=b.X @ linear.slope[:, selected], y=b.y - b.X @ linear.constant)
+            for b in every
+        )
         prepared = FamilyBlocks(family, names, len(determined), blocks)
         if nuisances:
             prepared, stated = _without_implausible(prepared)

@@ -13,8 +13,8 @@ for Least Squares Problems, section 9.2.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,40 @@ def reduced(
         if reduction is not None and set(reduction.linear) <= set(solution.names):
             solution, clusters, noise = _reduce(reduction, solution, clusters, noise, reject_noise)
     return solution
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Linear unknowns x = slope p + constant of rows near a solution.
+
+    `names` (m,) are those of p; `slope` (k, m) and `constant` (k,).
+    """
+
+    names: tuple[str, ...]
+    slope: Array
+    constant: Array
+
+
+def linearised(
+    rig: Rig, terms: Sequence[Used], names: Sequence[str], values: Mapping[str, float]
+) -> Linearisation:
+    """Return the unknowns `names` (k,) of rows as linear functions of the terms' parameters.
+
+    `values` are the parameters at which the functions are linearised, by name. Where no term
+    reduces, p = x.
+    """
+    out = Linearisation(tuple(names), np.eye(len(names)), np.zeros(len(names)))
+    for used in terms:
+        reduction = used.term.reduction(rig)
+        if reduction is None or not set(reduction.linear) <= set(out.names):
+            continue
+        places = [out.names.index(name) for name in reduction.linear]
+        others = [i for i in range(len(out.names)) if i not in places]
+        reduced_names = (*(out.names[i] for i in others), *reduction.parameters)
+        p = np.nan_to_num([values.get(name, 0.0) for name in reduced_names])
+        slope, constant = _tangent(reduction, places, others, p)
+        out = Linearisation(reduced_names, out.slope @ slope, out.constant + out.slope @ constant)
+    return out
 
 
 def _reduce(
@@ -81,15 +115,24 @@ def _transform(
     reduction: ParameterReduction, places: Sequence[int], others: Sequence[int], p: Array
 ) -> Array:
     """Return S (k+1, m+1) at the parameters p (m,)."""
+    slope, constant = _tangent(reduction, places, others, p)
+    k = len(constant)
+    S = np.zeros((k + 1, len(p) + 1))
+    S[:k, :-1], S[:k, -1], S[k, -1] = slope, -constant, 1.0
+    return S
+
+
+def _tangent(
+    reduction: ParameterReduction, places: Sequence[int], others: Sequence[int], p: Array
+) -> tuple[Array, Array]:
+    """Return J (k, m) and c (k,) of x = J p + c at the parameters p (m,)."""
     k, count = len(places) + len(others), len(others)
     slope = np.zeros((k, len(p)))
     slope[others, np.arange(count)] = 1.0
     slope[np.ix_(places, range(count, len(p)))] = reduction.slope(p[count:])
     constant = np.zeros(k)
     constant[places] = reduction.value(p[count:]) - reduction.slope(p[count:]) @ p[count:]
-    S = np.zeros((k + 1, len(p) + 1))
-    S[:k, :-1], S[:k, -1], S[k, -1] = slope, -constant, 1.0
-    return S
+    return slope, constant
 
 
 def _transformed(clusters: Sequence[RowCluster], change: Array) -> list[RowCluster]:
