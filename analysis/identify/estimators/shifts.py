@@ -183,7 +183,10 @@ def _prior_check(
         )
         if implausible:
             statement += (
-                ", more than a command held between samples makes (a lag, a delay?): left out"
+                ", more than a measured current makes (a lag, a delay? a command that is recorded "
+                "in its place and held makes -0.5): left out"
+                if prior.name.startswith(nu.DRIVE_BETWEEN)
+                else ", more than a command held between samples makes (a lag, a delay?): left out"
             )
         return Check(prior.name, not implausible, statement)
     size = np.sqrt(max(value, 0.0) + 2 * std)
