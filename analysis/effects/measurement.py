@@ -35,7 +35,6 @@ class Sensor(SignalEffect):
 
     mechanism = "sensor"
     element = "sensor"
-    hydraulic = True
     family = "measurement"
     stage = SENSOR
     kernel = NO_KERNEL
@@ -83,7 +82,7 @@ class Sensor(SignalEffect):
         """Return nothing."""
         return np.zeros(1)
 
-    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+    def undone(self, x: Array, order: int, rate: float, shape: Sequence[float]) -> Array:
         """Return the true derivative of an order (0, 1, 2) from that of the reading, x (n,)."""
         raise NotImplementedError
 
@@ -93,22 +92,22 @@ class Sensor(SignalEffect):
             for channel in self.each(rig):
                 signals = channel.prepare(rig, signals, self.shape_of(rig, shape))
             return signals
-        value = self.shape_of(rig, shape)[0]
+        shape = self.shape_of(rig, shape)
         if self.where == "bench":
-            return replace(signals, p_s=self.undone(signals.p_s, 0, signals.rate, value))
+            return replace(signals, p_s=self.undone(signals.p_s, 0, signals.rate, shape))
         if self.side == "piston":
-            return self._moved(rig, signals, value)
+            return self._moved(rig, signals, shape)
         if self.side == "position":
-            return self._turned(signals, value)
+            return self._turned(signals, shape)
         fields = {"cap": ("p_cap", "pd_cap"), "rod": ("p_rod", "pd_rod")}
         new = {}
         for order, field in enumerate(fields.get(self.side, ("u",))):
             new[field] = getattr(signals, field).copy()
             x = new[field][:, self.joint]
-            new[field][:, self.joint] = self.undone(x, order, signals.rate, value)
+            new[field][:, self.joint] = self.undone(x, order, signals.rate, shape)
         return replace(signals, **new)
 
-    def _moved(self, rig: Rig, signals: Signals, value: float) -> Signals:
+    def _moved(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Return the signals with a corrected piston, and its angles, Jacobian and volumes."""
         i, linkage = self.joint, rig.joints[self.joint].linkage
         names = ("s", "sd", "q", "qd", "qdd", "G", "V_cap", "V_rod")
@@ -116,14 +115,14 @@ class Sensor(SignalEffect):
         old_slope = np.asarray(linkage.jacobian_rate(signals.q[:, i]))
         acceleration = signals.G[:, i] * signals.qdd[:, i] + old_slope * signals.qd[:, i] ** 2
         rate = signals.rate
-        s = self.undone(signals.s[:, i], 0, rate, value)
+        s = self.undone(signals.s[:, i], 0, rate, shape)
         half = 0.55 * rig.joints[i].cylinder.stroke
         s = np.clip(s, -half, half)
         q, G, slope = linkage.geometry(s)
-        sd = self.undone(signals.sd[:, i], 1, rate, value)
+        sd = self.undone(signals.sd[:, i], 1, rate, shape)
         new["s"][:, i], new["sd"][:, i], new["q"][:, i], new["G"][:, i] = s, sd, q, G
         new["qd"][:, i] = sd / G
-        sdd = self.undone(acceleration, 2, rate, value)
+        sdd = self.undone(acceleration, 2, rate, shape)
         new["qdd"][:, i] = (sdd - slope * (sd / G) ** 2) / G
         volumes = rig.chamber_volumes(i, s)
         # Other effects may have added to the volumes.
@@ -135,11 +134,11 @@ class Sensor(SignalEffect):
         turn[:, i:] = (q - signals.q[:, i])[:, None]
         return replace(signals, theta=signals.theta + turn, **new)
 
-    def _turned(self, signals: Signals, value: float) -> Signals:
+    def _turned(self, signals: Signals, shape: Sequence[float]) -> Signals:
         """Return the signals with the position of an electric joint corrected."""
         i, new = self.joint, {}
         for order, names in enumerate((("s", "q"), ("sd", "qd"), ("qdd",))):
-            x = self.undone(getattr(signals, names[-1])[:, i], order, signals.rate, value)
+            x = self.undone(getattr(signals, names[-1])[:, i], order, signals.rate, shape)
             for name in names:
                 new[name] = getattr(signals, name).copy()
                 new[name][:, i] = x
@@ -155,13 +154,13 @@ class Sensor(SignalEffect):
         for channel in self.each(rig) if self.shared else ():
             out = channel.correct(rig, out, rate, self.shape_of(rig, shape))
         if self.channel in out:
-            value = self.shape_of(rig, shape)[0]
-            out[self.channel] = self.true_channel(out[self.channel], rate, value)
+            shape = self.shape_of(rig, shape)
+            out[self.channel] = self.true_channel(out[self.channel], rate, shape)
         return out
 
-    def true_channel(self, reading: Array, rate: float, value: float) -> Array:
+    def true_channel(self, reading: Array, rate: float, shape: Sequence[float]) -> Array:
         """Return what the channel's samples (n,) would be without the error."""
-        return self.undone(reading, 0, rate, value)
+        return self.undone(reading, 0, rate, shape)
 
     def plotted(self) -> str:
         """Name the channel's quantity, of a position its velocity."""

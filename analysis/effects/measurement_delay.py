@@ -22,14 +22,13 @@ from analysis.signals.conditioning import Signals
 from analysis.signals.filters import align, channel_filter
 from rig.model.rig import Rig
 
+EQUAL_POLES: Final = 0.25  # of tau^2: two poles of the same time constant
 MARGIN: Final = 16  # [samples] reach of the interpolation of a shift
 
 
 @dataclass(frozen=True)
 class TimingError(Sensor):
     """Common parts of delays and lags, which may act on all channels of a kind."""
-
-    hydraulic = False
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
@@ -73,9 +72,9 @@ class ChannelDelay(TimingError):
     )
     shape_stems = ("delay",)
 
-    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+    def undone(self, x: Array, order: int, rate: float, shape: Sequence[float]) -> Array:
         """Return x(t + delay)."""
-        return align(x, value * rate)
+        return align(x, shape[0] * rate)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Advance the channel; samples interpolated beyond the record's end become invalid."""
@@ -87,7 +86,11 @@ class ChannelDelay(TimingError):
 
 @dataclass(frozen=True)
 class SensorLag(TimingError):
-    """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter."""
+    """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter.
+
+    A detail of the form is a second pole: reading + tau d(reading)/dt + k tau^2 d2(reading)/dt2 = x
+    with k = tau_1 tau_2 / (tau_1 + tau_2)^2 of the poles' time constants, at most 1/4.
+    """
 
     name = "sensor_lag"
     amplifies = True
@@ -95,18 +98,36 @@ class SensorLag(TimingError):
     variable = "the channel's rate"
     confounders = ("channel_delay", "spool_lag", "dead_volume")
     separated_by = "a wide band: a lag loses amplitude at high frequencies, a delay only phase"
-    shape_stems = ("lag",)
+    shape_stems = ("lag", "second_pole")
 
-    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
-        """Return x + tau dx/dt."""
-        return np.asarray(x + value * rate * np.gradient(x))
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the time constant [s] and the share k of the second pole [-]."""
+        share = Shape(
+            self.shape_names()[1], "", 0.0, EQUAL_POLES, (EQUAL_POLES,), 0.0,
+            saturates=True, detail=True,
+        )  # fmt: skip
+        return (*super().shapes(rig), share)
 
-    def true_channel(self, reading: Array, rate: float, value: float) -> Array:
-        """Return x + tau dx/dt, the rate that of the low-passed samples.
+    def undone(self, x: Array, order: int, rate: float, shape: Sequence[float]) -> Array:
+        """Return x + tau dx/dt + k tau^2 d2x/dt2."""
+        first = shape[0] * rate * np.gradient(x)
+        second = second_pole(shape) * shape[0] * rate * np.gradient(first)
+        return np.asarray(x + first + second)
+
+    def true_channel(self, reading: Array, rate: float, shape: Sequence[float]) -> Array:
+        """Return x + tau dx/dt + k tau^2 d2x/dt2, the rates those of the low-passed samples.
 
         Differences of raw samples would multiply their noise by about tau times the sample rate.
         """
-        return np.asarray(reading + value * channel_filter(rate).apply(reading, 1))
+        low_passed = channel_filter(rate)
+        first = shape[0] * low_passed.apply(reading, 1)
+        second = second_pole(shape) * shape[0] ** 2 * low_passed.apply(reading, 2)
+        return np.asarray(reading + first + second)
+
+
+def second_pole(shape: Sequence[float]) -> float:
+    """Return the share of the second pole in a lag's shape, 0 where it has none."""
+    return shape[1] if len(shape) > 1 else 0.0
 
 
 TERMS = (ChannelDelay, SensorLag)

@@ -2,9 +2,10 @@
 
 Source: y = gain x + offset, and for a chamber's pressure y = p + k times the other chamber's.
 
-`where` is one channel, as `joint I cap|rod|piston|spool`, of an electric joint `joint I
-position|drive` (reported as `joint I`: the parameter's name says which), and `bench` for the supply
-pressure.
+`where` is one channel, as `joint I cap|rod|piston|spool` (reported as `joint I`: the parameter's
+name says which), and `bench` for the supply pressure. On an electric chain a gain is that of a
+drive (`joint I drive`), whose motor constant may be wrong, and an offset that of an encoder (`joint
+I position`); an offset of a drive is a `torque_offset`, one of the first encoder an inclined base.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ class SensorCrosstalk(Sensor):
 
     rescales = True
     name = "sensor_crosstalk"
+    hydraulic = True
     exact = True
     smallest_shape = (0.01,)
     variable = "the other chamber's pressure"
@@ -94,9 +96,20 @@ class SensorGain(Sensor):
     confounders = ("sensor_offset", "supply_sag", "tank_pressure", "pressure_dependent_friction")
     separated_by = "two amplitudes and two working points: an offset does not grow with either"
 
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return every channel that the model uses; of an electric chain the drives.
+
+        All parameters of a single electric joint absorb the gain of its drive.
+        """
+        if not rig.electric:
+            return super().all_places(rig)
+        joints = range(1, len(rig.joints) + 1) if len(rig.joints) > 1 else ()
+        return tuple(f"joint {i} drive" for i in joints)
+
     def alternatives_to_detail(self) -> tuple[Effect, ...]:
-        """Return the channel's offset: a sensor has one more often than it is bent."""
-        return (SensorOffset(self.where),)
+        """Return a pressure's offset: a sensor has one more often than it is bent."""
+        return () if self.side == "drive" else (SensorOffset(self.where),)
 
     def absorbed(self, rig: Rig) -> str:
         """Return that the flow gains absorb a spool's gain."""
@@ -125,15 +138,16 @@ class SensorGain(Sensor):
         bends = self.shape_names()[1:]
         return (gain, *(Shape(n, "", -0.3, 0.3, (-0.03, 0.03), 0.0, detail=True) for n in bends))
 
-    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+    def undone(self, x: Array, order: int, rate: float, shape: Sequence[float]) -> Array:
         """Return x / gain."""
-        return x / value
+        return x / shape[0]
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Undo gain and bend in the channel's signal and in its rate."""
-        new, bend, supply = super().prepare(rig, signals, shape), _bend(shape), rig.supply.pressure
+        new, bend = super().prepare(rig, signals, shape), _bend(shape)
         if bend == 0.0:
             return new
+        supply = rig.supply.pressure
         if self.where == "bench":
             return replace(new, p_s=_linearised(new.p_s, bend, supply))
         p, pd = getattr(new, f"p_{self.side}").copy(), getattr(new, f"pd_{self.side}").copy()
@@ -184,9 +198,12 @@ class SensorOffset(Sensor):
     shape_stems = ("offset",)
 
     def shape_of_smallest_size(self) -> tuple[float, ...]:
-        """Return the offset of interest of a pressure or a piston, none of other channels."""
+        """Return the offset of interest of a pressure, piston or encoder, none of others."""
         kind = ch.kind_of(self.channel)[0]
-        return {ch.PISTON: (0.3e-3,), ch.SPOOL: (), ch.TEMPERATURE: ()}.get(kind, (0.03e6,))
+        smallest: dict[str, tuple[float, ...]] = {
+            ch.PISTON: (0.3e-3,), ch.POSITION: (2e-3,), ch.SPOOL: (), ch.TEMPERATURE: (),
+        }  # fmt: skip
+        return smallest.get(kind, (0.03e6,))
 
     def inseparable(self, shape: Sequence[float] = ()) -> tuple[tuple[str, str], ...]:
         """Return the null's offset for a spool: data cannot separate valve and sensor."""
@@ -194,9 +211,14 @@ class SensorOffset(Sensor):
 
     @classmethod
     def all_places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return every channel that the model uses but the spools, and a supply that is stated."""
+        """Return every channel that the model uses but the spools, and a supply that is stated.
+
+        Of an electric chain, the encoders of all joints but the first.
+        """
+        if rig.electric:
+            return tuple(f"joint {i} position" for i in range(2, len(rig.joints) + 1))
         places = tuple(place for place in super().all_places(rig) if not place.endswith("spool"))
-        return places if rig.electric or "bench" in places else (*places, "bench")
+        return places if "bench" in places else (*places, "bench")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the offset, within a quarter of the sensor's span, or of a stated supply."""
@@ -210,9 +232,9 @@ class SensorOffset(Sensor):
         unit = ch.unit_of(self.channel)
         return (Shape(self.shape_names()[0], unit, -0.25 * span, 0.25 * span, grid, 0.0),)
 
-    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+    def undone(self, x: Array, order: int, rate: float, shape: Sequence[float]) -> Array:
         """Return x - offset; derivatives as they are."""
-        return x - value if order == 0 else x
+        return x - shape[0] if order == 0 else x
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the pressure of a supply that no sensor measures."""

@@ -69,3 +69,20 @@ def test_a_lag_is_undone_without_multiplying_the_noise_of_the_samples(rig: Rig) 
     rms = float(np.sqrt(np.mean((corrected - true)[inner] ** 2)))
     assert rms < 3.0 * noise
     assert rms < 0.2 * float(np.sqrt(np.mean((reading - true)[inner] ** 2)))
+
+
+@pytest.mark.parametrize("poles", [(4e-3, 4e-3), (6e-3, 2e-3), (8e-3, 0.0)])
+def test_a_lag_with_a_second_pole_is_undone(rig: Rig, poles: tuple[float, float]) -> None:
+    rate, (one, two) = 1000.0, poles
+    time = np.arange(4000) / rate
+    true = 1e6 * np.sin(2 * np.pi * 3.0 * time) + 3e5 * np.sin(2 * np.pi * 11.0 * time)
+    _, reading, _ = lsim(([1.0], [one * two, one + two, 1.0]), true, time)
+    shape = (one + two, one * two / (one + two) ** 2)
+    error = make("sensor_lag", "joint 1 cap")
+    assert isinstance(error, Sensor)
+    sampled = error.correct(rig, {"cap_pressure_1": reading}, rate, shape)["cap_pressure_1"]
+    inner = slice(200, -200)
+    for corrected in (sampled, error.undone(reading, 0, rate, shape)):
+        assert corrected[inner] == pytest.approx(true[inner], abs=5e3)
+    alone = error.undone(reading, 0, rate, shape[:1])[inner]
+    assert (float(np.abs(alone - true[inner]).max()) > 1.5e4) == (two > 0.0)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from analysis.effects.base import Effect
@@ -20,12 +22,16 @@ from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
 from rig.cli.main import app
 from rig.cli.text.trace_text import trace_text
 from rig.model.records import Record, Run
+from rig.model.rig import ElectricRig
 from rig.runs.archive import write_run
 from rig.runs.rigs import load_rig
 from rig.tui.pages.trace import errors_of
 from rig.tui.recorded_run import read_trace
 from tests.analysis.carriage import Carriage, moves, record
+from tests.studies.machines import electric_plant as plant
 from tests.studies.machines import emps as study
+
+Array = NDArray[np.float64]
 
 PLACE = Path(os.environ.get("BRAMAH_DATA", Path(__file__).parents[4] / "shared" / "data"))
 FILE = PLACE / "emps" / "DATA_EMPS.mat"
@@ -128,6 +134,44 @@ def test_a_drive_that_is_recorded_late_is_named_with_its_delay() -> None:
     assert (first.name, first.at, first.where) == ("channel_delay", "joint 1 drive", "joint 1")
     assert first.parameters["delay_drive_1"].value == pytest.approx(3e-3, rel=0.02)
     assert result.tied in ([], [("sensor_lag", "joint 1")])
+
+
+@pytest.mark.parametrize(
+    ("channel", "misread", "effect", "parameter", "size"),
+    [
+        ("drive_2", lambda x: 1.2 * x, ("sensor_gain", "joint 2 drive"), "gain_drive_2", 1.2),
+        (
+            "position_2", lambda x: x + 0.03, ("sensor_offset", "joint 2 position"),
+            "offset_position_2", 0.03,
+        ),
+    ],
+)  # fmt: skip
+def test_a_wrong_motor_constant_and_a_turned_encoder_of_an_arm_are_named(
+    channel: str, misread: Callable[[Array], Array], effect: tuple[str, str], parameter: str,
+    size: float,
+) -> None:  # fmt: skip
+    rig = load_rig("electric-2dof").model_copy(update={"inclination": 0.0})
+    assert isinstance(rig, ElectricRig)
+    arm = replace(plant.draw_arm(np.random.default_rng(5), slope=0.0), dry=(1e-6, 1e-6))
+
+    def measured(seed: int) -> Run:
+        run = plant.records(rig, arm, np.random.default_rng(seed), repeats=2)
+        records = (
+            replace(r, channels={**r.channels, channel: misread(r.channels[channel])})
+            for r in run.records
+        )
+        return replace(run, records=tuple(records))
+
+    result = trace([measured(6)], [measured(7)], look_ahead=False)
+    (first, *others) = result.effects
+    assert (first.name, first.at, others) == (*effect, [])
+    assert first.parameters[parameter].value == pytest.approx(size, rel=0.02)
+    for name in ("M1", "M2", "R12", "W1", "W2"):
+        assert result.model_after.values[name] == pytest.approx(arm.truth()[name], rel=0.02)
+
+
+def test_a_single_electric_joint_has_no_gain_that_its_parameters_do_not_absorb() -> None:
+    assert not {"sensor_gain", "sensor_offset"} & {e.name for e in catalogue(load_rig("emps"))}
 
 
 def test_a_revolute_joint_rubs_along_an_angle() -> None:

@@ -463,6 +463,10 @@ def test_a_worn_bore_leaks_most_where_it_is_worn(rig: Rig) -> None:
             Hidden(), Sensors(("cap_pressure",), lag=3e-3),
             ("sensor_lag", "joint 2 cap"), "lag_cap_pressure_2", 3e-3,
         ),
+        (
+            Hidden(), Sensors(("cap_pressure",), lag=6e-3, stages=2),
+            ("sensor_lag", "joint 2 cap"), "lag_cap_pressure_2", 6e-3,
+        ),
         pytest.param(
             Hidden(play=6e-3), Sensors(),
             ("spool_hysteresis", "joint 2"), "w_hysteresis_2", 6e-3, marks=pytest.mark.slow,
