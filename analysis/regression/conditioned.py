@@ -30,10 +30,12 @@ class ConditionedRecord:
 
     def condition_alike(self, rig: Rig, record: Record) -> ConditionedRecord:
         """Condition another record (averaged repeats, added noise) with this one's settings."""
-        signals = condition(rig, record, self.filtering.channels, self.signals.bands)
-        weight = self.signals.weight
-        if weight is not None:
-            signals = replace(signals, weight=weight[: record.samples])
+        filters = self.filtering
+        signals = condition(rig, record, filters.channels, self.signals.bands)
+        if filters.in_motion:
+            # By the record's own speed: a weight w(s') times s'' is the rate of a function of s',
+            # from which the row filter removes fast noise. Another record's noise would remain.
+            signals = without_rests(signals, filters.in_motion, filters.full_weight)
         return replace(self, record=record, signals=signals)
 
     def samples_at(self, time: Array) -> Indices:

@@ -147,8 +147,9 @@ def _is_better(moving: Finding, on_all_rows: Finding, joints: Collection[int]) -
     """Return whether the finding `moving`, with rows of `joints` weighted by speed, is better.
 
     It must remove most of the energy of all rows, rests included. It explains what was unexplained,
-    or it leaves at most `TRACE.noted_ratio` noise floors in the balances of `joints`, and explains
-    too or has fewer remainders with a veto.
+    or it leaves at most `TRACE.noted_ratio` noise floors in the balances of `joints`, or
+    `TRACE.motion_ratio` times as many as on all rows, and explains too or has fewer remainders with
+    a veto.
     """
     total = on_all_rows.hypotheses.refined(moving.winner.effects).total
     if total / on_all_rows.hypotheses.empty.total > 1.0 - TRACE.least_removed:
@@ -157,8 +158,11 @@ def _is_better(moving: Finding, on_all_rows: Finding, joints: Collection[int]) -
     if explains and on_all_rows.verdict == UNEXPLAINED:
         return True
     fewer = sum(r.veto for r in moving.remainders) < sum(r.veto for r in on_all_rows.remainders)
-    ratios = held_out_ratios(moving.rows, moving.winner)
-    meets_noise = all(ratios[equation("torque", joint)] <= TRACE.noted_ratio for joint in joints)
+    ratios, before = (held_out_ratios(f.rows, f.winner) for f in (moving, on_all_rows))
+    balances = [equation("torque", joint) for joint in joints]
+    meets_noise = all(
+        ratios[e] <= max(TRACE.noted_ratio, TRACE.motion_ratio * before[e]) for e in balances
+    )
     return (explains or fewer) and meets_noise
 
 

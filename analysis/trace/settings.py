@@ -69,6 +69,9 @@ class TraceSettings:
     states what remains (contract)."""
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
+    motion_ratio: float = 0.65
+    """Noise floors that a set leaves in motion over those that another leaves in all rows, up to
+    which the law in motion is taken (tuned)."""
     breakaway_speed: float = 0.3
     """Speed of a joint over its rms speed, below which friction may be a breakaway; where one is
     found, samples have full weight from this speed on."""

@@ -18,7 +18,7 @@ from analysis.signals.filters import row_filter
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.noise_floor import (
     NEIGHBOURS,
     OTHER_STEPS,
@@ -122,6 +122,29 @@ def test_a_motion_that_comes_back_shows_noise_that_the_rig_file_does_not_state()
     assert (once.source, thrice.source, known.source) == (STATED, NEIGHBOURS, REPEATS)
     assert once.noise < 0.3 * known.noise
     assert thrice.noise == pytest.approx(known.noise, rel=0.35)
+
+
+@pytest.mark.parametrize("in_motion", [(), (0,)])
+def test_stated_noise_agrees_with_repeats_of_a_slow_motion_without_its_rests_too(
+    in_motion: tuple[int, ...],
+) -> None:
+    """A weight by the speed of one record would mix its noise with the acceleration of another."""
+    emps = load_rig("emps")
+    encoder = emps.sensors.position.model_copy(update={"noise": 3e-5})
+    rig = emps.model_copy(update={"sensors": emps.sensors.model_copy(update={"position": encoder})})
+    rng = np.random.default_rng(1)
+    reference = np.tile(moves(rig.sample_rate, 4.0, 0.05, 0.25), 2)
+    records = tuple(
+        replace(
+            record(rig, Carriage(), reference, rng, "moves", repeat),
+            period=len(reference), lines=(2, 5),
+        )
+        for repeat in (1, 2, 3, 4)
+    )  # fmt: skip
+    conditioned = conditioned_records(rig, [Run(rig, records)], moving_filtering(in_motion))
+    (floor,) = regression_data(rig, tuple(map(Used, baseline_of(rig))), conditioned).floors
+    assert floor.source == REPEATS
+    assert floor.stated == pytest.approx(floor.noise, rel=0.35)
 
 
 def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> None:
