@@ -327,6 +327,8 @@ class SearchSettings:
     """Number of pairs that are refined exactly."""
     refined_extensions: int = 6
     """Number of extensions of a set that are refined exactly."""
+    replacements: int = 3
+    """Number of candidates that are refined exactly in the place of an effect of a set (tuned)."""
     near_gain: float = 0.25
     """Energy that a single candidate removes over what the best one removes: one with less is not
     refined (tuned)."""

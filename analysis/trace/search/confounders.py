@@ -1,4 +1,4 @@
-"""Confounders of an effect, and the sets of effects with one of them in its place."""
+"""Sets in which two effects take the place of one: a special case of it and a confounder."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.search.hypothesis import Hypothesis, effect_of, is_special_case, may_grow
-from analysis.trace.search.refinement import at_best_point
+from analysis.trace.search.hypothesis import Hypothesis, effect_of, may_grow
 
 BENCH: Final = "bench"
 
@@ -19,35 +18,6 @@ def act_at_one_joint(effect: Effect, other: Effect) -> bool:
     """Return whether two effects are at the same joint, or one of them is of the bench."""
     places = {" ".join(e.where.split()[:2]) for e in (effect, other)}
     return len({place for place in places if not place.startswith(BENCH)}) <= 1
-
-
-def _is_confusable(effect: Effect, member: Effect) -> bool:
-    """Return whether a candidate is easily confused with the `member` of a set.
-
-    It is another name of the member's mechanism at the same place, or, at the same joint or of the
-    bench, the same effect on another channel or chamber or one of its confounders.
-    """
-    same = effect.mechanism == member.mechanism and effect.where == member.where
-    alike = effect.name in (member.name, *member.confounders) and act_at_one_joint(effect, member)
-    return (same or alike) and not effect.free
-
-
-def confusable_sets(
-    data: RegressionData, candidates: Sequence[Effect], current: Hypothesis
-) -> list[tuple[Used, ...]]:
-    """Return the sets with one effect exchanged for another candidate or for two."""
-    sets = [s for used in current.effects for s in composites(data, candidates, current, used)]
-    for used in current.effects if len(current.effects) > 1 else ():
-        member, others = effect_in(used), current.without(used)
-        for effect in candidates:
-            if effect.key in current.keys or not _is_confusable(effect, member):
-                continue
-            fresh = at_best_point(data, effect, others)
-            sets.append((*others, fresh))
-            if is_special_case(member, effect):
-                # One of the others may only have compensated what the simpler law lacks.
-                sets += [(*(u for u in others if u is not left_out), fresh) for left_out in others]
-    return sets
 
 
 def composites(

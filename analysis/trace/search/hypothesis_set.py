@@ -27,7 +27,7 @@ from analysis.trace.data.regression_data import (
     variant_columns,
 )
 from analysis.trace.search import linear_fit
-from analysis.trace.search.confounders import BENCH, confusable_sets
+from analysis.trace.search.confounders import BENCH, composites
 from analysis.trace.search.exact_fit import (
     ExactFit,
     fit_coefficients,
@@ -357,32 +357,42 @@ class HypothesisSet:
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
         mask = data.in_equations(equations or data.row_counts).astype(np.float64)
-        # The set's shapes are fitted again beside a new effect: energy that they can remove
-        # themselves is no gain of that effect.
-        moves = (jacobian(self.train_data, current.fit, used)[1] for used in current.effects)
-        absorbing = replace(data, base=np.hstack((data.base, *moves)))
-        candidates = self._candidate_columns(absorbing, columns, mask)
-        r = current.fit.residual * mask
-        r = r - candidates.basis @ (candidates.basis.T @ r)
-        best_starts: dict[Key, tuple[Used, ...]] = {}
-        for trial in linear_fit.sets_with_one_more(candidates, (), r):
-            used = candidates.entries[trial.members[0]].used
-            if len(best_starts) < SEARCH.refined_extensions:
-                best_starts.setdefault(used.term.key, (*current.effects, used))
-        larger = [self._extended(current, effects) for effects in best_starts.values()]
+        starts = self._best_additions(data, current, columns, mask)[: SEARCH.refined_extensions]
+        larger = [self._extended(current, effects) for effects in starts]
         if free:
             return larger
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
         # Alone, a sensor's gain is fitted far from its size beside an offset, and the reverse.
         for effect in self.effects if may_grow(current.effects) else ():
             goes_with = any(map(effect.is_alternative_to_detail, members))
-            if goes_with and effect.key not in {*taken, *best_starts}:
+            if goes_with and not any(effect.key in o.keys for o in (current, *larger)):
                 grown = (*current.effects, at_start(self.train_data.rig, effect))
                 with_parts[keys_of(grown)] = grown
         for hypothesis in (current, *filter(self.physical_problem, larger)):
             for effects in self.with_parts_beside(hypothesis, equations):
                 with_parts.setdefault(keys_of(effects), effects)
         return larger + [self._extended(current, effects) for effects in with_parts.values()]
+
+    def _best_additions(
+        self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
+        mask: Array | None = None,
+    ) -> list[tuple[Used, ...]]:  # fmt: skip
+        """Return the set with each candidate, in the order of what they leave by their columns.
+
+        `data` have the set in their model; `mask` (M,) is 0 for rows that do not count.
+        """
+        # The set's shapes are fitted again beside a new effect: energy that they can remove
+        # themselves is no gain of that effect.
+        moves = (jacobian(self.train_data, current.fit, used)[1] for used in current.effects)
+        absorbing = replace(data, base=np.hstack((data.base, *moves)))
+        candidates = self._candidate_columns(absorbing, columns, mask)
+        r = current.fit.residual if mask is None else current.fit.residual * mask
+        r = r - candidates.basis @ (candidates.basis.T @ r)
+        starts: dict[Key, tuple[Used, ...]] = {}
+        for trial in linear_fit.sets_with_one_more(candidates, (), r):
+            used = candidates.entries[trial.members[0]].used
+            starts.setdefault(used.term.key, (*current.effects, used))
+        return list(starts.values())
 
     def with_parts_beside(
         self, hypothesis: Hypothesis, equations: Collection[str] = ()
@@ -440,20 +450,43 @@ class HypothesisSet:
         return out
 
     def exchanged(self, current: Hypothesis) -> Hypothesis:
-        """Return the set, or a better one with an effect exchanged for a confounder or for two.
+        """Return the set, or a better one with an effect exchanged for another one or for two.
 
-        An effect that was chosen before the last one was added may be wrong beside it, and one
-        effect may have been chosen in place of two (`confounders.composites`).
+        An effect that was chosen before the last one was added may be worse beside it than one that
+        it hid, and one effect may have been chosen in place of two (`confounders.composites`).
         """
         tried = {current.keys}
-        while sets := confusable_sets(self.train_data, self.effects, current):
-            pruned = self.prune(self.best([current, *(self.refined(s, current) for s in sets)]))
+        while current.effects:
+            sets = [self.refined(s, current) for s in self._composites(current)]
+            sets += self._replaced(current)
+            pruned = self.prune(self.best([current, *sets]))
             other = self.best([current, pruned])  # one that lost an effect again may be worse
             if other.keys in tried:
                 break
             current = other
             tried.add(current.keys)
         return current
+
+    def _composites(self, current: Hypothesis) -> Iterator[tuple[Used, ...]]:
+        for used in current.effects:
+            yield from composites(self.train_data, self.effects, current, used)
+
+    def _replaced(self, current: Hypothesis) -> list[Hypothesis]:
+        """Return the sets with one effect replaced by one of the best other candidates.
+
+        Columns under the baseline choose the candidates: to compute them anew for each set takes
+        long.
+        """
+        if len(current.effects) < 2:
+            return []
+        columns = [c for c in self.columns if c.used.term.key not in current.keys]
+        replaced = []
+        for used in current.effects:
+            smaller = self._refined_anew(current.without(used))
+            data = rebased(self.train_data, smaller.fit)
+            starts = self._best_additions(data, smaller, columns)[: SEARCH.replacements]
+            replaced += [self._extended(smaller, effects) for effects in starts]
+        return replaced
 
     def extended_in(self, current: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect that removes most from `equations`, None if none does.

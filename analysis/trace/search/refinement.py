@@ -309,18 +309,6 @@ def at_best_size(data: RegressionData, used: Used, others: Sequence[Used]) -> Us
     return _best_start(data, [scaled(share) for share in SEARCH.start_shares], others)
 
 
-def at_best_point(data: RegressionData, effect: Effect, others: Sequence[Used]) -> Used:
-    """Return an effect at the point of its shape grid that leaves least beside others.
-
-    From another point, the search of a shape of either sign may end at the wrong bound.
-    """
-    shapes = effect.shapes(data.rig)
-    if not any(s.neutral is not None and s.low < s.neutral for s in shapes):
-        return at_start(data.rig, effect)
-    starts = [Used(effect, point) for point in shape_grid(effect, data.rig)]
-    return _best_start(data, starts, others)
-
-
 def _best_start(data: RegressionData, starts: Sequence[Used], others: Sequence[Used]) -> Used:
     """Return the start that leaves least energy in the data's model with the others."""
     return min(starts, key=lambda used: fit_coefficients(data, (*data.terms, *others, used)).energy)

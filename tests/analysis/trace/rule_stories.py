@@ -630,7 +630,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_names_nothing, ("p always 0", "no family")),
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
     (a_leak_is_named_alone_and_for_certain, ()),
-    (a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak, ("look-alikes",)),
+    (a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak, ("exchanges",)),
     (friction_beside_a_pressure_offset_is_not_taken_for_two_levels, ("two for one",)),
     (a_leak_gone_on_the_held_out_day_is_refused, ("removes on held-out",)),
     (what_training_alone_shows_is_not_explained, ("fit records judge",)),

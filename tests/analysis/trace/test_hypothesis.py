@@ -54,6 +54,13 @@ def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclinati
     assert found["base_inclination"][0] == pytest.approx(inclination, rel=0.02)
 
 
+def test_an_effect_is_exchanged_for_one_that_does_not_resemble_it(rig: Rig) -> None:
+    names = ("torque_offset", "spool_offset", "internal_leakage")
+    s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, u_null=1e-3), *names)
+    again = s.hypotheses.exchanged(s.set_of("torque_offset", "internal_leakage"))
+    assert {name for name, _ in again.keys} == {"spool_offset", "internal_leakage"}
+
+
 @pytest.mark.slow
 def test_an_offset_of_a_pressure_is_tried_for_a_spring(rig: Rig) -> None:
     """A spring that rests far away is nearly the torque of a rod pressure that is 60 kPa off."""

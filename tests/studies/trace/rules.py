@@ -221,7 +221,7 @@ RULES: Final = (
          ((engine, "unstated_noise", lambda *_: None),)),
     Rule("other starts", "a search that explains nothing does not begin with another effect",
          ((HypothesisSet, "_begun_with_another", lambda _, current, _singles: current),)),
-    Rule("look-alikes", "no effect is exchanged for one that looks like it",
+    Rule("exchanges", "no effect is exchanged for another one",
          ((HypothesisSet, "exchanged", lambda _, now: now),)),
     Rule("two for one", "no effect is exchanged for two that leave less",
          ((confounders, "composites", lambda *_: []),)),
