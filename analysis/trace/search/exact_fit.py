@@ -17,6 +17,7 @@ from analysis.regression.least_squares import column_scale
 from analysis.regression.rows import in_common, matrix_of, parameters_of
 from analysis.terms.base import Used, family_of
 from analysis.trace.data.conditioned_record import acting_on, shared_rows
+from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
@@ -264,3 +265,27 @@ def rescale(data: RegressionData, terms: Sequence[Used]) -> bool:
 def is_logarithmic(shape: Shape) -> bool:
     """Return whether a shape's bounds differ by a factor so large that its logarithm is used."""
     return shape.low > 0 and shape.high / shape.low > 20
+
+
+def noise_amplification(data: RegressionData, fit: ExactFit) -> Array:
+    """Return how many times larger the stated noise is in each row (M,) with the effects of a fit.
+
+    To undo a sensor's lag multiplies fast noise of its channel. The factor is the ratio of the
+    equation's rms by stated noise under the fit's terms and under the data's own, at least 1.
+    """
+    factors = np.ones(len(data.base))
+    for conditioned, rows in zip(data.records, data.rows, strict=True):
+        after = shared_rows(data.rig, fit.terms, conditioned, data.cache)
+        noise = stated_noise(data.rig, data.terms, conditioned, rows, data.beta)
+        amplified = stated_noise(data.rig, fit.terms, conditioned, after, fit.beta)
+        for s in data.segments:
+            if s.group == conditioned.group and noise[s.equation] > 0.0:
+                factors[s.where] = max(1.0, amplified[s.equation] / noise[s.equation])
+    return factors
+
+
+def over_amplified_noise(data: RegressionData, fit: ExactFit, residual: Array) -> Array:
+    """Return a whitened residual (M,) over the noise that effects of the fit amplify, if any do."""
+    if not any(isinstance(u.term, Effect) and u.term.amplifies for u in fit.terms):
+        return residual
+    return np.asarray(residual / noise_amplification(data, fit))

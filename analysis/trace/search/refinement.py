@@ -24,13 +24,19 @@ from analysis.terms.base import Term, Used
 from analysis.trace.data.candidates import at_start, effect_in, shape_grid
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.nuisance_terms import temperature_terms
-from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
+from analysis.trace.data.regression_data import (
+    RegressionData,
+    evidence,
+    regression_data,
+    signals_of,
+)
 from analysis.trace.search.exact_fit import (
     ExactFit,
     design_matrix,
     fit_coefficients,
     is_logarithmic,
     jacobian,
+    over_amplified_noise,
     rescale,
     tangent,
     with_term,
@@ -79,18 +85,43 @@ def _refined(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None
             if continued.energy > max(limit, SEARCH.promising_drop * start.energy):
                 return continued
             terms = continued.terms
-    fit = _with_searched_shapes(data, terms)
-    for k in range(len(terms)):
-        used = fit.terms[k]
-        if used in data.terms or not isinstance(used.term, Effect):
-            continue
-        if k in in_rival and fit.energy > rival_energy:
-            continue
-        fit = _with_details(data, _in_best_form(data, fit, k), k)
+    start = _with_searched_shapes(data, terms)
+
+    def in_best_forms(shown_first: bool) -> ExactFit:
+        fit = start
+        for k in range(len(terms)):
+            used = fit.terms[k]
+            if used in data.terms or not isinstance(used.term, Effect):
+                continue
+            if k in in_rival and fit.energy > rival_energy:
+                continue
+            fit = _with_details(data, _in_best_form(data, fit, k, shown_first), k, shown_first)
+        return fit
+
+    fit = in_best_forms(shown_first=False)
+    if not _is_shown(data, fit):
+        # A smooth level of friction may fit best beside a breakaway that never falls.
+        shown = in_best_forms(shown_first=True)
+        return shown if _is_shown(data, shown) else fit
     return fit
 
 
-def _with_details(data: RegressionData, fit: ExactFit, place: int) -> ExactFit:
+def _is_shown(data: RegressionData, fit: ExactFit) -> bool:
+    """Return whether the records show every effect of a fit (`Effect.not_shown`)."""
+    tested = [
+        u for u in fit.terms
+        if u not in data.terms and isinstance(u.term, Effect)
+        and type(u.term).not_shown is not Effect.not_shown
+    ]  # fmt: skip
+    if not tested:
+        return True
+    values, signals = fit.parameters(data.rig), signals_of(data)
+    return not any(
+        effect_in(u).not_shown(data.rig, values, u.shape, fit.terms, signals) for u in tested
+    )
+
+
+def _with_details(data: RegressionData, fit: ExactFit, place: int, shown_first: bool) -> ExactFit:
     """Return the fit with details of the form of term number `place`, where they remove enough."""
     used = fit.terms[place]
     starts = effect_in(used).detailed_shapes(data.rig, used.shape)
@@ -108,10 +139,19 @@ def _with_details(data: RegressionData, fit: ExactFit, place: int) -> ExactFit:
     if fit.energy - detailed.energy <= least_gain:
         return fit
     # A form that fitted better without the details need not do so with them.
-    detailed = _in_best_form(data, detailed, place)
-    earned = fit.energy - detailed.energy > least_gain
-    sure = earned and _determines_shapes(data, detailed, detailed.terms[place], used)
+    detailed = _in_best_form(data, detailed, place, shown_first)
+    gain = fit.energy - detailed.energy
+    # Of a lag, a detail may only make the noise smaller.
+    quieter = _energy_over_noise(data, fit) - _energy_over_noise(data, detailed)
+    sure = min(gain, quieter) > least_gain and _determines_shapes(
+        data, detailed, detailed.terms[place], used
+    )
     return detailed if sure and not _replaces_detail(data, fit, detailed, used) else fit
+
+
+def _energy_over_noise(data: RegressionData, fit: ExactFit) -> float:
+    """Return the energy of a fit's residual over the noise that its effects amplify."""
+    return float(np.sum(over_amplified_noise(data, fit, fit.residual) ** 2))
 
 
 def _replaces_detail(data: RegressionData, fit: ExactFit, detailed: ExactFit, used: Used) -> bool:
@@ -164,19 +204,20 @@ def _detail_at_bound(shape: Shape, value: float) -> bool:
     return shape.detail and not shape.saturates and not low <= value <= shape.high - margin
 
 
-def _in_best_form(data: RegressionData, fit: ExactFit, place: int) -> ExactFit:
+def _in_best_form(data: RegressionData, fit: ExactFit, place: int, shown_first: bool) -> ExactFit:
     """Return the fit with the term number `place` in the form that leaves least.
 
     Each further free number of a form must be significant (`TRACE.standard_errors`): an exponent
     that is not would widen the interval of the size tenfold. A form within its physical bounds is
-    preferred to one at them.
+    preferred to one at them, and with `shown_first` one with which the records show every effect.
     """
     price = TRACE.standard_errors**2
 
-    def priced(model: ExactFit) -> tuple[bool, float]:
+    def priced(model: ExactFit) -> tuple[bool, bool, float]:
         used = model.terms[place]
+        hidden = shown_first and not _is_shown(data, model)
         outside = bool(effect_in(used).outside(data.rig, used.shape))
-        return outside, model.energy + price * len(_free_shapes(data, model.terms))
+        return hidden, outside, model.energy + price * len(_free_shapes(data, model.terms))
 
     while True:
         used = fit.terms[place]

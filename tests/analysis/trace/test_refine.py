@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from analysis.effects.base import Effect
+from analysis.effects.friction import StribeckFriction
 from analysis.terms import baseline, make
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.search import exact_fit, refinement
@@ -219,3 +222,22 @@ def test_shapes_are_searched_again_from_those_of_a_larger_set(rig: Rig) -> None:
     assert kept.keys == alone.keys
     assert kept.total == pytest.approx(alone.total, rel=0.01)
     assert sets.fitted[alone.keys] is kept
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_of_two_forms_the_one_that_the_records_show_is_chosen(
+    rig: Rig, shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The exponential fall leaves less, unless the records do not show a breakaway with it."""
+    run, _ = pair_of_runs(rig, Fc=30.0, Fs=40.0, v_stribeck=0.02, fall=1.0)
+    terms = tuple(map(Used, baseline()))
+    data = regression_data(rig, terms, conditioned_records(rig, [run]))
+    names = ("coulomb_friction", "stribeck_friction")
+    starts = [at_start(rig, make(name, "joint 2")) for name in names]
+
+    def not_shown(self: Effect, rig: Rig, values: Any, shape: Sequence[float], *_: Any) -> str:
+        return "" if shown or len(shape) < 4 else "it hardly falls"
+
+    monkeypatch.setattr(StribeckFriction, "not_shown", not_shown)
+    stribeck = refinement.refine(data, (*terms, *starts)).terms[-1]
+    assert (len(stribeck.shape) == 4) == shown
