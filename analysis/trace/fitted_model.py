@@ -95,7 +95,7 @@ def model_with_effects(
     if winner is not finding.winner:
         model, from_tolerances = _identified_with_effects(runs, winner, baseline, rows)
     from_tolerances |= shape_errors(rows.train, winner.fit)
-    others = alternatives_of(finding.hypotheses, finding.winner, finding.named)
+    others = alternatives_of(finding.hypotheses, finding.winner, finding.named, rows.choosing)
     absorbed = None
     if finding.verdict != UNEXPLAINED:
         absorbed = absorbed_effects(finding.hypotheses, candidates, finding.winner)

@@ -153,8 +153,8 @@ class TraceSettings:
     the fit to held-out rows, or by a rival in place of a named effect (tuned: with good excitation
     no detection limit reaches it)."""
     open_share: float = 0.02
-    """Half-width of a parameter's 95 % interval under another name of the same law, over its value,
-    from which that name is a rival (contract: the error that parameters may have)."""
+    """Half-width of a parameter's 95 % interval under another name, over its value, from which that
+    name is a rival (contract: the error that parameters may have)."""
     most_detection_limits: int = 3
     """Largest number of detection limits in the notes."""
     eigenvalue_ratio: float = 1e-10

@@ -85,3 +85,12 @@ def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
         for u in used
     )
     return len(used), numbers
+
+
+def details(rig: Rig, used: Sequence[Used]) -> int:
+    """Return the number of details that the forms of effects have."""
+    return sum(
+        shape.detail and shape.is_present(value) and not shape.fixed
+        for u in used
+        for shape, value in zip(shapes_of(rig, u), u.shape, strict=True)
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import at_start, effect_in, effects_among
+from analysis.trace.data.candidates import at_start, details, effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import held_out
 from analysis.trace.judge.curves import noise_covariance
@@ -22,8 +23,14 @@ from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
 from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search import confounders
-from analysis.trace.search.exact_fit import ExactFit
-from analysis.trace.search.hypothesis import Hypothesis, Key, is_special_case, of_one_law
+from analysis.trace.search.exact_fit import ExactFit, over_amplified_noise
+from analysis.trace.search.hypothesis import (
+    Hypothesis,
+    Key,
+    energy_above_noise,
+    is_special_case,
+    of_one_law,
+)
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
@@ -45,7 +52,7 @@ def rivals_of(
     parameter of another law, or where another rival is tied.
     """
     judged_effect, train_data = effect_in(used), hypotheses.train_data
-    holdout_data = held_out_test.data
+    holdout_data, rig = held_out_test.data, train_data.rig
     others = winner.keys - {judged_effect.key}
     training_test = TieTest(
         train_data,
@@ -55,11 +62,12 @@ def rivals_of(
     )
     out: list[Rival] = []
     richer: list[Rival] = []
-    for hypothesis, rival_term in hypotheses.replacements(winner, used):
+    for fitted, rival_term in hypotheses.replacements(winner, used):
         other = effect_in(rival_term)
         same_law = of_one_law(judged_effect, other)
-        # Each further free number must remove its price.
-        further = hypothesis.size[1] - winner.size[1]
+        hypothesis = _over_its_noise(train_data, fitted)
+        # Each further free number must remove its price, a detail of a form too.
+        further = _numbers(rig, hypothesis) - _numbers(rig, winner)
         price = SEARCH.number_price * further
         justified = further <= 0 or hypothesis.total <= winner.total - price
         alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
@@ -70,12 +78,12 @@ def rivals_of(
             or held_out.disturbed_equations(hypotheses, hypothesis, alternative)
         ):
             continue
-        residual, pair = held_out_residual(holdout_data, hypothesis.fit), (judged_effect, other)
+        residual = _held_out(holdout_data, hypothesis)
+        pair = (judged_effect, other)
         if _is_refused_simpler_name(hypotheses, holdout_data, pair, others, residual):
             continue
         ratio = held_out_test.ratio(residual)
-        tie_ratio = TRACE.tie_ratio_training if other.amplifies else TRACE.tie_ratio
-        tied = held_out_test.ties(residual, tie_ratio)
+        tied = held_out_test.ties(residual, TRACE.tie_ratio)
         tied = tied and (alike or ratio < TRACE.decisive_ratio)
         law = judged_effect.family if same_law else ""
         moved = moved_parameter(train_data, winner, hypothesis, law) if tied else None
@@ -88,10 +96,11 @@ def rivals_of(
             out.append(rival)
         elif tied:
             richer.append(rival)
+    costs = partial(cost, train_data, holdout_data)
     for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
         moved = moved_parameter(train_data, winner, composite)
         # One effect is the simpler explanation, unless the records prefer two.
-        if moved and cost(composite, holdout_data) < cost(winner, holdout_data):
+        if moved and costs(composite) < costs(winner):
             ratios = ratio, training_test.ratio(composite.fit.residual)
             one, two = (_rival(effect_in(u), *ratios, True) for u in composite.effects[-2:])
             out.append(replace(one, moved=moved, beside=two))
@@ -99,6 +108,24 @@ def rivals_of(
         out += richer
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: max(TRACE.most_rivals, sum(r.tied for r in out))]
+
+
+def _over_its_noise(data: RegressionData, hypothesis: Hypothesis) -> Hypothesis:
+    """Return a set with its residual over the noise that its effects amplify."""
+    residual = over_amplified_noise(data, hypothesis.fit, hypothesis.fit.residual)
+    fit, energy = replace(hypothesis.fit, residual=residual), energy_above_noise(data, residual)
+    return replace(hypothesis, fit=fit, excess_energy=energy)
+
+
+def _held_out(holdout_data: RegressionData, hypothesis: Hypothesis) -> Array:
+    """Return the held-out residual (M,) of a set over the noise that its effects amplify."""
+    fit = hypothesis.fit
+    return over_amplified_noise(holdout_data, fit, held_out_residual(holdout_data, fit))
+
+
+def _numbers(rig: Rig, hypothesis: Hypothesis) -> int:
+    """Return the count of a set's free numbers with the details of its forms."""
+    return hypothesis.size[1] + details(rig, hypothesis.effects)
 
 
 def _rival(
@@ -110,15 +137,15 @@ def _rival(
 
 def moved_parameter(
     train_data: RegressionData, winner: Hypothesis, rival: Hypothesis, law: str = "",
-    least: float = TRACE.noted_shift,
+    least: float = TRACE.noted_shift, with_open: bool = True,
 ) -> tuple[str, float] | None:  # fmt: skip
     """Return the baseline parameter that a rival changes most, and its relative change.
 
-    It changes by at least `least` and lies outside the rival's 95 % interval: the stated intervals
-    would be wrong if the rival were true. None where no parameter does.
+    It changes by at least `least` and lies outside the rival's 95 % interval. `with_open`: where
+    the interval is wider than `TRACE.open_share` of the value, its farther end gives the change.
+    The stated intervals would be wrong if the rival were true. None where no parameter does.
     With a `law`, parameters of the baseline's term of that law are left out (viscous friction
-    beside dry `friction`, whose forms differ by a slope too), and a rival's interval wider than
-    `TRACE.open_share` suffices: its end farther from the named set's value gives the change.
+    beside dry `friction`, whose forms differ by a slope too).
     """
     std = deviations(train_data, rival.fit)
     largest: tuple[str, float] | None = None
@@ -131,7 +158,7 @@ def moved_parameter(
         if not value or not other or c.parameter not in std:
             continue
         half_width = IDENTIFY.normal_quantile * std[c.parameter]
-        if law and half_width > TRACE.open_share * abs(value):
+        if with_open and half_width > TRACE.open_share * abs(value):
             other += math.copysign(half_width, other - value)
         elif abs(other - value) <= half_width:
             continue
@@ -180,28 +207,32 @@ def best_tied_set(
         return any(is_special_case(effect, other) for effect in named for other in others)
 
     tied = [o for o in tied_sets(hypotheses, winner, effects) if not is_richer(o)]
-    best = min(tied, key=lambda o: cost(o, holdout_data), default=winner)
-    limit = cost(winner, holdout_data) - SEARCH.number_price
-    return best if cost(best, holdout_data) < limit else winner
+    costs = partial(cost, hypotheses.train_data, holdout_data)
+    best = min(tied, key=costs, default=winner)
+    return best if costs(best) < costs(winner) - SEARCH.number_price else winner
 
 
-def cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
+def cost(train_data: RegressionData, holdout_data: RegressionData, hypothesis: Hypothesis) -> float:
     """Return the energy in training and held-out rows with the price of effects and numbers."""
-    residual = held_out_residual(holdout_data, hypothesis.fit)
-    energy = hypothesis.fit.energy + float(residual @ residual)
+    fit = hypothesis.fit
+    training = over_amplified_noise(train_data, fit, fit.residual)
+    held_out_rows = _held_out(holdout_data, hypothesis)
+    energy = float(training @ training) + float(held_out_rows @ held_out_rows)
     return energy + SEARCH.number_price * sum(hypothesis.size)
 
 
 def alternatives_of(
-    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
-) -> list[tuple[Hypothesis, str]]:
+    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect],
+    holdout_data: RegressionData,
+) -> list[tuple[Hypothesis, str]]:  # fmt: skip
     """Return the sets that could hold in place of the winner, and the law that each leaves out.
 
     They are those with a tied rival; those with a richer form of a named effect, such as two levels
-    of friction for one, that move parameters too little to be rivals; and those with another part
-    of its law beside it, such as a level beside a breakaway. Most leave out none (''). A richer
-    form that is not possible (its levels are equal) leaves out its law's term of the baseline,
-    viscous friction: forms of friction differ by a slope too.
+    of friction for one, that move parameters too little to be rivals; those with another effect of
+    more numbers that fits as well; and those with another part of its law beside it, such as a
+    level beside a breakaway. Most leave out none (''). A richer form that is not possible (its
+    levels are equal) leaves out its law's term of the baseline, viscous friction: forms of friction
+    differ by a slope too.
     """
     tied = tied_sets(hypotheses, winner, effects)
     out = [(hypothesis, "") for hypothesis in tied]
@@ -210,6 +241,8 @@ def alternatives_of(
         effect = effect_in(used)
         if effect.key not in named:
             continue
+        equal = _equal_with_more_numbers(hypotheses, winner, used, holdout_data)
+        out += [(hypothesis, "") for hypothesis in equal if hypothesis not in tied]
         for form in hypotheses.effects:
             if not is_special_case(effect, form) or form.key in winner.keys:
                 continue
@@ -222,6 +255,28 @@ def alternatives_of(
         if not hypotheses.physical_problem(parts):
             out.append((parts, ""))
     return out
+
+
+def _equal_with_more_numbers(
+    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData
+) -> Iterator[Hypothesis]:
+    """Yield the sets with an effect of more numbers in the place of `used` that lose only noise.
+
+    Over a short arc a spring fits as well as an inclination, with another weight.
+    """
+    best = held_out_residual(holdout_data, winner.fit)
+    for hypothesis, rival in hypotheses.replacements(winner, used):
+        other = effect_in(rival)
+        richer = hypothesis.size[0] == winner.size[0] and hypothesis.size[1] > winner.size[1]
+        if not richer or other.free or of_one_law(effect_in(used), other):
+            continue
+        residual = held_out_residual(holdout_data, hypothesis.fit)
+        losses = (
+            loss_in_deviations(hypothesis.fit.residual, winner.fit.residual),
+            loss_in_deviations(residual, best),
+        )
+        if max(losses) <= TRACE.standard_errors and not hypotheses.physical_problem(hypothesis):
+            yield hypothesis
 
 
 def errors_by_alternatives(

@@ -270,14 +270,15 @@ def sets_with_small_effect(
     """
     if absorbed is None:
         return []
-    residual, larger_sets = held_out_residual(holdout_data, winner.fit), []
+    data, larger_sets = hypotheses.train_data, list[tuple[Hypothesis, Moved]]()
+    residual = held_out_residual(holdout_data, winner.fit)
     for effects in _clearest_effects(absorbed, winner):
         larger = hypotheses.refined([*winner.effects, *effects])
         if (
             winner.fit.energy - larger.fit.energy > TRACE.suggested_deviations**2
             and not hypotheses.physical_problem(larger)
             and loses_by_restriction(residual, held_out_residual(holdout_data, larger.fit))
-            and (moved := moved_parameter(hypotheses.train_data, winner, larger, least=0.0))
+            and (moved := moved_parameter(data, winner, larger, least=0.0, with_open=False))
         ):
             larger_sets.append((larger, moved))
     least = min((o.fit.energy for o, _ in larger_sets), default=0.0)

@@ -35,7 +35,7 @@ from tests.analysis.trace.test_foreign_bench import rig_angle
 
 LEAK, RUBBING = 2e-12, 80.0  # [m^3/(s Pa)], [N]
 HIDDEN = {
-    "leak": Hidden(2.0, 2.0, leak=LEAK),
+    "leak": Hidden(1.0, 1.0, leak=LEAK),
     "rubbing": Hidden(RUBBING, RUBBING, 1e-4),
 }
 NAME = {

@@ -100,6 +100,27 @@ def test_friction_is_as_uncertain_as_a_breakaway_that_noise_hides(rig: Rig) -> N
     assert wide < level < narrow
 
 
+@pytest.mark.parametrize("noise", kept([1.0, 3.0], (3.0,)))
+def test_noise_does_not_make_a_certain_inclination_of_a_spring(rig: Rig, noise: float) -> None:
+    """Over this arc both are a straight line; with the spring the weight is open by a tenth."""
+    runs = pair_of_runs(rig, Hidden(spring=2.5 if noise > 1.0 else 4.0), noise=noise)
+    result = traced(rig, runs, "base_inclination", "joint_spring")
+    assert result.verdict == "confounded"
+    assert ("joint_spring", "joint 2") in [*result.tied, *((e.name, e.at) for e in result.effects)]
+    low, high = result.model_after.parameters["W2"].ci95
+    assert low < TRUTH["W2"] < high
+
+
+def test_an_interval_reaches_what_another_effect_of_more_numbers_gives(rig: Rig) -> None:
+    """A weak spring fits like an inclination and moves the weight by less than a rival must."""
+    runs = pair_of_runs(rig, Hidden(spring=0.3), noise=0.1)
+    result = traced(rig, runs, "base_inclination", "joint_spring")
+    assert [(e.name, e.rivals) for e in result.effects] == [("base_inclination", ())]
+    weight = result.model_after.parameters["W2"]
+    assert weight.ci95[0] < TRUTH["W2"] < weight.ci95[1]
+    assert weight.ci95[1] - weight.ci95[0] < 0.03 * TRUTH["W2"]
+
+
 @pytest.mark.slow
 def test_alternatives_widen_what_they_share_with_the_model(
     rig: Rig, noisy: tuple[Run, Run]
