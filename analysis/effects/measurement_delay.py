@@ -49,6 +49,19 @@ class TimingError(Sensor):
         artefact = between_samples(rig, self.shape_of(rig, shape)[0]) if is_input else ""
         return super().problem(rig, values, shape) or artefact
 
+    def extrapolated(
+        self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]
+    ) -> dict[str, tuple[float, float]]:
+        """Return the time [s] half a sample either way, of an electric joint alone.
+
+        Between samples the current may be held, or follow a held command: its mean leads or lags
+        the interpolated reading by up to that.
+        """
+        if not rig.electric:
+            return {}
+        value, half = self.shape_of(rig, shape)[0], 0.5 / rig.sample_rate
+        return {self.shape_names()[0]: (max(value - half, 0.0), value + half)}
+
     def plotted(self) -> str:
         """Name the rate of the channel's quantity."""
         quantity = super().plotted()

@@ -132,7 +132,10 @@ def test_a_drive_that_is_recorded_late_is_named_with_its_delay() -> None:
     result = trace([train], [unseen], look_ahead=False)
     first = result.effects[0]
     assert (first.name, first.at, first.where) == ("channel_delay", "joint 1 drive", "joint 1")
-    assert first.parameters["delay_drive_1"].value == pytest.approx(3e-3, rel=0.02)
+    delay = first.parameters["delay_drive_1"]
+    assert delay.value == pytest.approx(3e-3, rel=0.02)
+    # A command that is recorded and held is half a sample later than its interpolation.
+    assert delay.ci95 == pytest.approx((delay.value - 5e-4, delay.value + 5e-4), rel=1e-6)
     assert result.tied in ([], [("sensor_lag", "joint 1")])
 
 
