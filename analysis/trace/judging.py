@@ -25,6 +25,7 @@ from analysis.trace.judge.rivals import best_tied_set, cost
 from analysis.trace.judge.unrepeated import unrepeated_floors
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_trials import improved_by_exact_trials
+from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH
@@ -59,7 +60,8 @@ def search_and_judge(
     in_noise = hypotheses.within_noise(hypotheses.empty)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    winner = improved_by_exact_trials(hypotheses, hypotheses.run(progress))
+    found = exchanged(hypotheses, hypotheses.run(progress))
+    winner = improved_by_exact_trials(hypotheses, found)
     if in_noise:
         winner = _shown_by_held_out_rows(hypotheses, winner, choosing)
     rng = np.random.default_rng(candidates.seed)

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import effect_in
 from analysis.trace.search.exact_fit import fit_coefficients
+from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -36,7 +37,8 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> 
             hypotheses.refined_below(energy, effects)
             for energy, effects in _best_trials(hypotheses, current, above)
         ]
-        better = hypotheses.exchanged(hypotheses.prune(hypotheses.best([current, *tried])))
+        pruned = hypotheses.prune(hypotheses.best([current, *tried]))
+        better = exchanged(hypotheses, pruned)
         to_noise = hypotheses.within_noise(better)
         tolerated = hypotheses.within_form_tolerance(current) and not to_noise
         least = SEARCH.far_log_gain if tolerated else SEARCH.least_log_gain

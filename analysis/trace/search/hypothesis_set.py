@@ -27,7 +27,7 @@ from analysis.trace.data.regression_data import (
     variant_columns,
 )
 from analysis.trace.search import linear_fit
-from analysis.trace.search.confounders import BENCH, composites
+from analysis.trace.search.confounders import BENCH
 from analysis.trace.search.exact_fit import (
     ExactFit,
     fit_coefficients,
@@ -144,7 +144,7 @@ class HypothesisSet:
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
-    def _refined_anew(self, effects: Sequence[Used]) -> Hypothesis:
+    def refined_anew(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the best exact fit of a set: the earlier one, or one that starts at these shapes.
 
         Otherwise a further effect could seem to remove what a local minimum has left.
@@ -162,7 +162,7 @@ class HypothesisSet:
         An earlier fit that leaves more ended in a local minimum and is repeated from these shapes.
         """
         earlier = self.refined(effects)
-        return earlier if earlier.fit.energy <= energy else self._refined_anew(effects)
+        return earlier if earlier.fit.energy <= energy else self.refined_anew(effects)
 
     def replacements(self, winner: Hypothesis, used: Used) -> Iterator[tuple[Hypothesis, Used]]:
         """Yield the fitted sets with one other effect in the place of `used`, and that effect."""
@@ -215,7 +215,7 @@ class HypothesisSet:
         self.columns = variant_columns(data, self.variants_of(data, r), progress)
         candidates = self.candidates = self._candidate_columns(data, self.columns)
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        result = self.exchanged(self._searched(candidates, r))
+        result = self._searched(candidates, r)
         return self.fitted.get(result.keys, result)  # a later start may have found better shapes
 
     def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
@@ -357,8 +357,8 @@ class HypothesisSet:
         ]  # fmt: skip
         columns = variant_columns(data, tried, equations=equations)
         mask = data.in_equations(equations or data.row_counts).astype(np.float64)
-        starts = self._best_additions(data, current, columns, mask)[: SEARCH.refined_extensions]
-        larger = [self._extended(current, effects) for effects in starts]
+        starts = self.best_additions(data, current, columns, mask)[: SEARCH.refined_extensions]
+        larger = [self.extended(current, effects) for effects in starts]
         if free:
             return larger
         with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
@@ -371,9 +371,9 @@ class HypothesisSet:
         for hypothesis in (current, *filter(self.physical_problem, larger)):
             for effects in self.with_parts_beside(hypothesis, equations):
                 with_parts.setdefault(keys_of(effects), effects)
-        return larger + [self._extended(current, effects) for effects in with_parts.values()]
+        return larger + [self.extended(current, effects) for effects in with_parts.values()]
 
-    def _best_additions(
+    def best_additions(
         self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
         mask: Array | None = None,
     ) -> list[tuple[Used, ...]]:  # fmt: skip
@@ -413,7 +413,7 @@ class HypothesisSet:
                 if part and acts and effect.key not in hypothesis.keys:
                     yield (*hypothesis.without(used), at_start(rig, member), at_start(rig, effect))
 
-    def _extended(self, current: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
+    def extended(self, current: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
         """Return the exact fit of a set that extends `current`, with its shapes as starting points.
 
         A new effect starts at the size that leaves least. Where an equation keeps more than under
@@ -424,7 +424,7 @@ class HypothesisSet:
         effects = [*others, *(at_best_size(self.train_data, u, others) for u in added)]
         earlier = self.refined(effects)
         spoils = spoils_equation(earlier, current, self.noise_band)
-        return self._refined_anew(effects) if spoils else earlier
+        return self.refined_anew(effects) if spoils else earlier
 
     def may_act(self, effect: Effect, current: Hypothesis, equations: Collection[str]) -> bool:
         """Return whether a candidate may have columns in some of `equations`, true without any.
@@ -448,45 +448,6 @@ class HypothesisSet:
         for entry in self.columns:
             out.setdefault(entry.used.term.key, set()).update(entry.touched)
         return out
-
-    def exchanged(self, current: Hypothesis) -> Hypothesis:
-        """Return the set, or a better one with an effect exchanged for another one or for two.
-
-        An effect that was chosen before the last one was added may be worse beside it than one that
-        it hid, and one effect may have been chosen in place of two (`confounders.composites`).
-        """
-        tried = {current.keys}
-        while current.effects:
-            sets = [self.refined(s, current) for s in self._composites(current)]
-            sets += self._replaced(current)
-            pruned = self.prune(self.best([current, *sets]))
-            other = self.best([current, pruned])  # one that lost an effect again may be worse
-            if other.keys in tried:
-                break
-            current = other
-            tried.add(current.keys)
-        return current
-
-    def _composites(self, current: Hypothesis) -> Iterator[tuple[Used, ...]]:
-        for used in current.effects:
-            yield from composites(self.train_data, self.effects, current, used)
-
-    def _replaced(self, current: Hypothesis) -> list[Hypothesis]:
-        """Return the sets with one effect replaced by one of the best other candidates.
-
-        Columns under the baseline choose the candidates: to compute them anew for each set takes
-        long.
-        """
-        if len(current.effects) < 2:
-            return []
-        columns = [c for c in self.columns if c.used.term.key not in current.keys]
-        replaced = []
-        for used in current.effects:
-            smaller = self._refined_anew(current.without(used))
-            data = rebased(self.train_data, smaller.fit)
-            starts = self._best_additions(data, smaller, columns)[: SEARCH.replacements]
-            replaced += [self._extended(smaller, effects) for effects in starts]
-        return replaced
 
     def extended_in(self, current: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect that removes most from `equations`, None if none does.
@@ -532,7 +493,7 @@ class HypothesisSet:
         """Return the set without effects that are not needed or remove too little."""
         band = self.noise_band
         while len(hypothesis.effects) > 1:
-            smaller = [self._refined_anew(hypothesis.without(used)) for used in hypothesis.effects]
+            smaller = [self.refined_anew(hypothesis.without(used)) for used in hypothesis.effects]
             smaller = [o for o in smaller if not self.physical_problem(o)]
             simpler = [
                 o

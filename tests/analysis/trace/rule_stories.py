@@ -28,6 +28,7 @@ from analysis.trace.data.regression_data import regression_data
 from analysis.trace.judge import gates, held_out, inference
 from analysis.trace.result import Trace
 from analysis.trace.search.exact_fit import fit_coefficients, jacobian
+from analysis.trace.search.exchanges import exchanged
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -377,7 +378,7 @@ Story = Callable[[Benches], None]
 def a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak(b: Benches) -> None:
     runs = b.runs(Fc=60.0, c_internal=LEAK)
     s = b.searched(runs, "coulomb_friction", "pressure_dependent_friction", "internal_leakage")
-    again = s.hypotheses.exchanged(s.set_of("pressure_dependent_friction", "internal_leakage"))
+    again = exchanged(s.hypotheses, s.set_of("pressure_dependent_friction", "internal_leakage"))
     assert {name for name, _ in again.keys} == {"coulomb_friction", "internal_leakage"}
     assert again.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
 
@@ -397,7 +398,7 @@ def friction_beside_a_pressure_offset_is_not_taken_for_two_levels(b: Benches) ->
 
     names = ("coulomb_friction", "asymmetric_friction", "sensor_offset")
     s = b.searched(b.kept("offset", made), *names)
-    again = s.hypotheses.exchanged(s.set_of("asymmetric_friction"))
+    again = exchanged(s.hypotheses, s.set_of("asymmetric_friction"))
     assert again.keys == {("coulomb_friction", "joint 2"), ("sensor_offset", "joint 2 cap")}
 
 
@@ -587,7 +588,7 @@ def a_small_overlap_is_found_from_a_start_far_above_it(b: Benches) -> None:
     band, hypotheses = ValveDeadband("joint 2"), s.hypotheses
     known = hypotheses.fitted.pop(frozenset({(band.name, band.where)}))
     try:
-        found = hypotheses._extended(hypotheses.empty, [Used(band, (0.5, 0.5, 0.003))])
+        found = hypotheses.extended(hypotheses.empty, [Used(band, (0.5, 0.5, 0.003))])
     finally:
         hypotheses.fitted[known.keys] = known
     assert found.effects[0].shape[:2] == pytest.approx((0.003, 0.003), rel=0.05)

@@ -10,6 +10,7 @@ import pytest
 from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
+from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     energy_above_noise,
@@ -48,7 +49,7 @@ def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclinati
     """The one is of the bench and the other of a joint; from the wrong sign none is found."""
     names = ("joint_spring", "base_inclination", "internal_leakage")
     s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, inclination=inclination), *names)
-    again = s.hypotheses.exchanged(s.set_of("joint_spring", "internal_leakage"))
+    again = exchanged(s.hypotheses, s.set_of("joint_spring", "internal_leakage"))
     found = {u.term.name: u.shape for u in again.effects}
     assert set(found) == {"base_inclination", "internal_leakage"}
     assert found["base_inclination"][0] == pytest.approx(inclination, rel=0.02)
@@ -57,7 +58,7 @@ def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclinati
 def test_an_effect_is_exchanged_for_one_that_does_not_resemble_it(rig: Rig) -> None:
     names = ("torque_offset", "spool_offset", "internal_leakage")
     s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, u_null=1e-3), *names)
-    again = s.hypotheses.exchanged(s.set_of("torque_offset", "internal_leakage"))
+    again = exchanged(s.hypotheses, s.set_of("torque_offset", "internal_leakage"))
     assert {name for name, _ in again.keys} == {"spool_offset", "internal_leakage"}
 
 
@@ -66,7 +67,7 @@ def test_an_offset_of_a_pressure_is_tried_for_a_spring(rig: Rig) -> None:
     """A spring that rests far away is nearly the torque of a rod pressure that is 60 kPa off."""
     names = ("joint_spring", "sensor_offset", "internal_leakage")
     s = searched(rig, *pair_of_runs(rig, c_internal=LEAK, offset_rod_pressure=6e4), *names)
-    again = s.hypotheses.exchanged(s.set_of("joint_spring", "internal_leakage"))
+    again = exchanged(s.hypotheses, s.set_of("joint_spring", "internal_leakage"))
     found = {u.term.key: u.shape for u in again.effects}
     assert set(found) == {("sensor_offset", "joint 2 rod"), ("internal_leakage", "joint 2")}
     assert found["sensor_offset", "joint 2 rod"][0] == pytest.approx(6e4, rel=0.05)

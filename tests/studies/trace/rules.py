@@ -22,7 +22,7 @@ from analysis.regression import solve
 from analysis.trace import engine, finding, fitted_model, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import gates, held_out, inference, rivals
-from analysis.trace.search import confounders, hypothesis_set, linear_fit
+from analysis.trace.search import confounders, exchanges, hypothesis_set, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
 
@@ -222,9 +222,11 @@ RULES: Final = (
     Rule("other starts", "a search that explains nothing does not begin with another effect",
          ((HypothesisSet, "_begun_with_another", lambda _, current, _singles: current),)),
     Rule("exchanges", "no effect is exchanged for another one",
-         ((HypothesisSet, "exchanged", lambda _, now: now),)),
+         ((judging, "exchanged", lambda _, now: now),
+          (exchanges, "_with_another", lambda *_: []))),
     Rule("two for one", "no effect is exchanged for two that leave less",
-         ((confounders, "composites", lambda *_: []),)),
+         ((exchanges, "composites", lambda *_: []),
+          (confounders, "composites", lambda *_: []))),
     Rule("fewer effects", "an effect is added where another set of fewer leaves as little",
          ((HypothesisSet, "_smaller_sets", lambda *_: []),)),
     Rule("parts of a law", "a breakaway and the level below it are tried one by one",
