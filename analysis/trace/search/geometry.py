@@ -12,6 +12,7 @@ residual when each number is one sigma larger, and the share w of the rows that 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -58,6 +59,9 @@ def geometry_for_smaller_set(
     changes = residual_changes(data, winner.fit, numbers)
     limit = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
     best: tuple[Hypothesis, Array] | None = None
+    for size in range(1, len(winner.effects)):
+        for effects in itertools.combinations(winner.effects, size):
+            hypotheses.refined(effects)  # some of them may stand for the geometry
     for hypothesis in (hypotheses.empty, *hypotheses.fitted.values()):
         if explained and hypothesis.size >= winner.size:
             continue

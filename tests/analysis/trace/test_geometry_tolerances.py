@@ -10,18 +10,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.terms import baseline_of
+from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
+from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace
 from analysis.trace.search.exact_fit import fit_coefficients
-from analysis.trace.search.geometry import residual_changes
+from analysis.trace.search.geometry import geometry_for_smaller_set, residual_changes
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.tolerances import Tolerances
 from tests.analysis.small_bench import TRUTH
+from tests.analysis.trace.gate_cases import searched
 from tests.analysis.trace.hidden import STATED, misread, pair_of_runs
 
 
@@ -48,6 +50,19 @@ def test_an_effect_beside_wrong_numbers_is_named_alone(rig: Rig) -> None:
     assert [(e.name, e.where) for e in result.effects] == [("internal_leakage", "joint 2")]
     low, high = result.effects[0].parameters["c_internal_2"].ci95
     assert low < 2e-12 < high
+
+
+def test_a_part_of_the_set_is_tried_with_the_geometry_though_the_search_did_not_fit_it(
+    rig: Rig,
+) -> None:
+    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig, c_internal=2e-12)]
+    s = searched(runs[0].rig, *runs, "internal_leakage", "sensor_gain", "dead_volume")
+    names = {("internal_leakage", "joint 2"), ("sensor_gain", "joint 2 cap")}
+    effects = [at_start(s.hypotheses.train_data.rig, make(*key)) for key in sorted(names)]
+    winner = s.hypotheses.refined(effects)
+    s.hypotheses.fitted = {winner.keys: winner}
+    assert geometry_for_smaller_set(s.hypotheses, winner, explained=True) is not None
+    assert frozenset({("internal_leakage", "joint 2")}) in s.hypotheses.fitted
 
 
 def test_a_gain_far_beyond_the_tolerance_of_an_area_is_still_named(rig: Rig) -> None:
