@@ -35,6 +35,9 @@ class TraceSettings:
     tie_ratio_training: float = 1.25
     """Largest training rms of a tied rival over that of the best set: one that fits the training
     records worse is no alternative (tuned)."""
+    tie_ratio_detailed: float = 1.03
+    """The same ratio, held out and in training, of a rival with more details of form than the best
+    set: they adapt to its residual (tuned: the lag of two poles beside a delay)."""
     decisive_ratio: float = 0.95
     """Held-out rms of a rival over that of the best set: a rival with less is tied whatever its
     training rms (tuned)."""

@@ -66,11 +66,14 @@ def rivals_of(
         other = effect_in(rival_term)
         same_law = of_one_law(judged_effect, other)
         hypothesis = _over_its_noise(train_data, fitted)
-        # Each further free number must remove its price, a detail of a form too.
-        further = _numbers(rig, hypothesis) - _numbers(rig, winner)
+        # Each further free number must remove its price.
+        further = hypothesis.size[1] - winner.size[1]
         price = SEARCH.number_price * further
         justified = further <= 0 or hypothesis.total <= winner.total - price
-        alike = training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
+        tie_ratios = TRACE.tie_ratio, TRACE.tie_ratio_training
+        if details(rig, hypothesis.effects) > details(rig, winner.effects):
+            tie_ratios = TRACE.tie_ratio_detailed, TRACE.tie_ratio_detailed
+        alike = training_test.ties(hypothesis.fit.residual, tie_ratios[1])
         if (
             not (justified or alike)
             or (same_law and hypothesis.size <= winner.size)
@@ -83,7 +86,7 @@ def rivals_of(
         if _is_refused_simpler_name(hypotheses, holdout_data, pair, others, residual):
             continue
         ratio = held_out_test.ratio(residual)
-        tied = held_out_test.ties(residual, TRACE.tie_ratio)
+        tied = held_out_test.ties(residual, tie_ratios[0])
         tied = tied and (alike or ratio < TRACE.decisive_ratio)
         law = judged_effect.family if same_law else ""
         moved = moved_parameter(train_data, winner, hypothesis, law) if tied else None
@@ -121,11 +124,6 @@ def _held_out(holdout_data: RegressionData, hypothesis: Hypothesis) -> Array:
     """Return the held-out residual (M,) of a set over the noise that its effects amplify."""
     fit = hypothesis.fit
     return over_amplified_noise(holdout_data, fit, held_out_residual(holdout_data, fit))
-
-
-def _numbers(rig: Rig, hypothesis: Hypothesis) -> int:
-    """Return the count of a set's free numbers with the details of its forms."""
-    return hypothesis.size[1] + details(rig, hypothesis.effects)
 
 
 def _rival(
