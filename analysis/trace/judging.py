@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +90,7 @@ def _shown_by_held_out_rows(
         and not hypotheses.physical_problem(o)
         and not gates.equations_above_band(hypotheses, o, choosing)
     ]  # fmt: skip
-    return min(possible, key=partial(cost, hypotheses.train_data, choosing), default=winner)
+    return min(possible, key=lambda o: cost(o, choosing), default=winner)
 
 
 def with_free_form(finding: Finding, candidates: Candidates) -> Finding:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,11 +98,10 @@ def rivals_of(
             out.append(rival)
         elif tied:
             richer.append(rival)
-    costs = partial(cost, train_data, holdout_data)
     for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
         moved = moved_parameter(train_data, winner, composite)
         # One effect is the simpler explanation, unless the records prefer two.
-        if moved and costs(composite) < costs(winner):
+        if moved and cost(composite, holdout_data) < cost(winner, holdout_data):
             ratios = ratio, training_test.ratio(composite.fit.residual)
             one, two = (_rival(effect_in(u), *ratios, True) for u in composite.effects[-2:])
             out.append(replace(one, moved=moved, beside=two))
@@ -139,13 +137,14 @@ def moved_parameter(
 ) -> tuple[str, float] | None:  # fmt: skip
     """Return the baseline parameter that a rival changes most, and its relative change.
 
-    It changes by at least `least` and lies outside the rival's 95 % interval. `with_open`: where
-    the interval is wider than `TRACE.open_share` of the value, its farther end gives the change.
-    The stated intervals would be wrong if the rival were true. None where no parameter does.
+    It changes by at least `least` and lies outside the rival's 95 % interval. `with_open`: or it
+    lies inside, and the interval is wider than the winner's by `TRACE.open_share` of the value, as
+    a root of squares; then the end by that width gives the change. The stated intervals would be
+    wrong if the rival were true. None where no parameter does.
     With a `law`, parameters of the baseline's term of that law are left out (viscous friction
     beside dry `friction`, whose forms differ by a slope too).
     """
-    std = deviations(train_data, rival.fit)
+    std, own_std = (deviations(train_data, hypothesis.fit) for hypothesis in (rival, winner))
     largest: tuple[str, float] | None = None
     rig = train_data.rig
     left_out = _law_parameters(rig, law)
@@ -153,13 +152,15 @@ def moved_parameter(
         if c.parameter in left_out:
             continue
         value, other = (h.fit.beta.get(c.parameter, 0.0) for h in (winner, rival))
-        if not value or not other or c.parameter not in std:
+        if not value or not other or c.parameter not in std or c.parameter not in own_std:
             continue
         half_width = IDENTIFY.normal_quantile * std[c.parameter]
-        if with_open and half_width > TRACE.open_share * abs(value):
-            other += math.copysign(half_width, other - value)
-        elif abs(other - value) <= half_width:
-            continue
+        if abs(other - value) <= half_width:
+            own = IDENTIFY.normal_quantile * own_std[c.parameter]
+            wider = math.sqrt(max(half_width**2 - own**2, 0.0))
+            if not with_open or wider <= TRACE.open_share * abs(value):
+                continue
+            other += math.copysign(wider, other - value)
         change = value / other - 1.0 if c.reciprocal else other / value - 1.0
         if abs(change) > max(least, abs(largest[1]) if largest else 0.0):
             largest = c.parameter, float(change)
@@ -205,17 +206,15 @@ def best_tied_set(
         return any(is_special_case(effect, other) for effect in named for other in others)
 
     tied = [o for o in tied_sets(hypotheses, winner, effects) if not is_richer(o)]
-    costs = partial(cost, hypotheses.train_data, holdout_data)
-    best = min(tied, key=costs, default=winner)
-    return best if costs(best) < costs(winner) - SEARCH.number_price else winner
+    best = min(tied, key=lambda o: cost(o, holdout_data), default=winner)
+    limit = cost(winner, holdout_data) - SEARCH.number_price
+    return best if cost(best, holdout_data) < limit else winner
 
 
-def cost(train_data: RegressionData, holdout_data: RegressionData, hypothesis: Hypothesis) -> float:
+def cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
     """Return the energy in training and held-out rows with the price of effects and numbers."""
-    fit = hypothesis.fit
-    training = over_amplified_noise(train_data, fit, fit.residual)
-    held_out_rows = _held_out(holdout_data, hypothesis)
-    energy = float(training @ training) + float(held_out_rows @ held_out_rows)
+    residual = held_out_residual(holdout_data, hypothesis.fit)
+    energy = hypothesis.fit.energy + float(residual @ residual)
     return energy + SEARCH.number_price * sum(hypothesis.size)
 
 
