@@ -41,7 +41,7 @@ from analysis.identify.estimators.shifts import (
 )
 from analysis.identify.estimators.weighted import weighted_least_squares
 from analysis.identify.stacked_rows import RecordRows, repeats_in_motion, with_columns
-from analysis.regression.nonlinear import linearised
+from analysis.regression.nonlinear import Linearisation, linearised
 from analysis.regression.rows import parameters_of
 from analysis.regression.solve import MOSTLY_NOISE, Solution
 from analysis.terms.base import Used, inverted
@@ -211,17 +211,26 @@ def _prepare(
         nuisances = [*noisy, *(n for n in nuisances if n in columns and n not in determined)]
         names = (*determined, *nuisances)
         selected = [columns.index(name) for name in names]
-        every = blocks_of(built, family, range(len(unknowns)))
-        blocks = tuple(
-            replace(b, X=b.X @ linear.slope[:, selected], y=b.y - b.X @ linear.constant)
-            for b in every
-        )
+        blocks = _linearised_blocks(built, family, linear, selected)
         prepared = FamilyBlocks(family, names, len(determined), blocks)
         if nuisances:
             prepared, stated = _without_implausible(prepared)
             checks += stated
         out.append(prepared)
     return out, checks
+
+
+def _linearised_blocks(
+    built: Sequence[RecordRows], family: str, linear: Linearisation, selected: Sequence[int]
+) -> tuple[RepeatBlock, ...]:
+    """Return one family's blocks with the columns `selected` of the parameters of `linear`."""
+    if linear.is_identity:
+        return tuple(blocks_of(built, family, selected))
+    slope = linear.slope[:, list(selected)]
+    return tuple(
+        replace(block, X=block.X @ slope, y=block.y - block.X @ linear.constant)
+        for block in blocks_of(built, family, range(len(linear.slope)))
+    )
 
 
 def _without_implausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:

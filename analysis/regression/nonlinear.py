@@ -56,6 +56,11 @@ class Linearisation:
     slope: Array
     constant: Array
 
+    @property
+    def is_identity(self) -> bool:
+        """Whether every parameter is an unknown of the rows itself."""
+        return np.array_equal(self.slope, np.eye(len(self.slope)))
+
 
 def linearised(
     rig: Rig, terms: Sequence[Used], names: Sequence[str], values: Mapping[str, float]
