@@ -194,6 +194,11 @@ class Sensor(SignalEffect):
         return x[:, self.joint]
 
 
+def detail_of(shape: Sequence[float]) -> float:
+    """Return the detail of the form in a sensor effect's shape, 0 where it has none."""
+    return shape[1] if len(shape) > 1 else 0.0
+
+
 def corrected_channels(
     rig: Rig, terms: Sequence[Used], channels: Mapping[str, Array], rate: float
 ) -> dict[str, Array]:

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from analysis.effects.base import Array, Shape, between_samples, longest_lag
-from analysis.effects.measurement import ELECTRIC, Sensor
+from analysis.effects.measurement import ELECTRIC, Sensor, detail_of
 from analysis.signals.conditioning import Signals
 from analysis.signals.filters import align, channel_filter
 from rig.model.rig import Rig
@@ -124,7 +124,7 @@ class SensorLag(TimingError):
     def undone(self, x: Array, order: int, rate: float, shape: Sequence[float]) -> Array:
         """Return x + tau dx/dt + k tau^2 d2x/dt2."""
         first = shape[0] * rate * np.gradient(x)
-        second = second_pole(shape) * shape[0] * rate * np.gradient(first)
+        second = detail_of(shape) * shape[0] * rate * np.gradient(first)
         return np.asarray(x + first + second)
 
     def true_channel(self, reading: Array, rate: float, shape: Sequence[float]) -> Array:
@@ -134,13 +134,8 @@ class SensorLag(TimingError):
         """
         low_passed = channel_filter(rate)
         first = shape[0] * low_passed.apply(reading, 1)
-        second = second_pole(shape) * shape[0] ** 2 * low_passed.apply(reading, 2)
+        second = detail_of(shape) * shape[0] ** 2 * low_passed.apply(reading, 2)
         return np.asarray(reading + first + second)
-
-
-def second_pole(shape: Sequence[float]) -> float:
-    """Return the share of the second pole in a lag's shape, 0 where it has none."""
-    return shape[1] if len(shape) > 1 else 0.0
 
 
 TERMS = (ChannelDelay, SensorLag)

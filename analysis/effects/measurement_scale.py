@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from analysis.effects.base import Array, Effect, Shape
-from analysis.effects.measurement import KINDS, Sensor
+from analysis.effects.measurement import KINDS, Sensor, detail_of
 from analysis.signals.conditioning import Signals
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -144,7 +144,7 @@ class SensorGain(Sensor):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Undo gain and bend in the channel's signal and in its rate."""
-        new, bend = super().prepare(rig, signals, shape), _bend(shape)
+        new, bend = super().prepare(rig, signals, shape), detail_of(shape)
         if bend == 0.0:
             return new
         supply = rig.supply.pressure
@@ -161,8 +161,10 @@ class SensorGain(Sensor):
     ) -> dict[str, Array]:
         """Return the channels as a correct sensor would have sampled them, each (n,)."""
         out = super().correct(rig, channels, rate, shape)
-        if _bend(shape) and self.channel in out:
-            out[self.channel] = _linearised(out[self.channel], _bend(shape), rig.supply.pressure)
+        if detail_of(shape) and self.channel in out:
+            out[self.channel] = _linearised(
+                out[self.channel], detail_of(shape), rig.supply.pressure
+            )
         return out
 
 
@@ -249,11 +251,6 @@ class SensorOffset(Sensor):
     def _is_stated(self, rig: Rig) -> bool:
         """Return whether it is that of the supply's pressure, which the rig file states."""
         return self.where == "bench" and rig.sensors.supply_pressure is None
-
-
-def _bend(shape: Sequence[float]) -> float:
-    """Return the bend of a gain's shape, 0 where it has none."""
-    return shape[1] if len(shape) > 1 else 0.0
 
 
 def _linearised(y: Array, bend: float, supply: float) -> Array:
