@@ -30,12 +30,7 @@ class ConditionedRecord:
 
     def condition_alike(self, rig: Rig, record: Record) -> ConditionedRecord:
         """Condition another record (averaged repeats, added noise) with this one's settings."""
-        filters = self.filtering
-        signals = condition(rig, record, filters.channels, self.signals.bands)
-        if filters.in_motion:
-            # By the record's own speed: a weight w(s') times s'' is the rate of a function of s',
-            # from which the row filter removes fast noise. Another record's noise would remain.
-            signals = without_rests(signals, filters.in_motion, filters.full_weight)
+        signals = _weighted_signals(rig, record, self.filtering, self.signals.bands)
         return replace(self, record=record, signals=signals)
 
     def samples_at(self, time: Array) -> Indices:
@@ -61,8 +56,18 @@ def condition_runs(
         bands = bands_by_step(rig, run.records)
         for record in run.records:
             filters = filtering(record)
-            signals = condition(rig, record, filters.channels, bands[record.step])
-            if filters.in_motion:
-                signals = without_rests(signals, filters.in_motion, filters.full_weight)
+            signals = _weighted_signals(rig, record, filters, bands[record.step])
             out.append(ConditionedRecord(number, record, signals, filters, families))
     return out
+
+
+def _weighted_signals(rig: Rig, record: Record, filters: Filtering, bands: Array) -> Signals:
+    """Return a record's signals, with weights 0 at rest for the joints `in_motion`.
+
+    The weight goes by the record's own speed: w(s') times s'' is the rate of a function of s', from
+    which the row filter removes fast noise. The noise of another record would remain.
+    """
+    signals = condition(rig, record, filters.channels, bands)
+    if not filters.in_motion:
+        return signals
+    return without_rests(signals, filters.in_motion, filters.full_weight)
