@@ -75,9 +75,7 @@ def linearised(
         reduction = used.term.reduction(rig)
         if reduction is None or not set(reduction.linear) <= set(out.names):
             continue
-        places = [out.names.index(name) for name in reduction.linear]
-        others = [i for i in range(len(out.names)) if i not in places]
-        reduced_names = (*(out.names[i] for i in others), *reduction.parameters)
+        places, others, reduced_names = _partition(reduction, out.names)
         p = np.nan_to_num([values.get(name, 0.0) for name in reduced_names])
         slope, constant = _tangent(reduction, places, others, p)
         out = Linearisation(reduced_names, out.slope @ slope, out.constant + out.slope @ constant)
@@ -92,9 +90,7 @@ def _reduce(
     reject_noise: bool,
 ) -> tuple[Solution, Sequence[RowCluster], Array | None]:
     names = linear.names
-    places = [names.index(name) for name in reduction.linear]
-    others = [i for i in range(len(names)) if i not in places]
-    reduced_names = (*(names[i] for i in others), *reduction.parameters)
+    places, others, reduced_names = _partition(reduction, names)
     x = np.nan_to_num(linear.value)
     p = np.concatenate((x[others], reduction.start(x[places])))
     # The step needs only the sum over clusters; the scatter is computed at the end.
@@ -114,6 +110,15 @@ def _reduce(
     transformed = _transformed(clusters, change)
     moment = None if noise is None else change.T @ noise @ change
     return solve(reduced_names, transformed, moment, reject_noise), transformed, moment
+
+
+def _partition(
+    reduction: ParameterReduction, names: Sequence[str]
+) -> tuple[list[int], list[int], tuple[str, ...]]:
+    """Return the places in `names` of the reduced unknowns and of the others, and the new names."""
+    places = [names.index(name) for name in reduction.linear]
+    others = [i for i in range(len(names)) if i not in places]
+    return places, others, (*(names[i] for i in others), *reduction.parameters)
 
 
 def _transform(
