@@ -16,9 +16,9 @@ from analysis.trace.finding import Finding, has_tied_rival, remainders
 from analysis.trace.judge import gates
 from analysis.trace.judge.curves import CurveRange
 from analysis.trace.result import CONFOUNDED, EXPLAINED, UNEXPLAINED
-from analysis.trace.search.confounders import act_at_one_joint
 from analysis.trace.search.hypothesis import (
     Hypothesis,
+    act_at_one_joint,
     law_of,
     may_grow,
     removes_too_little,

@@ -115,7 +115,7 @@ def judge_effects(
         removes = removed.share >= TRACE.least_removed and not disturbed
         significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown_size else "")
         rival_words = rivals.rivals_in_words([*inseparable, *others])
-        rival_words += rivals.composites_in_words(hypotheses, winner, used, tie_test)
+        rival_words += rivals.pair_in_words(hypotheses, winner, used, tie_test)
         gates = (
             Gate(REMOVES, removes, held_out.removal_in_words(removed, disturbed)),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),

@@ -21,7 +21,6 @@ from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
 from analysis.trace.result import JudgedEffect, Rival
-from analysis.trace.search import confounders
 from analysis.trace.search.exact_fit import ExactFit, over_amplified_noise
 from analysis.trace.search.hypothesis import (
     Hypothesis,
@@ -61,7 +60,7 @@ def rivals_of(
     )
     out: list[Rival] = []
     richer: list[Rival] = []
-    for fitted, rival_term in hypotheses.replacements(winner, used):
+    for fitted, (rival_term,) in hypotheses.replacements(winner, used):
         other = effect_in(rival_term)
         same_law = of_one_law(judged_effect, other)
         hypothesis = _over_its_noise(train_data, fitted)
@@ -98,12 +97,13 @@ def rivals_of(
             out.append(rival)
         elif tied:
             richer.append(rival)
-    for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
-        moved = moved_parameter(train_data, winner, composite)
-        # One effect is the simpler explanation, unless the records prefer two.
-        if moved and cost(composite, holdout_data) < cost(winner, holdout_data):
-            ratios = ratio, training_test.ratio(composite.fit.residual)
-            one, two = (_rival(effect_in(u), *ratios, True) for u in composite.effects[-2:])
+    least = cost(winner, holdout_data)
+    for with_pair, ratio, effects in _tied_pairs(hypotheses, winner, used, held_out_test):
+        moved = moved_parameter(train_data, winner, with_pair)
+        # One effect is the simpler explanation, unless training and held-out rows prefer two.
+        if moved and cost(with_pair, holdout_data) < least:
+            ratios = ratio, training_test.ratio(with_pair.fit.residual)
+            one, two = (_rival(effect_in(u), *ratios, True) for u in effects)
             out.append(replace(one, moved=moved, beside=two))
     if any(rival.tied for rival in out):
         out += richer
@@ -262,7 +262,7 @@ def _equal_with_more_numbers(
     Over a short arc a spring fits as well as an inclination, with another weight.
     """
     best = held_out_residual(holdout_data, winner.fit)
-    for hypothesis, rival in hypotheses.replacements(winner, used):
+    for hypothesis, (rival,) in hypotheses.replacements(winner, used):
         other = effect_in(rival)
         richer = hypothesis.size[0] == winner.size[0] and hypothesis.size[1] > winner.size[1]
         if not richer or other.free or of_one_law(effect_in(used), other):
@@ -305,32 +305,30 @@ def _law_parameters(rig: Rig, law: str) -> set[str]:
     return {c.parameter for term in terms for c in term.coefficients(rig)}
 
 
-def _tied_composites(
+def _tied_pairs(
     hypotheses: HypothesisSet, winner: Hypothesis, used: Used, held_out_test: TieTest
-) -> Iterator[tuple[Hypothesis, float]]:
-    """Yield the sets with two effects in the place of one that leave as little in held-out rows.
+) -> list[tuple[Hypothesis, float, tuple[Used, Used]]]:
+    """Return the sets with two effects in the place of one that leave as little in held-out rows.
 
-    From levels of friction by direction one level and an offset torque differ by the lever arm
-    only. The ratio yielded is that of `TieTest`; the two effects are the last of the set's.
+    Each with its ratio of `TieTest` and the two effects, the set that costs least first.
     """
-    for effects in confounders.composites(hypotheses.train_data, hypotheses.effects, winner, used):
-        composite = hypotheses.refined(effects)
-        if hypotheses.physical_problem(composite):
-            continue
-        residual = held_out_residual(held_out_test.data, composite.fit)
-        if held_out_test.ties(residual, TRACE.tie_ratio):
-            yield composite, held_out_test.ratio(residual)
+    out = []
+    for pair, (first, second) in hypotheses.replacements(winner, used, by=2):
+        residual = held_out_residual(held_out_test.data, pair.fit)
+        if held_out_test.ties(residual, TRACE.tie_ratio) and not hypotheses.physical_problem(pair):
+            out.append((pair, held_out_test.ratio(residual), (first, second)))
+    return sorted(out, key=lambda tied: cost(tied[0], held_out_test.data))
 
 
-def composites_in_words(
+def pair_in_words(
     hypotheses: HypothesisSet, winner: Hypothesis, used: Used, held_out_test: TieTest
 ) -> str:
-    """Name two effects that together leave as little as one ('' if none do).
+    """Name the best two effects that together leave as little as one ('' if none do).
 
     They are no rival where no parameter changes with them, since one effect is simpler.
     """
-    for composite, ratio in _tied_composites(hypotheses, winner, used, held_out_test):
-        names = " and ".join(u.term.name for u in composite.effects[-2:])
+    for _, ratio, effects in _tied_pairs(hypotheses, winner, used, held_out_test)[:1]:
+        names = " and ".join(u.term.name for u in effects)
         return f"; {names} together would leave {ratio:.2f} times the held-out rms"
     return ""
 

@@ -88,7 +88,7 @@ def absorbed_effects(
     ]  # fmt: skip
     shape_by_effect = {
         effect_in(rival): rival.shape
-        for member in winner.effects for _, rival in hypotheses.replacements(winner, member)
+        for member in winner.effects for _, (rival,) in hypotheses.replacements(winner, member)
         if law_of(effect_in(rival)) == law_of(effect_in(member))
     }  # fmt: skip
     explanations = (smallest_effect(e, train_data.rig, shape_by_effect.get(e, ())) for e in further)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
+BENCH: Final = "bench"
 # Energy above noise, by equation, up to which a residual counts as noise.
 NoiseBand = Mapping[str, float]
 
@@ -63,6 +65,12 @@ def keys_of(effects: Iterable[Used]) -> frozenset[Key]:
 def may_grow(effects: Sequence[Used], by: int = 1) -> bool:
     """Return whether a set may have so many more effects of other names (`SEARCH.most_names`)."""
     return len({used.term.name for used in effects}) + by <= SEARCH.most_names
+
+
+def act_at_one_joint(effect: Effect, other: Effect) -> bool:
+    """Return whether two effects are at the same joint, or one of them is of the bench."""
+    places = {" ".join(e.where.split()[:2]) for e in (effect, other)}
+    return len({place for place in places if not place.startswith(BENCH)}) <= 1
 
 
 def law_of(effect: Effect) -> Key:

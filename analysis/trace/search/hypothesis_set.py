@@ -27,7 +27,6 @@ from analysis.trace.data.regression_data import (
     variant_columns,
 )
 from analysis.trace.search import linear_fit
-from analysis.trace.search.confounders import BENCH
 from analysis.trace.search.exact_fit import (
     ExactFit,
     fit_coefficients,
@@ -36,6 +35,7 @@ from analysis.trace.search.exact_fit import (
     rebased,
 )
 from analysis.trace.search.hypothesis import (
+    BENCH,
     Hypothesis,
     Key,
     effect_of,
@@ -164,14 +164,16 @@ class HypothesisSet:
         earlier = self.refined(effects)
         return earlier if earlier.fit.energy <= energy else self.refined_anew(effects)
 
-    def replacements(self, winner: Hypothesis, used: Used) -> Iterator[tuple[Hypothesis, Used]]:
-        """Yield the fitted sets with one other effect in the place of `used`, and that effect."""
+    def replacements(
+        self, winner: Hypothesis, used: Used, by: int = 1
+    ) -> Iterator[tuple[Hypothesis, list[Used]]]:
+        """Yield the fitted sets with `by` other effects in the place of `used`, and these."""
         key = used.term.key
         others = winner.keys - {key}
         for hypothesis in self.fitted.values():
             fresh = [u for u in hypothesis.effects if u.term.key not in winner.keys]
-            if key not in hypothesis.keys and others <= hypothesis.keys and len(fresh) == 1:
-                yield hypothesis, fresh[0]
+            if key not in hypothesis.keys and others <= hypothesis.keys and len(fresh) == by:
+                yield hypothesis, fresh
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
         """Return the simplest physical set `among` those that leave about the least, else `empty`.
@@ -381,18 +383,45 @@ class HypothesisSet:
 
         `data` have the set in their model; `mask` (M,) is 0 for rows that do not count.
         """
-        # The set's shapes are fitted again beside a new effect: energy that they can remove
-        # themselves is no gain of that effect.
-        moves = (jacobian(self.train_data, current.fit, used)[1] for used in current.effects)
-        absorbing = replace(data, base=np.hstack((data.base, *moves)))
-        candidates = self._candidate_columns(absorbing, columns, mask)
-        r = current.fit.residual if mask is None else current.fit.residual * mask
-        r = r - candidates.basis @ (candidates.basis.T @ r)
+        candidates, r = self._beside(data, current, columns, mask)
         starts: dict[Key, tuple[Used, ...]] = {}
         for trial in linear_fit.sets_with_one_more(candidates, (), r):
             used = candidates.entries[trial.members[0]].used
             starts.setdefault(used.term.key, (*current.effects, used))
         return list(starts.values())
+
+    def pairs_like(
+        self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
+        effect: Key,
+    ) -> list[tuple[Used, ...]]:  # fmt: skip
+        """Return the set with the pairs of other candidates that leave no more than one effect.
+
+        `data` have the set in their model. The pairs and the effect (name, where) are compared by
+        their columns of first order, within the noise's band.
+        """
+        candidates, r = self._beside(data, current, columns)
+        alone = [m for m, e in enumerate(candidates.entries) if e.used.term.key == effect]
+        least = min((linear_fit.fit_members(candidates, [m], r).total for m in alone), default=0.0)
+        limit = least + sum(self.noise_band.values())
+        return [
+            (*current.effects, *(candidates.entries[m].used for m in pair.members))
+            for pair in linear_fit.best_pairs(candidates, r, [effect]) if pair.total < limit
+        ]  # fmt: skip
+
+    def _beside(
+        self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
+        mask: Array | None = None,
+    ) -> tuple[linear_fit.CandidateColumns, Array]:  # fmt: skip
+        """Return candidates and residual (M,), orthogonal to what the set can remove itself.
+
+        The set's shapes are fitted again beside a new effect: energy that they can remove is no
+        gain of that effect.
+        """
+        moves = (jacobian(self.train_data, current.fit, used)[1] for used in current.effects)
+        absorbing = replace(data, base=np.hstack((data.base, *moves)))
+        candidates = self._candidate_columns(absorbing, columns, mask)
+        r = current.fit.residual if mask is None else current.fit.residual * mask
+        return candidates, r - candidates.basis @ (candidates.basis.T @ r)
 
     def with_parts_beside(
         self, hypothesis: Hypothesis, equations: Collection[str] = ()

@@ -11,7 +11,7 @@ numbers comes first.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,9 +152,11 @@ def fit_members(candidates: CandidateColumns, members: Sequence[int], r: Array) 
 
 
 def sets_with_one_more(
-    candidates: CandidateColumns, members: Sequence[int], r: Array
+    candidates: CandidateColumns, members: Sequence[int], r: Array, left_out: Collection[Key] = ()
 ) -> list[LinearFit]:
     """Return the sets with one more entry that removes enough energy, the best set first.
+
+    Effects `left_out` (name, where) are not added.
 
     Sets that leave about the least come first, ordered by their count of free numbers; then the
     others by the energy that they leave.
@@ -164,7 +166,7 @@ def sets_with_one_more(
     for m in members:
         K, c = schur_complement(K, c, candidates.groups[m])
     g = gains(K, c, candidates.groups, candidates.visibility_limit)
-    taken = {candidates.entries[m].used.term.key for m in members}
+    taken = {candidates.entries[m].used.term.key for m in members} | set(left_out)
     trials: list[LinearFit] = []
     for i in _best_of_each(candidates, g):
         entry = candidates.entries[i]
@@ -206,18 +208,24 @@ def _best_of_each(candidates: CandidateColumns, g: Array) -> list[int]:
     return best
 
 
-def best_pairs(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
-    """Return the pairs of different candidates that leave least; each alone may remove little."""
+def best_pairs(
+    candidates: CandidateColumns, r: Array, left_out: Collection[Key] = ()
+) -> list[LinearFit]:
+    """Return the pairs of different candidates that leave least; each alone may remove little.
+
+    Effects `left_out` (name, where) are in none.
+    """
     g = gains(
         candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
     )
     best_variant: dict[Key, int] = {}
     for i in map(int, np.argsort(-g)[: 6 * SEARCH.pair_starts]):
-        if g[i] > 0:
-            best_variant.setdefault(candidates.entries[i].used.term.key, i)
+        key = candidates.entries[i].used.term.key
+        if g[i] > 0 and key not in left_out:
+            best_variant.setdefault(key, i)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(best_variant.values())[: SEARCH.pair_starts]:
-        for pair in sets_with_one_more(candidates, (first,), r)[:3]:
+        for pair in sets_with_one_more(candidates, (first,), r, left_out)[:3]:
             keys = frozenset(candidates.entries[m].used.term.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair

@@ -22,7 +22,7 @@ from analysis.regression import solve
 from analysis.trace import engine, finding, fitted_model, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import gates, held_out, inference, rivals
-from analysis.trace.search import confounders, exchanges, hypothesis_set, linear_fit
+from analysis.trace.search import exchanges, hypothesis_set, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
 
@@ -188,7 +188,7 @@ RULES: Final = (
          "a rival with further numbers must remove the price of each, whatever it means",
          ((rivals, "moved_parameter", lambda *_: None),)),
     Rule("two in place of one", "two effects are no rival of one",
-         ((rivals, "_tied_composites", lambda *_: iter(())),)),
+         ((rivals, "_tied_pairs", lambda *_: []),)),
     Rule("small effects", "an effect too small to be named widens no interval",
          ((fitted_model, "sets_with_small_effect", lambda *_: []),)),
     Rule("open parameters", "a richer name that leaves another parameter open is no rival",
@@ -225,8 +225,7 @@ RULES: Final = (
          ((judging, "exchanged", lambda _, now: now),
           (exchanges, "_with_another", lambda *_: []))),
     Rule("two for one", "no effect is exchanged for two that leave less",
-         ((exchanges, "composites", lambda *_: []),
-          (confounders, "composites", lambda *_: []))),
+         ((exchanges, "_with_two_for_one", lambda *_: []),)),
     Rule("fewer effects", "an effect is added where another set of fewer leaves as little",
          ((HypothesisSet, "_smaller_sets", lambda *_: []),)),
     Rule("parts of a law", "a breakaway and the level below it are tried one by one",
