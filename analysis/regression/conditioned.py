@@ -19,7 +19,9 @@ from rig.model.rig import Rig
 class ConditionedRecord:
     """A conditioned record: its filtered signals, its filters, the equations it is used for.
 
-    `run` numbers the run; `families` are the families of rows that are used, by default all.
+    `run` numbers the run; `families` are the families of rows that are used, by default all. An
+    average of repeats that moved differently has these as `repeats`: its rows are the mean of
+    theirs, since a product of averaged signals is not the average of the products.
     """
 
     run: int
@@ -27,6 +29,7 @@ class ConditionedRecord:
     signals: Signals
     filtering: Filtering
     families: tuple[str, ...] = tuple(FAMILIES)
+    repeats: tuple[ConditionedRecord, ...] = ()
 
     def condition_alike(self, rig: Rig, record: Record) -> ConditionedRecord:
         """Condition another record (averaged repeats, added noise) with this one's settings."""
@@ -42,6 +45,11 @@ class ConditionedRecord:
     def group(self) -> tuple[int, str]:
         """The (run, step) that the repeat belongs to."""
         return self.run, self.record.step
+
+    @property
+    def key(self) -> tuple[int, str, int]:
+        """The run, the step and the number of the repeat."""
+        return self.run, self.record.step, self.record.repeat
 
 
 def condition_runs(

@@ -8,6 +8,7 @@ why). Sum of columns times coefficients = right-hand side; units: torque_i [N m]
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -92,6 +93,22 @@ def in_common(rows: Rows, other: Rows) -> tuple[Indices | slice, Indices | slice
         return slice(None), slice(None)
     _, indices, others = np.intersect1d(rows.time, other.time, return_indices=True)
     return indices, others
+
+
+def mean_rows(repeats: Sequence[Mapping[str, Rows]]) -> dict[str, Rows]:
+    """Return the mean of the repeats' rows of each equation, at the instants that all have."""
+    out = {}
+    for name in repeats[0]:
+        parts = [rows[name] for rows in repeats if name in rows]
+        if len(parts) < len(repeats):
+            continue
+        time = functools.reduce(np.intersect1d, (rows.time for rows in parts))
+        parts = [rows.at(np.isin(rows.time, time)) for rows in parts]
+        names = tuple(dict.fromkeys(n for rows in parts for n in rows.names))
+        matrix = np.mean([matrix_of(rows, names) for rows in parts], axis=0)
+        rhs = np.mean([rows.rhs for rows in parts], axis=0)
+        out[name] = Rows(name, names, matrix, rhs, time, max(rows.masked for rows in parts))
+    return out
 
 
 def default_filtering(record: Record) -> Filtering:

@@ -180,6 +180,11 @@ class DataSettings:
     """Rms difference of a joint's position between repeats over its standard deviation, from which
     they are no repeats of one motion (tuned: recordings that start 0.4 s apart made clean benches
     `unexplained` on a plant written apart from the study's)."""
+    averaging_error: float = 0.1
+    """Rms difference between the residual of averaged repeats and the average of their residuals,
+    over their noise, from which rows are averaged in place of channels (tuned: at most 0.003 where
+    the valves are driven alike, 4 to 7 in position loops that oscillate, which made clean benches
+    `unexplained` on a plant written apart from the study's)."""
     seen_motion: float = 20.0
     """Least standard deviation of a position over its sensor's noise, to be compared between
     repeats (arithmetic)."""

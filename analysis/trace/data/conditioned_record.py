@@ -19,6 +19,7 @@ from analysis.regression.rows import (
     assembled,
     default_filtering,
     low_passed,
+    mean_rows,
     parameters_of,
     places_of,
     record_rows,
@@ -108,6 +109,8 @@ def acting_on(rig: Rig, terms: Iterable[Used], family: str, cache: RowCache) -> 
 
 def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.regression.rows.record_rows`)."""
+    if conditioned.repeats:
+        return mean_rows([model_rows(rig, terms, repeat) for repeat in conditioned.repeats])
     return record_rows(
         rig, ordered(terms), conditioned.signals, conditioned.filtering, conditioned.families
     )
@@ -145,6 +148,9 @@ def shared_rows(
     The columns of an effect that changes no signal are filtered separately and appended to the rows
     of the other terms.
     """
+    if conditioned.repeats:
+        alike = (replace(r, families=conditioned.families) for r in conditioned.repeats)
+        return mean_rows([shared_rows(rig, terms, repeat, cache) for repeat in alike])
     visible = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
     out: dict[str, Rows] = {}
     for family in conditioned.families:
@@ -152,12 +158,12 @@ def shared_rows(
         appended = [u for u in acting if isinstance(u.term, Effect) and not changes_rows(u.term)]
         others = tuple(u for u in acting if u not in appended)
         one_family = replace(conditioned, families=(family,))
-        key = conditioned.group, family, others
+        key = conditioned.key, family, others
         # Signals depend only on the terms that change them, so that families of rows share them.
         changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
         prepared = partial(
             cache.signals.get,
-            (conditioned.group, changing),
+            (conditioned.key, changing),
             partial(prepared_signals, rig, changing, one_family),
         )
         common: dict[str, Rows] = cache.rows.get(
@@ -181,7 +187,7 @@ def _rows_of_family(
     (family,), filtering = conditioned.families, conditioned.filtering
     terms, signals = ordered(terms), prepared()
     parts = [_term_part(rig, u, conditioned, family, signals, cache) for u in terms]
-    key = conditioned.group, family
+    key = conditioned.key, family
     sides = cache.parts.get(key, signals, lambda x: right_parts(rig, x, filtering, family))
     return assembled(parameters_of(rig, terms, family), parts, sides, filtering)
 
@@ -190,7 +196,7 @@ def _term_part(
     rig: Rig, used: Used, conditioned: ConditionedRecord, family: str, signals: Signals,
     cache: RowCache,
 ) -> TermPart:  # fmt: skip
-    key, filtering = (conditioned.group, family, used), conditioned.filtering
+    key, filtering = (conditioned.key, family, used), conditioned.filtering
     part: TermPart = cache.parts.get(
         key, signals, lambda x: term_part(rig, used, x, filtering, family, conditioned.signals)
     )

@@ -2,7 +2,9 @@
 
 Repeats of one excitation (a group: run and step) are averaged channel by channel. The columns are
 those of the average; each repeat has its own residual. So 12 records of 10 s become a few thousand
-rows for the whole catalogue, and a sign flip costs one product.
+rows for the whole catalogue, and a sign flip costs one product. Where repeats move so differently
+that the rows of the averaged channels are not the average of their rows (a position loop near its
+limit of stability), their rows are averaged.
 Rows are divided by the noise floor of their group and equation, and multiplied by the root of the
 number of repeats: noise then adds 1 per row to a residual's energy, whatever unit and repeats.
 """
@@ -20,9 +22,9 @@ from numpy.typing import NDArray
 from analysis.effects.base import Evidence
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
-from analysis.regression.rows import Rows, in_common, matrix_of
+from analysis.regression.rows import Rows, in_common, matrix_of, mean_rows
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import FAMILIES, Used, family_of
+from analysis.terms.base import FAMILIES, Used, family_of, joint_of
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.conditioned_record import (
     acting_on,
@@ -35,7 +37,7 @@ from analysis.trace.data.conditioned_record import (
     shared_rows,
 )
 from analysis.trace.data.noise_floor import Floor, Group, floors
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import DATA, TRACE
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -162,6 +164,32 @@ def _averaged_record(rig: Rig, repeats: Sequence[ConditionedRecord]) -> Conditio
     return replace(average, signals=signals)
 
 
+def _average(
+    rig: Rig, terms: Sequence[Used], repeats: Sequence[ConditionedRecord],
+    of_repeats: Sequence[Mapping[str, Rows]], beta: Mapping[str, float],
+    noise: Mapping[str, float],
+) -> tuple[ConditionedRecord, dict[str, Rows]]:  # fmt: skip
+    """Return the average of repeats, and its rows under a model.
+
+    They are the rows of the averaged channels, or the mean of the repeats' rows (`of_repeats`)
+    where the residuals of an equation differ by more than `DATA.averaging_error` times the noise of
+    the mean. Rows weighted by speed do not count: the noise of a speed alone changes its weight.
+    `noise` [SI] is that of one record, by equation.
+    """
+    average = _averaged_record(rig, repeats)
+    of_average, mean = model_rows(rig, terms, average), mean_rows(of_repeats)
+    in_motion = average.filtering.in_motion
+    weighted = {e for e in mean if e.startswith("torque") and joint_of(e) in in_motion}
+    for name in of_average.keys() & mean.keys() - weighted:
+        rows, others = of_average[name], mean[name]
+        in_rows, in_others = in_common(rows, others)
+        change = row_residual(rows, beta)[in_rows] - row_residual(others, beta)[in_others]
+        limit = DATA.averaging_error * noise[name] / np.sqrt(len(repeats))
+        if len(change) and np.sqrt(np.mean(change**2)) > limit:
+            return replace(average, repeats=tuple(repeats)), mean
+    return average, of_average
+
+
 def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, float]:
     """Return the unweighted least-squares coefficients of all rows, the shortest if not unique."""
     out: dict[str, float] = {}
@@ -195,30 +223,37 @@ def regression_data(
     groups: dict[Group, list[int]] = {}
     for k, conditioned in enumerate(members):
         groups.setdefault(conditioned.group, []).append(k)
-    averages = [_averaged_record(rig, [members[k] for k in repeats]) for repeats in groups.values()]
-    mean_rows = [model_rows(rig, terms, conditioned) for conditioned in averages]
-    names = tuple(dict.fromkeys(n for rows in mean_rows for r in rows.values() for n in r.names))
     noise = {(f.group, f.equation): f.noise for f in noise_floors}
+    averages, averaged_rows = [], []
+    for group, numbers in groups.items():
+        repeats = [members[k] for k in numbers]
+        of_repeats = [rows_of_records[k] for k in numbers]
+        of_group = {equation: value for (g, equation), value in noise.items() if g == group}
+        average, rows = _average(rig, terms, repeats, of_repeats, beta, of_group)
+        averages.append(average)
+        averaged_rows.append(rows)
+    all_rows = [r for rows in averaged_rows for r in rows.values()]
+    names = tuple(dict.fromkeys(name for r in all_rows for name in r.names))
     most_repeats = max(map(len, groups.values()))
     base, residual, segments, start = [], [], [], 0
     rows_of_groups: list[dict[str, Rows]] = [{} for _ in averages]
-    for conditioned, rows, kept in zip(averages, mean_rows, rows_of_groups, strict=True):
-        repeats = [rows_of_records[k] for k in groups[conditioned.group]]
+    for conditioned, rows, kept in zip(averages, averaged_rows, rows_of_groups, strict=True):
+        of_repeats = [rows_of_records[k] for k in groups[conditioned.group]]
         for equation, mean in rows.items():
             time = mean.time
-            for record in repeats:
+            for record in of_repeats:
                 time = np.intersect1d(time, record[equation].time)
             if len(time) < 5:
                 continue
             kept[equation] = _rows_at(mean, time)
             sigma = max(noise[conditioned.group, equation], 1e-30)
-            base.append(matrix_of(kept[equation], names) * np.sqrt(len(repeats)) / sigma)
+            base.append(matrix_of(kept[equation], names) * np.sqrt(len(of_repeats)) / sigma)
             residuals = np.full((most_repeats, len(time)), np.nan)
-            for k, record in enumerate(repeats):
+            for k, record in enumerate(of_repeats):
                 residuals[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
             residual.append(residuals)
             where = slice(start, start := start + len(time))
-            segments.append(Segment(conditioned.group, equation, where, sigma, len(repeats)))
+            segments.append(Segment(conditioned.group, equation, where, sigma, len(of_repeats)))
     if not segments:
         raise InputError(
             "the records are too short: no rows are left after filter edges; take longer records"
@@ -306,7 +341,7 @@ def candidate_columns(
     """
     if is_hidden_by_lock(used.term, conditioned):
         return {}
-    if not changes_rows(used.term):
+    if not changes_rows(used.term) and not conditioned.repeats:
         return added_columns(data.rig, conditioned, lambda: prepared, rows, used, data.cache)
     families = tuple(f for f in conditioned.families if acting_on(data.rig, (used,), f, data.cache))
     parameters = [c.parameter for c in used.term.coefficients(data.rig)]

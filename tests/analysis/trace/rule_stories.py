@@ -33,6 +33,7 @@ from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis import small_bench
+from tests.analysis.effects import one_joint
 from tests.analysis.trace import foreign_bench, gate_cases
 from tests.analysis.trace.gate_cases import LEAK, Searched, gate, joined, with_residual
 from tests.analysis.trace.hidden import (
@@ -627,6 +628,27 @@ def with_other_volumes(rig: Rig, joint: int, cap: float, rod: float) -> tuple[Ru
     return recorded(1, 0.025, 3), recorded(2, 0.018, 2)
 
 
+def a_clean_bench_in_a_loop_that_oscillates_is_clean(b: Benches) -> None:
+    """A position loop swings at 12 Hz, in each repeat in another phase.
+
+    The average of the channels is of no motion: their products leave seven times the noise.
+    """
+
+    def swinging(seed: int, rms: float, repeats: int) -> Run:
+        records = []
+        for k in range(1, repeats + 1):
+            swing = [0.012, 2.0 * np.pi * 12.0, 2.0 * np.pi * k / repeats]
+            wave = np.vstack((one_joint.excitation(rms, seed), swing))
+            clean = foreign_bench.channels(b.rig, foreign_bench.Hidden(), wave, 8.0)
+            record = one_joint.record(b.rig, clean, f"step1_r{k}", 1000 * seed + k)
+            records.append(replace(record, repeat=k, period=0))
+        return Run(b.rig, tuple(records), f"swinging, seed {seed}")
+
+    runs = b.kept("swinging", lambda: (swinging(1, 0.03, 3), swinging(2, 0.021, 2)))
+    result = b.traced(runs, "internal_leakage", "spool_lag")
+    assert (result.verdict, result.effects) == ("clean", ())
+
+
 STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_names_nothing, ("p always 0", "no family")),
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
@@ -669,6 +691,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first, ("tied sets",)),
     (what_a_cubic_spring_adds_is_no_error_of_an_offsets_form, ("exact forms",)),
     (noise_above_the_stated_one_is_noise_where_nothing_repeats, ("unstated noise",)),
+    (a_clean_bench_in_a_loop_that_oscillates_is_clean, ("repeats that differ",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
     (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),
     (a_breakaway_that_motion_hides_is_named_as_all_rows_show_it, ("force at standstill",)),

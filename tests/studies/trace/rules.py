@@ -217,6 +217,8 @@ RULES: Final = (
          ((gates, "form_share", lambda *_: TRACE.held_out_share),)),
     Rule("tolerances", "areas, volumes and pin distances are taken as the rig file states them",
          ((engine, "geometry_for_smaller_set", lambda *_: None),)),
+    Rule("repeats that differ", "channels of repeats are averaged, however their motions differ",
+         ((DATA, "averaging_error", math.inf),), refits=True),
     Rule("unstated noise", "where nothing repeats, the noise is the stated one",
          ((engine, "unstated_noise", lambda *_: None),)),
     Rule("other starts", "a search that explains nothing does not begin with another effect",
