@@ -59,8 +59,9 @@ def geometry_for_smaller_set(
     changes = residual_changes(data, winner.fit, numbers)
     limit = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
     best: tuple[Hypothesis, Array] | None = None
-    for size in range(1, len(winner.effects)):
-        for effects in itertools.combinations(winner.effects, size):
+    largest = winner if explained else min(hypotheses.fitted.values(), key=lambda o: o.total)
+    for size in range(1, len(largest.effects)):
+        for effects in itertools.combinations(largest.effects, size):
             hypotheses.refined(effects)  # some of them may stand for the geometry
     for hypothesis in (hypotheses.empty, *hypotheses.fitted.values()):
         if explained and hypothesis.size >= winner.size:
