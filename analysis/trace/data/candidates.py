@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from analysis.effects.base import Effect, Evidence, shapes_of
+from analysis.effects.base import Effect, Evidence, Shape, shapes_of
 from analysis.terms import known
 from analysis.terms.base import Used
 from analysis.trace.settings import DATA
@@ -88,9 +88,17 @@ def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
 
 
 def details(rig: Rig, used: Sequence[Used]) -> int:
-    """Return the number of details that the forms of effects have."""
-    return sum(
-        shape.detail and shape.is_present(value) and not shape.fixed
-        for u in used
-        for shape, value in zip(shapes_of(rig, u), u.shape, strict=True)
-    )
+    """Return the number of fitted details that the forms of effects have."""
+    return sum(not shape.fixed for shape in _present_details(rig, used))
+
+
+def fixed_details(rig: Rig, used: Sequence[Used]) -> int:
+    """Return the number of details of fixed value that the forms of effects have."""
+    return sum(shape.fixed for shape in _present_details(rig, used))
+
+
+def _present_details(rig: Rig, used: Sequence[Used]) -> Iterator[Shape]:
+    for u in used:
+        for shape, value in zip(shapes_of(rig, u), u.shape, strict=True):
+            if shape.detail and shape.is_present(value):
+                yield shape

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shapes_of
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces, segments
 from analysis.identify.geometry import wider
@@ -125,12 +125,23 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         excess = max(float(residual @ residual) - len(residual), TRACE.form_noise)
         share = excess / (excess + max(0.0, other.energy - fit.energy))
         incomparable = _incomparable_coefficients(rig, fit, other)
-        for name, value in other.beta.items():
+        own = {**fit.beta, **_fitted_shapes(rig, fit)}
+        for name, value in {**other.beta, **_fitted_shapes(rig, other)}.items():
             if name in incomparable:
                 continue
-            shift = value - fit.beta.get(name, value)
+            shift = value - own.get(name, value)
             squares[name] = squares.get(name, 0.0) + share * shift**2
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
+
+
+def _fitted_shapes(rig: Rig, fit: ExactFit) -> dict[str, float]:
+    """Return the shapes of a fit's effects that are present and not fixed, by name."""
+    return {
+        shape.parameter: value
+        for used in fit.terms
+        for shape, value in zip(shapes_of(rig, used), used.shape, strict=True)
+        if shape.is_present(value) and not shape.fixed
+    }
 
 
 def _incomparable_coefficients(rig: Rig, fit: ExactFit, other: ExactFit) -> set[str]:

@@ -21,7 +21,7 @@ from analysis.effects.base import Effect, Shape, open_shapes, shape_values, shap
 from analysis.identify import checks as ck
 from analysis.simulation.model import Estimate
 from analysis.terms.base import Term, Used
-from analysis.trace.data.candidates import at_start, effect_in, shape_grid
+from analysis.trace.data.candidates import at_start, effect_in, fixed_details, shape_grid
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.nuisance_terms import temperature_terms
 from analysis.trace.data.regression_data import (
@@ -207,9 +207,10 @@ def _detail_at_bound(shape: Shape, value: float) -> bool:
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, shown_first: bool) -> ExactFit:
     """Return the fit with the term number `place` in the form that leaves least.
 
-    Each further free number of a form must be significant (`TRACE.standard_errors`): an exponent
-    that is not would widen the interval of the size tenfold. A form within its physical bounds is
-    preferred to one at them, and with `shown_first` one with which the records show every effect.
+    Each further free number or fixed detail of a form must be significant
+    (`TRACE.standard_errors`): an exponent that is not would widen the interval of the size tenfold.
+    A form within its physical bounds is preferred to one at them, and with `shown_first` one with
+    which the records show every effect.
     """
     price = TRACE.standard_errors**2
 
@@ -217,7 +218,8 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, shown_first: 
         used = model.terms[place]
         hidden = shown_first and not _is_shown(data, model)
         outside = bool(effect_in(used).outside(data.rig, used.shape))
-        return hidden, outside, model.energy + price * len(_free_shapes(data, model.terms))
+        numbers = len(_free_shapes(data, model.terms)) + fixed_details(data.rig, model.terms)
+        return hidden, outside, model.energy + price * numbers
 
     while True:
         used = fit.terms[place]
