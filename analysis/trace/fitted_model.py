@@ -38,7 +38,12 @@ from analysis.trace.finding import Finding
 from analysis.trace.in_motion import equations_above_noise
 from analysis.trace.judge.held_out import rms_of
 from analysis.trace.judge.inference import with_form_error
-from analysis.trace.judge.rivals import alternatives_of, deviations, errors_by_alternatives
+from analysis.trace.judge.rivals import (
+    alternatives_of,
+    deviations,
+    errors_by_alternatives,
+    shape_errors_by_alternatives,
+)
 from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
 from analysis.trace.next_experiment.detection_limits import (
     AbsorbedEffects,
@@ -108,6 +113,8 @@ def model_with_effects(
         alternatives.append((_fitted_to_choosing_rows(finding, winner, model), ""))
     by_alternatives = errors_by_alternatives(model, alternatives)
     model = with_errors(model, by_alternatives)
+    other_sets = [hypothesis for hypothesis, _ in others]
+    by_alternatives |= shape_errors_by_alternatives(rows.train.rig, finding.winner, other_sets)
     effects = tuple(
         with_shots(_with_further_errors(f, from_tolerances, by_alternatives), shots)
         for f in finding.named

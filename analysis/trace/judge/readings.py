@@ -98,13 +98,16 @@ def loss_in_deviations(restricted: Array, richer: Array) -> float:
     return float(restricted @ change) / size if size > 0 else 0.0
 
 
-def loses_by_restriction(restricted: Array, richer: Array) -> bool:
+def loses_by_restriction(
+    restricted: Array, richer: Array, deviations: float = TRACE.standard_errors
+) -> bool:
     """Return whether a restricted model loses more than noise to the richer one, and leaves more.
 
-    Both residuals (M,) are those of `loss_in_deviations`. Where an unknown cause changes the rows
-    along d, the loss alone is large for either model: the richer one must have the smaller energy.
+    The loss must exceed `deviations` times its standard deviation by noise. Both residuals (M,) are
+    those of `loss_in_deviations`. Where an unknown cause changes the rows along d, the loss alone
+    is large for either model: the richer one must have the smaller energy.
     """
-    lost = loss_in_deviations(restricted, richer) > TRACE.standard_errors
+    lost = loss_in_deviations(restricted, richer) > deviations
     return lost and float(richer @ richer) < float(restricted @ restricted)
 
 

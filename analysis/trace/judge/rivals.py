@@ -20,6 +20,7 @@ from analysis.trace.judge import held_out
 from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
+from analysis.trace.judge.scatter import fitted_shapes
 from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search.exact_fit import ExactFit, over_amplified_noise
 from analysis.trace.search.hypothesis import (
@@ -296,6 +297,23 @@ def errors_by_alternatives(
         )  # fmt: skip
         if estimate.identified and added_variance > 0.0:
             errors[name] = math.sqrt(added_variance / (len(alternatives) + 1))
+    return errors
+
+
+def shape_errors_by_alternatives(
+    rig: Rig, winner: Hypothesis, alternatives: Sequence[Hypothesis]
+) -> dict[str, float]:
+    """Return the further standard error of the winner's shapes by other sets, by name.
+
+    It is the root of the mean square of the shifts, as in `errors_by_alternatives`. Sets without
+    the shape count with none.
+    """
+    others = [fitted_shapes(rig, other.fit) for other in alternatives]
+    errors = {}
+    for name, value in fitted_shapes(rig, winner.fit).items():
+        squares = sum((shapes.get(name, value) - value) ** 2 for shapes in others)
+        if squares > 0.0:
+            errors[name] = math.sqrt(squares / (len(others) + 1))
     return errors
 
 

@@ -125,8 +125,8 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         excess = max(float(residual @ residual) - len(residual), TRACE.form_noise)
         share = excess / (excess + max(0.0, other.energy - fit.energy))
         incomparable = _incomparable_coefficients(rig, fit, other)
-        own = {**fit.beta, **_fitted_shapes(rig, fit)}
-        for name, value in {**other.beta, **_fitted_shapes(rig, other)}.items():
+        own = {**fit.beta, **fitted_shapes(rig, fit)}
+        for name, value in {**other.beta, **fitted_shapes(rig, other)}.items():
             if name in incomparable:
                 continue
             shift = value - own.get(name, value)
@@ -134,7 +134,7 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
 
 
-def _fitted_shapes(rig: Rig, fit: ExactFit) -> dict[str, float]:
+def fitted_shapes(rig: Rig, fit: ExactFit) -> dict[str, float]:
     """Return the shapes of a fit's effects that are present and not fixed, by name."""
     return {
         shape.parameter: value
