@@ -41,6 +41,8 @@ class TraceSettings:
     decisive_ratio: float = 0.95
     """Held-out rms of a rival over that of the best set: a rival with less is tied whatever its
     training rms (tuned)."""
+    harm_deviations: float = 4.0
+    harm_share: float = 0.05
     harm_ratio: float = 1.2
     """Largest energy above noise of an equation with an effect over that under the baseline, beyond
     which the effect is refused (tuned)."""

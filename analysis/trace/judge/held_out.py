@@ -273,15 +273,21 @@ def disturbed_equations(
 ) -> list[str]:
     """Return the equations in which an effect leaves more energy than the baseline.
 
-    It must be more by the noise's band and by `TRACE.harm_ratio`, and more than without the effect.
+    It must be more by what noise may add (`TRACE.harm_deviations`) and by `TRACE.harm_ratio`, more
+    than without the effect, and more than `TRACE.harm_share` of what the set removes elsewhere.
     """
     before = {e: max(0.0, v) for e, v in hypotheses.empty.excess_energy.items()}
+    removed = sum(max(0.0, v - winner.excess_energy[e]) for e, v in before.items())
+
+    def allowed(equation: str) -> float:
+        noise = math.sqrt(2.0 * hypotheses.train_data.row_counts[equation])
+        least = max(TRACE.harm_deviations * noise, TRACE.harm_share * removed)
+        return before[equation] + min(hypotheses.noise_band[equation], least)
+
     return [
         e
         for e, energy in winner.excess_energy.items()
-        if energy > before[e] + hypotheses.noise_band[e]
-        and energy > TRACE.harm_ratio * before[e]
-        and energy > alternative.excess_energy[e]
+        if energy > max(allowed(e), TRACE.harm_ratio * before[e], alternative.excess_energy[e])
     ]
 
 

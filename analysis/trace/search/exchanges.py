@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import complexity
+from analysis.trace.search import linear_fit
 from analysis.trace.search.exact_fit import rebased
 from analysis.trace.search.hypothesis import Hypothesis, keys_of, may_grow
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -37,26 +36,35 @@ def _with_two_for_one(
 ) -> list[Hypothesis]:
     """Return the sets with two other effects in the place of one, the best by their columns.
 
-    Columns under the baseline choose the candidates: to compute them anew for each set takes long.
+    The pairs and the effect are compared by their columns of first order, under the baseline: to
+    compute them anew for each set takes long. Pairs that leave more than the effect by more than
+    the noise's band, or whose numbers cost more than all that is left, are left out.
     """
-    others = current.without(used)
+    others, key = current.without(used), used.term.key
     if not may_grow(others, by=2):
         return []
     taken = keys_of(others)
     columns = [c for c in hypotheses.columns if c.used.term.key not in taken]
     smaller = hypotheses.refined(others)
     data = rebased(hypotheses.train_data, smaller.fit)
-    pairs = hypotheses.pairs_like(data, smaller, columns, used.term.key)
+    candidates, r = hypotheses.candidates_beside(data, smaller, columns)
+    alone = [m for m, e in enumerate(candidates.entries) if e.used.term.key == key]
+    least = min((linear_fit.fit_members(candidates, [m], r).total for m in alone), default=0.0)
+    limit = least + sum(hypotheses.noise_band.values())
+    pairs = [
+        *linear_fit.best_pairs(candidates, r, [key])[: SEARCH.replacements],
+        *linear_fit.pairs_of_chambers(candidates, r, [key])[:1],
+    ]
+    sets = [
+        (*smaller.effects, *(candidates.entries[m].used for m in pair.members))
+        for pair in pairs if pair.total < limit
+    ]  # fmt: skip
+    affordable = current.total + SEARCH.number_price * sum(current.size)
     return [
         hypotheses.refined(effects, current)
-        for effects in pairs[: SEARCH.replacements]
-        if _price(hypotheses, effects) <= sum(current.size) * SEARCH.number_price + current.total
+        for effects in sets
+        if SEARCH.number_price * sum(complexity(data.rig, effects)) <= affordable
     ]
-
-
-def _price(hypotheses: HypothesisSet, effects: Sequence[Used]) -> float:
-    """Return the price of a set's effects and free numbers, as an energy."""
-    return SEARCH.number_price * sum(complexity(hypotheses.train_data.rig, effects))
 
 
 def _with_another(hypotheses: HypothesisSet, current: Hypothesis) -> list[Hypothesis]:

@@ -229,12 +229,15 @@ class HypothesisSet:
             return current
         pairs = [
             self.refined([candidates.entries[m].used for m in pair.members])
-            for pair in linear_fit.best_pairs(candidates, r)
+            for pair in (
+                *linear_fit.best_pairs(candidates, r),
+                *linear_fit.pairs_of_chambers(candidates, r),
+            )
         ]
         if self.within_form_tolerance(current):
             others = [o for o in pairs if not current.keys & o.keys]
             far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]
-            return self.completed_to_noise(self.prune(self.best([current, *far])))
+            return self.completed_to_noise(self.prune(self.best([current, *far])), pairs)
         current = self._grown(self.prune(self.best([self.empty, *singles, *pairs])))
         if self.within_form_tolerance(current):
             return current
@@ -286,14 +289,16 @@ class HypothesisSet:
         allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band[equation]
         return energy <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
-    def completed_to_noise(self, current: Hypothesis) -> Hypothesis:
-        """Return a set within form error, with one more effect if that leaves only noise.
+    def completed_to_noise(
+        self, current: Hypothesis, others: Sequence[Hypothesis] = ()
+    ) -> Hypothesis:
+        """Return a set within form error, or a larger or another one if that leaves noise alone.
 
         An effect that leaves less, but more than noise, would only fit the form error.
         """
         if self.within_noise(current) or not may_grow(current.effects):
             return current
-        larger = self.extensions(current)
+        larger = [*self.extensions(current), *others]
         best = self.best([o for o in larger if self.within_noise(o)])
         return best if best.effects and self.prune(best).keys == best.keys else current
 
@@ -383,32 +388,14 @@ class HypothesisSet:
 
         `data` have the set in their model; `mask` (M,) is 0 for rows that do not count.
         """
-        candidates, r = self._beside(data, current, columns, mask)
+        candidates, r = self.candidates_beside(data, current, columns, mask)
         starts: dict[Key, tuple[Used, ...]] = {}
         for trial in linear_fit.sets_with_one_more(candidates, (), r):
             used = candidates.entries[trial.members[0]].used
             starts.setdefault(used.term.key, (*current.effects, used))
         return list(starts.values())
 
-    def pairs_like(
-        self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
-        effect: Key,
-    ) -> list[tuple[Used, ...]]:  # fmt: skip
-        """Return the set with the pairs of other candidates that leave no more than one effect.
-
-        `data` have the set in their model. The pairs and the effect (name, where) are compared by
-        their columns of first order, within the noise's band.
-        """
-        candidates, r = self._beside(data, current, columns)
-        alone = [m for m, e in enumerate(candidates.entries) if e.used.term.key == effect]
-        least = min((linear_fit.fit_members(candidates, [m], r).total for m in alone), default=0.0)
-        limit = least + sum(self.noise_band.values())
-        return [
-            (*current.effects, *(candidates.entries[m].used for m in pair.members))
-            for pair in linear_fit.best_pairs(candidates, r, [effect]) if pair.total < limit
-        ]  # fmt: skip
-
-    def _beside(
+    def candidates_beside(
         self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
         mask: Array | None = None,
     ) -> tuple[linear_fit.CandidateColumns, Array]:  # fmt: skip

@@ -230,3 +230,27 @@ def best_pairs(
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
     return sorted(pairs.values(), key=lambda p: p.total)[: SEARCH.refined_pairs]
+
+
+def pairs_of_chambers(
+    candidates: CandidateColumns, r: Array, left_out: Collection[Key] = ()
+) -> list[LinearFit]:
+    """Return the pairs of one effect at both chambers of a joint, those that leave least first.
+
+    Both pipes longer than stated, or both pressures read against vacuum, are as likely as one, and
+    details of form that the columns lack may hide each alone. Effects `left_out` are in none.
+    """
+    g = gains(
+        candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
+    )
+    best: dict[Key, int] = {}
+    for i in map(int, np.argsort(-g)):
+        key = candidates.entries[i].used.term.key
+        if g[i] > 0 and key not in left_out:
+            best.setdefault(key, i)
+    others = {(name, where): (name, where.removesuffix("cap") + "rod") for name, where in best}
+    pairs = [
+        fit_members(candidates, (best[cap], best[rod]), r)
+        for cap, rod in others.items() if cap[1].endswith(" cap") and rod in best
+    ]  # fmt: skip
+    return sorted(pairs, key=lambda pair: pair.total)[: SEARCH.refined_pairs]
