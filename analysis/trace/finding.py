@@ -46,12 +46,19 @@ def remainders(
     listed = {r.equation for r in out}
     counts = hypotheses.train_data.row_counts
     for e, energy in winner.excess_energy.items():
-        share = energy / max(hypotheses.empty.excess_energy[e], 1e-30)
+        before = hypotheses.empty.excess_energy[e]
+        share = energy / max(before, 1e-30)
         visible = energy > TRACE.visible_deviations * np.sqrt(2 * counts[e])
         if winner.effects and e not in listed and visible and share > TRACE.visible_share:
             form_share = gates.form_share(holdout_data.rig, effects_among(winner.effects), e)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            out.append(Remainder(e, words + tolerance_words(share, form_share), False))
+            words += tolerance_words(share, form_share)
+            if energy > before:
+                times = plain(float(np.sqrt(1.0 + energy / counts[e])), 3)
+                words = (
+                    f"the repeatable rms is {times} times the noise, more than under the baseline"
+                )
+            out.append(Remainder(e, words, False))
     return tuple(out)
 
 

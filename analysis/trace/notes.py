@@ -203,10 +203,12 @@ def rival_notes(named: Sequence[JudgedEffect]) -> list[str]:
         if not changed:
             continue
         parameter, change, rival = max(changed, key=lambda entry: abs(entry[1]))
-        size = f"{plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
+        size = f"be {plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
+        if abs(change) >= 1.0:
+            size = "hardly be determined"
         out.append(
             f"with {rival.name} at {rival.location} in place of {effect.name}, {parameter} would "
-            f"be {size}: its interval is wide enough for either cause"
+            f"{size}: its interval is wider for it"
         )
     return out
 

@@ -176,6 +176,6 @@ def _motion_difference(rig: Rig, first: Record, other: Record) -> float:
         count = min(len(x), len(y))
         motion = float(np.std(x[:count]))
         if joint not in first.locked and motion > DATA.seen_motion * noise:
-            change = float(np.sqrt(np.mean((y[:count] - x[:count]) ** 2)))
+            change = float(np.std(y[:count] - x[:count]))
             largest = max(largest, change / motion)
     return largest
