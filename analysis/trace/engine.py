@@ -273,7 +273,9 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
         ),
         *phase_notes(finding.named, records.lines),
         *(rival_notes(finding.named) if finding.verdict == CONFOUNDED else ()),
-        *refitted_notes(winner.fit, fit_after, model),
+        *refitted_notes(
+            winner.fit, fit_after, model, held_out.oil_changes(rows.judging, winner.fit)
+        ),
         *(why for _, why in shared_parameters(winner, model).values()),
         *record_condition_notes(train_data, winner),
         *undetermined_notes(model, baseline, finding.rows.filtering.in_motion),

@@ -26,9 +26,10 @@ from rig.model.channels import place_in_words
 from rig.model.records import Run
 from rig.model.units import plain
 
-# Begins what a note says of a torque whose rests are not judged; the sentence refers to it.
 MOST_NUMBERS: Final = 3  # of a rig file, in a note
+# Begins what a note says of a torque whose rests are not judged; the sentence refers to it.
 WITHOUT_RESTS: Final = "judged without the samples at which the joint rests"
+OIL_WORDS: Final = {"Fv": "viscous friction", "b": "bulk modulus"}
 
 
 def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
@@ -149,16 +150,36 @@ def unseen_load_notes(train: Sequence[Run], unseen: Sequence[Run]) -> list[str]:
     ]
 
 
-def refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
-    """Name the parameters whose values in the stated errors were fitted to the judging rows."""
-    names = [n for n in refitted_names(fit, judged) if n in model.parameters]
-    if not names:
-        return []
-    return [
-        f"the held-out records show {', '.join(names)} at least "
-        f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
-        "do: the errors are given with their values; record training motions like the held-out ones"
+def refitted_notes(
+    fit: ExactFit, judged: ExactFit, model: Model, oil: Mapping[str, float]
+) -> list[str]:
+    """Name the parameters whose values in the stated errors were fitted to the judging rows.
+
+    `oil` are the relative changes by an oil of another temperature (`held_out.oil_changes`).
+    """
+    notes = []
+    changes = {name.rstrip("0123456789"): change for name, change in oil.items()}
+    if "b" in changes:  # the rows hold 1/b
+        changes["b"] = 1.0 / (1.0 + changes["b"]) - 1.0
+    parts = [
+        f"{OIL_WORDS[name]} {plain(100 * abs(change), 2)} % {'larger' if change > 0 else 'smaller'}"
+        for name, change in changes.items()
     ]
+    if parts:
+        notes.append(
+            f"the held-out records have {' and '.join(parts)} than the training records, as with "
+            "oil of another temperature: the errors are given with that; measure the oil's "
+            "temperature, or hold out records with oil as warm"
+        )
+    names = [n for n in refitted_names(fit, judged, oil) if n in model.parameters]
+    if names:
+        times = plain(TRACE.information_ratio**0.5, 1)
+        notes.append(
+            f"the held-out records show {', '.join(names)} at least {times} times more exactly "
+            "than the training records do: the errors are given with their values; record training "
+            "motions like the held-out ones"
+        )
+    return notes
 
 
 def geometry_note(geometry: Geometry, named: Sequence[JudgedEffect], explained: bool) -> str:

@@ -42,10 +42,20 @@ class TraceSettings:
     """Held-out rms of a rival over that of the best set: a rival with less is tied whatever its
     training rms (tuned)."""
     harm_deviations: float = 4.0
+    """Standard deviations of the noise's own energy by which an effect may increase the residual of
+    an equation (convention; tuned on hoses that stiffen: a piston's gain of 1.1 was named)."""
     harm_share: float = 0.05
+    """Share of the energy that a set removes elsewhere, which form errors may add to an equation
+    (tuned)."""
     harm_ratio: float = 1.2
     """Largest energy above noise of an equation with an effect over that under the baseline, beyond
     which the effect is refused (tuned)."""
+    viscosity_change: float = 0.3
+    """Largest relative change of viscous friction between days (arithmetic: 7 K of an oil that
+    loses 4 % of its viscosity a kelvin, as ISO VG 46 does at 40 degC)."""
+    bulk_change: float = 0.05
+    """Largest relative change of the bulk modulus between days (arithmetic: 7 K at 0.7 % a
+    kelvin)."""
     # Residual that may remain.
     held_out_share: float = 0.05
     """Largest remaining share of an equation's held-out energy above noise under the baseline;

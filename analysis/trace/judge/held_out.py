@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
+from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import effects_among
 from analysis.trace.data.conditioned_record import model_rows, row_residual
@@ -63,7 +65,8 @@ def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> Exact
     then warm up), and every direction of the baseline's coefficients on which the held-out rows
     have `TRACE.information_ratio` times the information of the training rows: two joints that move
     together show a coupling inertia that joints locked in turn do not, and its error would look
-    like an error of the model. No coefficient of an effect is changed.
+    like an error of the model. Before that, the oil of another day is allowed for (`oil_changes`).
+    No coefficient of an effect is changed.
     """
     return _refitted(holdout_data.rig, design_matrix(holdout_data, model.terms), model)
 
@@ -71,6 +74,8 @@ def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> Exact
 def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     """Return `refitted_to_held_out` by the design matrix of the held-out rows."""
     model = _with_fitted_temperature(rows, model)
+    changes = _oil_changes(rig, rows, model)
+    model = replace(model, beta={n: v * (1.0 + changes.get(n, 0.0)) for n, v in model.beta.items()})
     fixed = {c.parameter for e in effects_among(model.terms) for c in e.coefficients(rig)} | {KAPPA}
     # A coefficient that no row contains would be moved by rounding alone.
     visible = np.sum(rows.matrix**2, axis=0) + np.diag(model.information) > 0.0
@@ -89,12 +94,51 @@ def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     return replace(model, beta={n: v + changed.get(n, 0.0) for n, v in model.beta.items()})
 
 
-def refitted_names(before: ExactFit, after: ExactFit) -> list[str]:
-    """Return the coefficients that `refitted_to_held_out` changed by more than `noted_shift`."""
+def oil_changes(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
+    """Return the relative changes of viscous friction and 1/b that held-out rows need, by name.
+
+    Oil of another temperature has another viscosity and bulk modulus: one factor for the viscous
+    friction of all joints, and one for 1/b, each within `TRACE.viscosity_change` and
+    `TRACE.bulk_change`. A factor counts only where it exceeds `TRACE.standard_errors` of its noise
+    and leaves at most `TRACE.noted_ratio` times the noise: it would hide a part of an effect that
+    the model lacks.
+    """
+    return _oil_changes(holdout_data.rig, design_matrix(holdout_data, model.terms), model)
+
+
+def _oil_changes(rig: Rig, rows: DesignMatrix, model: ExactFit) -> dict[str, float]:
+    """Return `oil_changes` by the design matrix of the held-out rows."""
+    viscous = (t for t in baseline_of(rig) if t.name == "viscous_friction")
+    friction = [c.parameter for term in viscous for c in term.coefficients(rig)]
+    changes: dict[str, float] = {}
+    for names, bound in ((friction, TRACE.viscosity_change), (["b"], TRACE.bulk_change)):
+        beta = {n: v for n, v in model.beta.items() if n in names and n in rows.names}
+        column = rows.matrix[:, [rows.names.index(n) for n in beta]] @ list(beta.values())
+        size = float(np.linalg.norm(column))
+        if not size > 0.0:
+            continue
+        acting, residual = column != 0.0, rows.residual(model.beta)
+        change = float(np.clip(column @ residual / size**2, -bound, bound))
+        left = (residual - change * column)[acting]
+        noise_alone = left @ left <= TRACE.noted_ratio**2 * len(left)
+        if abs(change) * size > TRACE.standard_errors and noise_alone:
+            changes |= dict.fromkeys(beta, change)
+    return changes
+
+
+def refitted_names(
+    before: ExactFit, after: ExactFit, oil: Mapping[str, float] = MappingProxyType({})
+) -> list[str]:
+    """Return the coefficients that `refitted_to_held_out` changed by more than `noted_shift`.
+
+    The changes `oil` (`oil_changes`) do not count.
+    """
     return [
         name
         for name, value in before.beta.items()
-        if name != KAPPA and abs(after.beta[name] - value) > TRACE.noted_shift * abs(value)
+        if name != KAPPA
+        and abs(after.beta[name] - value * (1.0 + oil.get(name, 0.0)))
+        > TRACE.noted_shift * abs(value)
     ]
 
 
