@@ -90,7 +90,8 @@ def _shown_by_held_out_rows(
         and not hypotheses.physical_problem(o)
         and not gates.equations_above_band(hypotheses, o, choosing)
     ]  # fmt: skip
-    return min(possible, key=lambda o: cost(o, choosing), default=winner)
+    data = hypotheses.train_data
+    return min(possible, key=lambda o: cost(data, o, choosing), default=winner)
 
 
 def with_free_form(finding: Finding, candidates: Candidates) -> Finding:

@@ -22,7 +22,12 @@ from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
 from analysis.trace.judge.scatter import fitted_shapes
 from analysis.trace.result import JudgedEffect, Rival
-from analysis.trace.search.exact_fit import ExactFit, over_amplified_noise
+from analysis.trace.search.exact_fit import (
+    ExactFit,
+    fit_coefficients,
+    over_amplified_noise,
+    rescale,
+)
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -98,11 +103,11 @@ def rivals_of(
             out.append(rival)
         elif tied:
             richer.append(rival)
-    least = cost(winner, holdout_data)
+    least = cost(train_data, winner, holdout_data)
     for with_pair, ratio, effects in _tied_pairs(hypotheses, winner, used, held_out_test):
         moved = moved_parameter(train_data, winner, with_pair)
         # One effect is the simpler explanation, unless training and held-out rows prefer two.
-        if moved and cost(with_pair, holdout_data) < least:
+        if moved and cost(train_data, with_pair, holdout_data) < least:
             ratios = ratio, training_test.ratio(with_pair.fit.residual)
             one, two = (_rival(effect_in(u), *ratios, True) for u in effects)
             out.append(replace(one, moved=moved, beside=two))
@@ -207,15 +212,23 @@ def best_tied_set(
         return any(is_special_case(effect, other) for effect in named for other in others)
 
     tied = [o for o in tied_sets(hypotheses, winner, effects) if not is_richer(o)]
-    best = min(tied, key=lambda o: cost(o, holdout_data), default=winner)
-    limit = cost(winner, holdout_data) - SEARCH.number_price
-    return best if cost(best, holdout_data) < limit else winner
+    data = hypotheses.train_data
+    best = min(tied, key=lambda o: cost(data, o, holdout_data), default=winner)
+    limit = cost(data, winner, holdout_data) - SEARCH.number_price
+    return best if cost(data, best, holdout_data) < limit else winner
 
 
-def cost(hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
-    """Return the energy in training and held-out rows with the price of effects and numbers."""
-    residual = held_out_residual(holdout_data, hypothesis.fit)
-    energy = hypothesis.fit.energy + float(residual @ residual)
+def cost(train_data: RegressionData, hypothesis: Hypothesis, holdout_data: RegressionData) -> float:
+    """Return the energy in training and held-out rows with the price of effects and numbers.
+
+    Rows of a set that rescales signals are scaled back: a gain below 1 makes their noise smaller.
+    """
+    fit = hypothesis.fit
+    if rescale(train_data, fit.terms):
+        fit = fit_coefficients(replace(train_data, relative=True), fit.terms)
+        holdout_data = replace(holdout_data, relative=True)
+    residual = held_out_residual(holdout_data, fit)
+    energy = fit.energy + float(residual @ residual)
     return energy + SEARCH.number_price * sum(hypothesis.size)
 
 
@@ -335,7 +348,8 @@ def _tied_pairs(
         residual = held_out_residual(held_out_test.data, pair.fit)
         if held_out_test.ties(residual, TRACE.tie_ratio) and not hypotheses.physical_problem(pair):
             out.append((pair, held_out_test.ratio(residual), (first, second)))
-    return sorted(out, key=lambda tied: cost(tied[0], held_out_test.data))
+    data = hypotheses.train_data
+    return sorted(out, key=lambda tied: cost(data, tied[0], held_out_test.data))
 
 
 def pair_in_words(
