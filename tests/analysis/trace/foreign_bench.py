@@ -39,8 +39,8 @@ TANH, SIGMOID, KARNOPP, SLOW = range(4)
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
     STIFFER, BACK_POWER, SPRING_REST, KNEE, TIGHTER, WORN, SPOOL, SPOOL_DAMPING,
-    LAMINAR, REYNOLDS,
-) = range(31)  # fmt: skip
+    LAMINAR, REYNOLDS, HOSES, HOSE_PRESSURE,
+) = range(33)  # fmt: skip
 MIDDLE = -1.44  # [rad] where springs are at rest
 
 
@@ -65,7 +65,8 @@ class Hidden:
     `worn` times as large; the opening follows the spool's signal by a lag of second order
     of natural frequency `spool_frequency` [Hz] and damping ratio `spool_damping`; of a drop dp
     across an edge its root passes times x / (x + 1), x = 2 (dp / `laminar`)^(1/2), or, where
-    `reynolds` is 1, times tanh(x).
+    `reynolds` is 1, times tanh(x). `hoses` [m^3] are further volumes at both chambers that stiffen
+    under pressure, to half of it at `hose_pressure` [Pa].
     """
 
     ahead: float = 0.0
@@ -99,6 +100,8 @@ class Hidden:
     spool_damping: float = 0.7
     laminar: float = 0.0
     reynolds: float = 0.0
+    hoses: float = 0.0
+    hose_pressure: float = 2e6
 
     @property
     def array(self) -> Array:
@@ -261,8 +264,10 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
     out[0], out[1] = w, (torque - G * friction) / par[0]
     stiff_cap = par[3] * (1.0 + hidden[STIFFER] * cap)
     stiff_rod = par[3] * (1.0 + hidden[STIFFER] * rod)
-    out[2] = stiff_cap * (into_cap - 7.0e-4 * v) / (6.3e-5 + (0.0375 + s) * 7.0e-4)
-    out[3] = stiff_rod * (into_rod + 5.4e-4 * v) / (6.3e-5 + (0.0375 - s) * 5.4e-4)
+    hose_cap = hidden[HOSES] / (1.0 + cap / hidden[HOSE_PRESSURE])
+    hose_rod = hidden[HOSES] / (1.0 + rod / hidden[HOSE_PRESSURE])
+    out[2] = stiff_cap * (into_cap - 7.0e-4 * v) / (6.3e-5 + hose_cap + (0.0375 + s) * 7.0e-4)
+    out[3] = stiff_rod * (into_rod + 5.4e-4 * v) / (6.3e-5 + hose_rod + (0.0375 - s) * 5.4e-4)
 
 
 @njit(cache=True)

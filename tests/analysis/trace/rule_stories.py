@@ -649,6 +649,23 @@ def a_clean_bench_in_a_loop_that_oscillates_is_clean(b: Benches) -> None:
     assert (result.verdict, result.effects) == ("clean", ())
 
 
+def thinner_oil_on_the_held_out_day_is_no_effect(b: Benches) -> None:
+    """Viscous friction is 10 % smaller there, as with oil 2 or 3 K warmer."""
+
+    def recorded() -> tuple[Run, Run]:
+        lever_arm = 0.0893  # [m] of the piston's force at mid-stroke
+        slope = -0.1 * small_bench.TRUTH["Fv2"] / lever_arm**2
+        thinner = foreign_bench.Hidden(drag_ahead=slope, drag_astern=slope)
+        first_day = foreign_bench.experiment(b.rig, foreign_bench.Hidden(), repeats=4, seed=1)
+        return first_day, foreign_bench.experiment(b.rig, thinner, repeats=2, seed=2, rms=0.02)
+
+    result = b.traced(b.kept("thinner", recorded), "coulomb_friction", "internal_leakage")
+    assert (result.verdict, result.effects) == ("clean", ())
+    (note,) = (n for n in result.notes if n.startswith("the held-out records have"))
+    assert note.startswith("the held-out records have viscous friction 9.")
+    assert "% smaller than the training records, as with oil of another temperature" in note
+
+
 STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_names_nothing, ("p always 0", "no family")),
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
@@ -691,6 +708,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (of_a_spring_and_an_inclination_that_tie_the_better_one_is_named_first, ("tied sets",)),
     (what_a_cubic_spring_adds_is_no_error_of_an_offsets_form, ("exact forms",)),
     (noise_above_the_stated_one_is_noise_where_nothing_repeats, ("unstated noise",)),
+    (thinner_oil_on_the_held_out_day_is_no_effect, ("oil of another day",)),
     (a_clean_bench_in_a_loop_that_oscillates_is_clean, ("repeats that differ",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
     (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),

@@ -12,9 +12,17 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import VariantColumns, regression_data
-from analysis.trace.search.linear_fit import gains, project, sets_with_one_more
+from analysis.trace.search.linear_fit import (
+    CandidateColumns,
+    LinearFit,
+    gains,
+    pairs_of_chambers,
+    project,
+    sets_with_one_more,
+)
 from rig.model.rig import Rig
-from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment
+from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment, pair_of_runs
+from tests.analysis.trace.gate_cases import searched
 
 
 @pytest.mark.parametrize(
@@ -67,3 +75,21 @@ def test_an_effect_that_fits_with_an_impossible_number_leaves_room_for_others(ri
     candidates = project(data, entries, lambda _: 1, lambda e, _: e.used.term is offset)
     found = sets_with_one_more(candidates, (), r)
     assert [candidates.entries[m].used.term for m in found[0].members] == [offset]
+
+
+def test_longer_pipes_at_both_chambers_are_tried_together(rig: Rig) -> None:
+    """Hoses on both, which stiffen under pressure: half of each volume is in either alone."""
+    runs = pair_of_runs(rig, Hidden(hoses=1e-4))
+    s = searched(rig, *runs, "dead_volume", "sensor_offset", "sensor_gain")
+    candidates, r = s.hypotheses.candidates, s.hypotheses.train_data.mean_residual
+    r = r - candidates.basis @ (candidates.basis.T @ r)
+    best, *others = pairs_of_chambers(candidates, r)
+    assert keys(candidates, best) == {("dead_volume", f"joint 2 {side}") for side in ("cap", "rod")}
+    assert best.total <= min(pair.total for pair in others)
+    (left, *_) = pairs_of_chambers(candidates, r, [("dead_volume", "joint 2 cap")])
+    assert not keys(candidates, left) & keys(candidates, best)
+    assert s.winner.keys == keys(candidates, best)
+
+
+def keys(candidates: CandidateColumns, pair: LinearFit) -> frozenset[tuple[str, str]]:
+    return frozenset(candidates.entries[m].used.term.key for m in pair.members)

@@ -37,6 +37,17 @@ def test_a_repeat_of_another_motion_is_a_step_of_its_own(rig: Rig) -> None:
     assert note.startswith("step 'step1': repeat 3 differs from the first by ")
 
 
+def test_a_joint_that_drifts_between_repeats_still_repeats_its_motion(rig: Rig) -> None:
+    """Nothing holds a joint at its place between repeats: its mean moves by a millimetre."""
+    train, _ = pair_of_runs(rig)
+    records = []
+    for record in train.records:
+        piston = record.channels["piston_2"] + 1e-3 * record.repeat
+        records.append(replace(record, channels={**record.channels, "piston_2": piston}))
+    (alike,), nothing = with_other_motions_apart([replace(train, records=tuple(records))])
+    assert ([r.step for r in alike.records], nothing) == (["step1"] * 4, ())
+
+
 def test_a_clean_bench_stays_clean(rig: Rig) -> None:
     """Averaged with the other repeat, it left several times the noise."""
     train, held_out = pair_of_runs(rig)

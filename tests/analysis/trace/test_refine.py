@@ -17,11 +17,13 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
+from analysis.trace.judge.scatter import form_shift
 from analysis.trace.search import exact_fit, refinement
 from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
+from tests.analysis.trace import foreign_bench
 from tests.analysis.trace.gate_cases import searched
 from tests.analysis.trace.hidden import pair_of_runs
 
@@ -241,3 +243,16 @@ def test_of_two_forms_the_one_that_the_records_show_is_chosen(
     monkeypatch.setattr(StribeckFriction, "not_shown", not_shown)
     stribeck = refinement.refine(data, (*terms, *starts)).terms[-1]
     assert (len(stribeck.shape) == 4) == shown
+
+
+def test_a_lag_has_no_hold_at_its_input_unless_the_records_show_one(rig: Rig) -> None:
+    """Of second order, the lag with a held input, half a sample shorter, fits as well by chance."""
+    hidden = foreign_bench.Hidden(spool_frequency=50.0, spool_damping=0.9)
+    s = searched(rig, *foreign_bench.pair_of_runs(rig, hidden, seed=2), "spool_lag")
+    (lag,) = s.winner.effects
+    assert lag.shape == pytest.approx((2.0 * 0.9 / (2.0 * np.pi * 50.0), 0.9), rel=0.01)
+    data = s.hypotheses.train_data
+    ((_, held),) = refinement.fits_in_other_forms(data, s.winner.fit)
+    assert held.energy < s.winner.fit.energy
+    shift = form_shift(data, s.winner.fit)
+    assert shift["tau_spool_2"] == pytest.approx(0.5 / rig.sample_rate, rel=0.05)

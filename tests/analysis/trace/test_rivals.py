@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from analysis.identify.identify import identify
 from analysis.simulation.model import Model
+from analysis.terms import make
+from analysis.terms.base import Used
 from analysis.trace.engine import trace
-from analysis.trace.judge import rivals
+from analysis.trace.judge import held_out, rivals
 from analysis.trace.judge.rivals import errors_by_alternatives
 from analysis.trace.result import Rival
 from analysis.trace.settings import SEARCH, TRACE
@@ -151,3 +155,36 @@ def test_an_unknown_cause_that_differs_between_days_widens_what_it_moves(rig: Ri
     assert alone["Fv2"].ci95[0] > TRUTH["Fv2"]
     for name in ("b", "C_pp_2"):  # the flows keep no more than noise
         assert intervals[name].ci95 == pytest.approx(alone[name].ci95)
+
+
+def test_an_effect_may_not_pay_for_one_equation_with_another() -> None:
+    """A good piston sensor got a gain of 1.1: less in the flows, and more in a quiet torque."""
+
+    def left(torque: float, flow: float) -> Any:
+        return SimpleNamespace(excess_energy={"torque_1": torque, "flow_cap_1": flow})
+
+    rows = {"torque_1": 1600, "flow_cap_1": 1600}
+    hypotheses: Any = SimpleNamespace(
+        empty=left(-30.0, 2300.0), noise_band=dict.fromkeys(rows, 780.0),
+        train_data=SimpleNamespace(row_counts=rows),
+    )  # fmt: skip
+    without = left(-30.0, 1600.0)
+    assert held_out.disturbed_equations(hypotheses, left(284.0, 300.0), without) == ["torque_1"]
+    # What noise makes, and what the form error of a large effect makes, refuses nothing.
+    assert held_out.disturbed_equations(hypotheses, left(150.0, 300.0), without) == []
+    hypotheses.empty = left(-30.0, 23000.0)
+    assert held_out.disturbed_equations(hypotheses, left(284.0, 300.0), without) == []
+
+
+def test_other_sets_widen_the_interval_of_a_shape_too(rig: Rig) -> None:
+    """With a torque beside it, an inclination of 0.025 rad would be 0.029 rad."""
+
+    def leaning(by: float) -> Any:
+        used = Used(make("base_inclination", "bench"), (by,))
+        return SimpleNamespace(fit=SimpleNamespace(terms=(used,)))
+
+    other = leaning(0.029)
+    errors = rivals.shape_errors_by_alternatives(rig, leaning(0.025), [other])
+    assert errors == {"inclination": pytest.approx(0.004 / 2**0.5)}
+    empty: Any = SimpleNamespace(fit=SimpleNamespace(terms=()))
+    assert rivals.shape_errors_by_alternatives(rig, leaning(0.025), [empty]) == {}

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from analysis.simulation.model import Estimate, nominal_model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
+from analysis.trace import finding
 from analysis.trace.finding import Remainder, tolerance_words
 from analysis.trace.in_motion import rest_phase_notes
+from analysis.trace.judge import gates
 from analysis.trace.judge.gates import NO_RIVAL, passes_gates, tied_in_held_out
 from analysis.trace.judge.held_out import completed
-from analysis.trace.notes import not_judged_notes, undetermined_notes
+from analysis.trace.notes import not_judged_notes, rival_notes, undetermined_notes
 from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.words import quantity, sentence, tolerated_error_notes
@@ -202,3 +206,31 @@ def test_what_only_some_rows_hold_is_stated_where_the_errors_do_not_show_it() ->
         "flow_cap_1: the repeatable energy is 7 times the band, held-out error 4.1 times the noise "
         "floor; the rows that judge hold noise alone"
     )
+
+
+def test_a_parameter_that_a_tied_rival_leaves_open_is_said_to_be_open() -> None:
+    """No interval of W1 holds 190 % less."""
+    rival = Rival("joint_spring", "joint 1", 1.0, 1.0, True, "joint 1", ("W1", -1.9))
+    offset = replace(effect("torque_offset", "a constant", {}), rivals=(rival,))
+    (note,) = rival_notes([offset])
+    assert "W1 would hardly be determined: its interval is wider for it" in note
+    (note,) = rival_notes([replace(offset, rivals=(replace(rival, moved=("W1", -0.2)),))])
+    assert "W1 would be 20 % smaller: its interval is wider for it" in note
+
+
+def test_an_equation_that_the_effects_make_worse_is_said_to_be_worse() -> None:
+    """The baseline left noise alone: a share of nothing is no figure."""
+    rows = {"torque_1": 1600, "flow_cap_1": 1600}
+    data = SimpleNamespace(row_counts=rows, rig=None)
+    empty = SimpleNamespace(excess_energy={"torque_1": -30.0, "flow_cap_1": 1700.0})
+    after = SimpleNamespace(
+        effects=("an effect",), excess_energy={"torque_1": 500.0, "flow_cap_1": 10.0}
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gates, "equations_above_band", lambda *_: [])
+        patch.setattr(gates, "form_share", lambda *_: 0.0)
+        hypotheses: Any = SimpleNamespace(train_data=data, empty=empty)
+        patch.setattr(finding, "effects_among", lambda _: [])
+        (left,) = finding.remainders(hypotheses, cast("Any", after), cast("Any", data))
+    assert left.equation == "torque_1"
+    assert left.words == "the repeatable rms is 1.15 times the noise, more than under the baseline"
