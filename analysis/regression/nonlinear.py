@@ -61,6 +61,10 @@ class Linearisation:
         """Whether every parameter is an unknown of the rows itself."""
         return np.array_equal(self.slope, np.eye(len(self.slope)))
 
+    def at(self, p: Array) -> Array:
+        """Return the unknowns x (k,) at the parameters p (m,)."""
+        return self.constant + self.slope @ p
+
 
 def linearised(
     rig: Rig, terms: Sequence[Used], names: Sequence[str], values: Mapping[str, float]

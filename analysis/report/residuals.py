@@ -16,9 +16,11 @@ from scipy.signal import welch
 from analysis.identify.result import Identification
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import least_squares
-from analysis.regression.rows import Array, Rows
+from analysis.regression.nonlinear import linearised, reduced
+from analysis.regression.rows import Array, Rows, parameters_of
 from analysis.regression.solve import RowCluster, solve, triangle
 from analysis.report.settings import REPORT
+from analysis.simulation.model import Model
 from analysis.terms.base import family_of, inverted
 
 KINDS = ("torque", "flow_cap", "flow_rod")
@@ -59,12 +61,15 @@ def coefficients(
 ) -> dict[str, Array]:
     """Return the rows' coefficients (k,) by family, finite for unidentified parameters as well.
 
-    Where only a combination is determined, the shortest coefficients that fit the rows are used:
-    the residual does not depend on the choice.
+    Where fewer parameters determine them (`Term.reduction`), they are computed from these. Where
+    only a combination is determined, the shortest coefficients that fit the rows are used: the
+    residual does not depend on the choice.
     """
+    rig, terms = identification.model.rig, identification.model.terms
     out = {}
     for family, solution in identification.solutions.items():
-        beta = solution.value
+        values = dict(zip(solution.names, solution.value, strict=True))
+        beta = linearised(rig, terms, parameters_of(rig, terms, family), values).at(solution.value)
         if not np.isfinite(beta).all():
             parts = [rows for record in per_record for rows in record.family(family)]
             X, y = np.vstack([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
@@ -169,16 +174,14 @@ def per_repeat(
     model = identification.model
     by_equation: dict[str, list[float]] = {}
     for members in complete:
-        for family, solution in identification.solutions.items():
-            alone = _solve_repeat(members, family, solution.names)
+        for family in identification.solutions:
+            alone = _solve_repeat(model, members, family)
             for name, value in inverted(model.rig, model.terms, alone).items():
                 by_equation.setdefault(name, []).append(value)
     return {name: _scatter(np.array(values)) for name, values in by_equation.items()}
 
 
-def _solve_repeat(
-    members: Sequence[RecordRows], family: str, names: Sequence[str]
-) -> Mapping[str, float]:
+def _solve_repeat(model: Model, members: Sequence[RecordRows], family: str) -> Mapping[str, float]:
     clusters = []
     for member in members:
         rows = member.family(family)
@@ -190,7 +193,9 @@ def _solve_repeat(
             )
     if not clusters:
         return {}
-    return dict(zip(names, solve(names, clusters).value, strict=True))
+    linear = solve(parameters_of(model.rig, model.terms, family), clusters)
+    solution = reduced(model.rig, model.terms, linear, clusters)
+    return dict(zip(solution.names, solution.value, strict=True))
 
 
 def _scatter(values: Array) -> Scatter:

@@ -17,13 +17,18 @@ from analysis.regression.rows import Rows
 from analysis.report import format as fm
 from analysis.report import paper
 from analysis.report.identification import facts
+from analysis.report.identification.report import render_report
 from analysis.report.plots import arm_plot, record_plots, style, trace_plots
 from analysis.report.residuals import per_repeat, residuals
+from analysis.terms import make, with_effects
+from analysis.terms.base import Used
 from analysis.trace.result import Curve, JudgedEffect
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from tests.analysis.page import number
+from rig.runs.rigs import load_rig
+from tests.analysis.page import Page, number
+from tests.studies.machines import electric_plant
 
 FINITE = st.floats(1e-12, 1e12) | st.floats(-1e12, -1e-12)
 
@@ -162,9 +167,15 @@ def test_masked_rows_leave_the_scatter_where_it_was() -> None:
         return RecordRows(conditioned, {"torque_1": rows})
 
     class _Solution:
+        names = ("Fv1",)
         value = np.array([7.0])
 
+    class _Model:
+        rig = load_rig("boom-1dof")
+        terms = (Used(make("viscous_friction")),)
+
     class _Found:
+        model = _Model()
         solutions = {"mechanical": _Solution()}  # noqa: RUF012
 
     (found,) = residuals(_Found(), [one(1), one(2), one(3), one(4)])  # type: ignore[arg-type]
@@ -194,6 +205,46 @@ def test_each_repeat_alone_gives_what_identifying_it_alone_gives(multisine_run: 
         assert (spread.low, spread.high) == pytest.approx((min(values), max(values)), rel=1e-9)
         assert spread.rsd == pytest.approx(100 * np.std(values, ddof=1) / np.mean(values), rel=1e-6)
     assert per_repeat(found, [r for r in rows if r.record.repeat == 1]) == {}
+
+
+@pytest.fixture(scope="module")
+def sloped_arm() -> Run:
+    """The electric arm on a base whose slope its rig file leaves unknown."""
+    arm = electric_plant.draw_arm(np.random.default_rng(5))
+    rig = load_rig("electric-2dof")
+    return electric_plant.records(rig, arm, np.random.default_rng(6), repeats=2)
+
+
+@pytest.mark.parametrize(("bench", "effects"), [
+    ("multisine_run", ["base_inclination"]),
+    ("sloped_arm", []),
+])  # fmt: skip
+def test_the_report_of_an_unknown_slope_has_the_residuals_of_that_slope(
+    bench: str, effects: list[str], request: pytest.FixtureRequest
+) -> None:
+    """2 N weights and one angle determine 2 N columns: the rows of gravity turned by the angle."""
+    run: Run = request.getfixturevalue(bench)
+    found = identify([run], terms=[Used(term) for term in with_effects(run.rig, effects)])
+    values = {name: estimate.value for name, estimate in found.estimates.items()}
+    known = [used for used in found.model.terms if used.term.name != "inclined_gravity"]
+    known += [
+        Used(make("gravity")),
+        Used(make("base_inclination"), (values["base_inclination"],)),
+    ]
+    squares: dict[tuple[str, str], list[np.ndarray]] = {}
+    for record in build_rows(run.rig, [run], known):
+        for r in record.family("mechanical"):
+            left = r.rhs - r.matrix @ [values[name] for name in r.names]
+            squares.setdefault((record.record.step, r.equation[-1]), []).append(left**2)
+    page = Page(render_report(runs=[run], identification=found))
+    table = page.table("Residuals of the equations")
+    shown = {(row[0], row[1]): number(row[5]) for row in table.rows if "N·m" in row}
+    assert shown == {
+        place: pytest.approx(math.sqrt(np.concatenate(parts).mean()), rel=6e-3)
+        for place, parts in squares.items()
+    }
+    alone = per_repeat(found, found.built)["base_inclination"]
+    assert alone.mean == pytest.approx(values["base_inclination"], abs=2e-3)
 
 
 def test_a_bench_that_is_no_rigid_body_is_told_from_a_bad_identification() -> None:
