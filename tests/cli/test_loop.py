@@ -6,10 +6,12 @@ import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from analysis.report.loop import render
+from analysis.simulation.model import load_model
 from analysis.simulation.twin import simulate_commands
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
@@ -129,6 +131,48 @@ def test_it_stops_where_it_should_and_says_why(
     assert len(experiments.rounds) == count
 
 
+class Repeated(Replayed):
+    """A loop as the command runs it, whose records and traces are those of `made`."""
+
+    made: Inside
+
+    def __init__(self, request: LoopRequest, say: object) -> None:
+        super().__init__(request, self.made.rounds)
+        self.train, self.judge = self.made.train, self.made.judge
+
+
+def of_a_killed_loop(out: Path) -> tuple[dict[str, Any], str]:
+    """What a loop that got SIGKILL now would leave: its JSON and the text of its page."""
+    assert load_model(out / "model.json").rig.name == RIG
+    assert not list(out.glob(".*"))
+    return json.loads((out / "loop.json").read_text()), Page((out / "loop.html").read_text()).text
+
+
+def test_each_round_is_on_the_disk_when_the_next_begins(
+    air: Inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    class Looked(Repeated):
+        made = air
+
+        def _record(self, number: int, *_: object) -> None:
+            if number > 1:
+                seen.append(of_a_killed_loop(self.request.out))
+
+    monkeypatch.setattr(experiment_loop, "Loop", Looked)
+    done = bramah_here("loop", "--rig", RIG, "--out", tmp_path, "--unattended", "--until-visible")
+    assert done.returncode == 0, done.stderr
+    ((told, page),) = seen
+    assert [r["round"] for r in told["rounds"]] == [1]
+    assert told["stopped"] == ""
+    assert "had not ended when this page was written, after round 1" in page
+    told, page = of_a_killed_loop(tmp_path)
+    assert [r["round"] for r in told["rounds"]] == [1, 2]
+    assert told["stopped"] == FLOOR
+    assert f"Stopped: {FLOOR}" in page
+
+
 @pytest.mark.slow
 def test_a_leak_is_traced_over_the_wire_into_folders_of_its_own(tmp_path: Path) -> None:
     protocol, out = tmp_path / "waves.yaml", tmp_path / "monday"
@@ -148,7 +192,8 @@ def test_a_leak_is_traced_over_the_wire_into_folders_of_its_own(tmp_path: Path) 
         "loop", "--rig", RIG, "--out", out, "--protocol", protocol, "--unattended", "--simulate"
     )
     assert again.returncode == 2
-    assert "run-1" in again.stderr
+    assert "run-1 exists already" in again.stderr
+    assert "name another folder" in again.stderr
 
 
 def test_a_trip_ends_the_loop_with_its_code_and_what_was_known(tmp_path: Path) -> None:

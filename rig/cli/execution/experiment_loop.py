@@ -50,7 +50,8 @@ REFUSED: Final = "the bench refused the next experiment"
 class LoopRequest:
     """Settings of a loop: `rounds`, number of designed experiments; `ask`, called before each.
 
-    `until_visible` continues after `clean` while a relevant effect could be below the noise.
+    `until_visible` continues after `clean` while a relevant effect could be below the noise. `keep`
+    is called with the loop after each round, to write the result so far.
     """
 
     rig: str
@@ -63,13 +64,18 @@ class LoopRequest:
     until_visible: bool = False
     operator: str | None = None
     ask: Callable[[Mapping[str, Any]], bool] = lambda experiment: True
+    keep: Callable[[Loop], None] = lambda loop: None
 
 
 def refuse_used_folder(out: Path) -> None:
     """Raise InputError if the folder holds the runs of an earlier loop."""
     first_run = out / "run-1"
     if first_run.exists():
-        raise InputError(f"--out {out}: {first_run} exists already; expected a folder without runs")
+        raise InputError(
+            f"--out {out}: {first_run} exists already; expected a folder without runs. A loop "
+            "begins with its first round: name another folder. `bramah trace` traces the runs that "
+            "this one has, and writes the protocol of the next experiment with --json"
+        )
 
 
 class Loop:
@@ -87,6 +93,7 @@ class Loop:
         """Run rounds until an ending condition holds; raises the error that ends a run."""
         self._record(1, self.request.protocol, self.request.overrides, HELD_OUT)
         self._trace(1, None)
+        self.request.keep(self)
         while not self.stopped:
             number = len(self.rounds) + 1
             experiment = self._next()
@@ -99,6 +106,7 @@ class Loop:
                 self.stopped = REFUSED
             else:
                 self._trace(number, experiment)
+                self.request.keep(self)
 
     def _next(self) -> Mapping[str, Any] | None:
         """Return the next experiment; None if there is none, with the reason in `stopped`."""

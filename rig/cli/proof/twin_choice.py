@@ -208,13 +208,9 @@ def _in_virtual_time(runs: Iterable[str]) -> bool:
     return False
 
 
-def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> None:
-    """Write a model file and keep a copy as the last identified model of its rig.
-
-    `say` receives whether the copy was kept, or why not; then the earlier copy remains.
-    """
+def write_identified(model: Model, path: Path) -> Model:
+    """Write a model file; returns the model as written, with when, where and from what runs."""
     from analysis.simulation.model import save_model
-    from analysis.simulation.model_draws import unusable
 
     origin = {
         _SAVED: datetime.now(UTC).isoformat(timespec="seconds"),
@@ -223,6 +219,18 @@ def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> Non
     }
     dated = replace(model, provenance={**model.provenance, **origin})
     save_model(dated, path)
+    return dated
+
+
+def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> None:
+    """Write a model file and keep a copy as the last identified model of its rig.
+
+    `say` receives whether the copy was kept, or why not; then the earlier copy remains.
+    """
+    from analysis.simulation.model import save_model
+    from analysis.simulation.model_draws import unusable
+
+    dated = write_identified(model, path)
     if model.rig.electric:
         return  # electric rigs are not checked on a twin
     reason = unusable(model, model.rig)

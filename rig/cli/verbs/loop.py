@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,9 @@ from rig.cli.options import (
     writable_file,
 )
 from rig.cli.text.output import is_terminal, printed_at_end, progress, write_json
+
+if TYPE_CHECKING:
+    from rig.cli.execution.experiment_loop import Loop
 
 
 def loop(
@@ -91,8 +94,13 @@ def loop(
             endpoint = stack.enter_context(simulated_bench(rig, seed=seed, scenario=scenario))
         ask = (lambda experiment: True) if unattended else _confirmed
         sizes = Overrides(repeats=repeats, amplitude_scale=amplitude_scale)
+        page = report or out / "loop.html"
+
+        def keep(loop: Loop) -> None:
+            _write_result(loop, json, page)
+
         request = LoopRequest(
-            rig, out, endpoint, protocol, sizes, rounds, seed, until_visible, operator, ask
+            rig, out, endpoint, protocol, sizes, rounds, seed, until_visible, operator, ask, keep
         )
         experiments = Loop(request, progress)
         try:
@@ -101,30 +109,42 @@ def loop(
             experiments.stopped = code_and_message(error)[1]
             raise
         finally:
-            _show_result(experiments, json, report or out / "loop.html")
+            _show_result(experiments, json, page)
 
 
 def _confirmed(experiment: Mapping[str, Any]) -> bool:
     return typer.confirm(f"Run the next experiment ({experiment['text']})?", err=True)
 
 
-def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
+def _write_result(experiments: Loop, json: Path | None, report: Path) -> None:
+    """Write report, JSON and model of the rounds so far, each replaced as a whole."""
     from analysis.trace.loop_rounds import rounds_json
-    from rig.cli.proof.twin_choice import save_identified
+    from rig.cli.proof.twin_choice import write_identified
     from rig.cli.text.reports import write_loop
-    from rig.cli.text.trace_text import rounds_text
 
-    if not experiments.rounds and not experiments.request.out.is_dir():
-        return  # the loop ended before its first record
+    out = experiments.request.out
     document = rounds_json(experiments.rounds, experiments.stopped)
-    write_json(experiments.request.out / "loop.json", document)
-    write_json(json, document)
-    if not experiments.rounds:
-        return
-    last = experiments.rounds[-1].result.model_after
-    text = rounds_text(experiments.rounds, experiments.stopped)
-    with printed_at_end(json, lambda: f"{text}\nreport: {report}"):
-        save_identified(last, experiments.request.out / "model.json", progress)
+    write_json(out / "loop.json", document)
+    if json != Path("-") or experiments.stopped:
+        write_json(json, document)
+    if experiments.rounds:
+        write_identified(experiments.rounds[-1].result.model_after, out / "model.json")
         write_loop(
             report, experiments.train, experiments.judge, experiments.rounds, experiments.stopped
         )
+
+
+def _show_result(experiments: Loop, json: Path | None, report: Path) -> None:
+    """Write and print the result of a loop that has ended; its model becomes that of the bench."""
+    from rig.cli.proof.twin_choice import save_identified
+    from rig.cli.text.trace_text import rounds_text
+
+    if not experiments.rounds:
+        if experiments.request.out.is_dir():  # the loop did not end before its first record
+            _write_result(experiments, json, report)
+        return
+    text = rounds_text(experiments.rounds, experiments.stopped)
+    with printed_at_end(json, lambda: f"{text}\nreport: {report}"):
+        _write_result(experiments, json, report)
+        model = experiments.rounds[-1].result.model_after
+        save_identified(model, experiments.request.out / "model.json", progress)
