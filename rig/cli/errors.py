@@ -99,7 +99,8 @@ def code_and_message(error: BaseException) -> tuple[int, str]:
         if isinstance(error, kinds):
             return code, _with_notes(error, text(error))
     # pydantic reports an interruption within a serializer as an error of its own.
-    if any(getattr(signal.getsignal(n), "heard", False) for n in (signal.SIGINT, signal.SIGTERM)):
+    interrupting = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    if any(getattr(signal.getsignal(n), "heard", False) for n in interrupting):
         return INTERRUPTED, _with_notes(error, "stopped")
     # An error that is not listed is a bug; its type is shown.
     return FAILED, f"{type(error).__name__}: {error}; --debug shows where"

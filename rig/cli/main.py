@@ -114,6 +114,7 @@ class Interruption:
     """A signal's handler that raises KeyboardInterrupt; `heard` states whether it was called.
 
     A library that calls Python may swallow the exception; `rig.bench.stops` then still stops.
+    A closing terminal sends SIGHUP twice, from the kernel and the shell: only the first counts.
     """
 
     def __init__(self) -> None:
@@ -121,6 +122,8 @@ class Interruption:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt."""
+        if self.heard and number == signal.SIGHUP:
+            return
         self.heard = True
         raise KeyboardInterrupt
 
@@ -140,6 +143,8 @@ def run(arguments: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, Interruption())
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
         signal.signal(signal.SIGINT, Interruption())
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
+        signal.signal(signal.SIGHUP, Interruption())
     verb = next((word for word in _words_of_call(words) if not word.startswith("-")), "")
 
     def work() -> int | None:

@@ -27,6 +27,7 @@ from tests.forked import Forked
 
 START = "from rig.cli.main import run; run()"
 ROOT = Path(__file__).parents[2]
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LONG = 120.0  # [s] nothing here takes it; a hang ends in an error that says so
 
 SHORT = """
@@ -80,15 +81,17 @@ def bramah_here(*arguments: object, cwd: Path | None = None) -> subprocess.Compl
 
 @contextmanager
 def _as_a_process_begins() -> Iterator[None]:
-    """Take handlers off the log; restore log, SIGTERM and hidden modules afterwards."""
-    root, ended = logging.getLogger(), signal.getsignal(signal.SIGTERM)
+    """Take handlers off the log; restore log, signals and hidden modules afterwards."""
+    root = logging.getLogger()
+    signals = {number: signal.getsignal(number) for number in ENDING}
     handlers, level, modules = root.handlers, root.level, set(sys.modules)
     root.handlers = []
     try:
         yield
     finally:
         root.handlers, root.level = handlers, level
-        signal.signal(signal.SIGTERM, ended)
+        for number, handler in signals.items():
+            signal.signal(number, handler)
         for name in set(sys.modules) - modules:
             if sys.modules[name] is None:  # a library that the command does without
                 del sys.modules[name]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -171,6 +172,28 @@ def test_each_round_is_on_the_disk_when_the_next_begins(
     assert [r["round"] for r in told["rounds"]] == [1, 2]
     assert told["stopped"] == FLOOR
     assert f"Stopped: {FLOOR}" in page
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_a_terminal_closed_while_a_round_is_traced_ends_the_loop_as_ctrl_c_does(
+    air: Inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    class Hung(Repeated):
+        made = air
+
+        def _trace(self, round_: int, experiment: object) -> None:
+            if round_ == 2:
+                signal.raise_signal(number)
+            super()._trace(round_, experiment)
+
+    monkeypatch.setattr(experiment_loop, "Loop", Hung)
+    done = bramah_here("loop", "--rig", RIG, "--out", tmp_path, "--unattended", "--until-visible")
+    assert done.returncode == 130
+    assert done.stderr.splitlines()[-1] == "bramah: stopped"
+    told, page = of_a_killed_loop(tmp_path)
+    assert [r["round"] for r in told["rounds"]] == [1]
+    assert told["stopped"] == "stopped"
+    assert "Stopped: stopped" in page
 
 
 @pytest.mark.slow
