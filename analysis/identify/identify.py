@@ -22,7 +22,13 @@ from analysis.regression.rows import Filtering, default_filtering
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.records import Record, Run, refuse_malformed, with_loads_stated
+from rig.model.records import (
+    Record,
+    Run,
+    refuse_malformed,
+    refuse_repeated_runs,
+    with_loads_stated,
+)
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 HYDRAULIC = ("sequential", "pso", "ga")
@@ -49,14 +55,15 @@ def identify(
     where noise in the regressors biases it by more than matters) or "plain", without nuisances;
     `bootstrap` > 0 takes the intervals from so many draws of whole repeats; `rng` (default: seed 0)
     draws them; `progress` receives the share of the runs that the coupled method has processed.
-    Raises InputError for another method or estimator, for runs of different rigs and for records
-    that cannot be used, naming record and channel.
+    Raises InputError for another method or estimator, for runs of different rigs or with the same
+    samples, and for records that cannot be used, naming record and channel.
     """
     refuse_malformed(runs)
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
     _refuse_estimator(estimator, bootstrap)
     rig, runs = ck.common_rig(runs), with_loads_stated(runs)
+    refuse_repeated_runs(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     if method in HYDRAULIC and rig.electric:
         raise InputError(

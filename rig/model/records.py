@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -144,6 +145,38 @@ def _malformed_samples(samples: Array) -> str:
         found = f"{type(samples).__name__} of {x.dtype}, shape {x.shape}"
         return f"expected an array (n,) of floats, found {found}"
     return ""
+
+
+def refuse_repeated_runs(runs: Sequence[Run]) -> None:
+    """Raise InputError if two runs have a record with the same samples."""
+    known: dict[str, tuple[int, str]] = {}
+    sources = [run.source or f"run {k + 1} of {len(runs)}" for k, run in enumerate(runs)]
+    for k, run in enumerate(runs if len(runs) > 1 else ()):
+        for record in run.records:
+            other, name = known.setdefault(samples_digest(record), (k, record.name))
+            if other != k:
+                raise repeated_run(sources[k], sources[other], (record.name, name))
+
+
+def samples_digest(record: Record) -> str:
+    """Return a digest of a record's samples, the same whatever its name."""
+    digest = hashlib.sha256()
+    for name in sorted(record.channels):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
+    return digest.hexdigest()
+
+
+def repeated_run(run: str, known: str, records: tuple[str, str] | None = None) -> InputError:
+    """Return the refusal of a run that was given already, or of which `records` are the same."""
+    found = "" if records is None else (
+        f" in whole or in part (its record {records[0]} is record {records[1]} there, sample for "
+        "sample)"
+    )  # fmt: skip
+    return InputError(
+        f"{run}: is the same run as {known}{found}; expected each run once, since repeated samples "
+        f"add no information: leave {run} out"
+    )
 
 
 def common_bandwidth(widths: Sequence[float | None]) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import socket
@@ -233,39 +232,6 @@ def load_run(path: str | Path, *, partial: bool = False) -> Run:
 
     chosen = chosen_of(folder, state, read_records(folder / ARCHIVE), partial)
     return Run(header.rig, chosen, source=str(folder), state=state)
-
-
-def refuse_repeated(folders: Sequence[str | Path]) -> None:
-    """Raise InputError if two folders are the same run: by path, or by content of records.h5.
-
-    Folders that do not exist here (a cluster may read them elsewhere) are compared by name only.
-    """
-    known: dict[object, Path] = {}
-    sized: dict[int, list[Path]] = {}
-    for folder in map(Path, folders):
-        keys: list[object] = [folder.resolve()]
-        archive = folder / ARCHIVE
-        if archive.is_file():
-            same_size = sized.setdefault(archive.stat().st_size, [])
-            for other in same_size:  # equal size: compare the contents
-                known.setdefault(_digest(other / ARCHIVE), other)
-            keys += [_digest(archive)] if same_size else []
-            same_size.append(folder)
-        for key in keys:
-            if key in known:
-                raise InputError(
-                    f"{folder}: is the same run as {known[key]}; expected each run once, "
-                    "since repeated samples add no information"
-                )
-            known[key] = folder
-
-
-def _digest(path: Path) -> str:
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 # Libraries that decode, store or compute data; a repeated run needs the same versions.

@@ -8,7 +8,7 @@ sampled with the multiplexer's skew and get white noise; there is no other imper
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -318,3 +318,11 @@ def default_excitations(seed: int, rms: float = 0.05) -> dict[str, dict[int, Exc
         step.name: {i - 1: Excitation.multisine(rms, rng) for i in (1, 2) if i not in step.locked}
         for step in STEPS
     }
+
+
+def one_sample_shorter(run: Run) -> Run:
+    """Return a run without the last sample of its records, as another run with nearly its data."""
+    shorter = (
+        replace(r, channels={name: x[:-1] for name, x in r.channels.items()}) for r in run.records
+    )
+    return replace(run, records=tuple(shorter))

@@ -23,6 +23,7 @@ from analysis.workers.pool import Pool, Processes, Serial
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.runs.archive import write_run
+from tests.analysis import small_bench as bench
 from tests.analysis.pool_work import about, broken, gone, noise, square
 from tests.analysis.test_accumulate import assert_same
 from tests.cli.bench import bramah_here
@@ -129,10 +130,12 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def test_a_cluster_identifies_what_one_process_does(
     scheduler: str, tmp_path: Path, multisine_run: Run
 ) -> None:
-    folders = [str(write_run(tmp_path / name, multisine_run)) for name in ("monday", "tuesday")]
+    runs = [multisine_run, bench.one_sample_shorter(multisine_run)]
+    names = ("monday", "tuesday")
+    folders = [str(write_run(tmp_path / n, run)) for n, run in zip(names, runs, strict=True)]
     with DaskCluster(scheduler) as pool:
         assert pool.workers == 1
-        both = identify([multisine_run, multisine_run], estimator=PLAIN)
+        both = identify(runs, estimator=PLAIN)
         assert_same(identify_folders(folders, pool=pool), both)
         with pytest.raises(InputError, match="item 3 cannot be used"):
             list(pool.map(broken, [3]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from analysis.identify.identify import identify
 from analysis.simulation.model import nominal_model, save_model
 from analysis.terms import with_effects
 from analysis.terms.base import Used
@@ -17,10 +19,13 @@ from drivers.base import OutputLaw
 from rig.bench.session import Bench
 from rig.cli.main import app
 from rig.model.parse import InputError
+from rig.runs import repeated
 from rig.runs.recorder import Recorder
+from rig.runs.repeated import refuse_repeated
 from rig.runs.rigs import load_rig
-from rig.runs.store import load_run, refuse_repeated
+from rig.runs.store import load_run
 from rig.runs.stream import open_record
+from tests.cli.bench import bramah_here
 from tests.services.fake_driver import FakeDriver
 
 RIG = load_rig("shinshu-2dof")
@@ -48,6 +53,14 @@ def copy(monday: Path, tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
+def imported_again(run: Path, folder: Path, kind: str) -> Path:
+    """A run exported as `kind` of file, and imported again."""
+    bramah_here("export", run, "--format", kind, "--out", folder / "files")
+    done = bramah_here("import", folder / "files" / "manifest.yaml", "--out", folder / "run")
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
 @pytest.mark.parametrize(
     "line",
     [
@@ -57,7 +70,7 @@ def copy(monday: Path, tmp_path: Path) -> Path:
         ("trace", "MONDAY", "--holdout", "AGAIN"),
     ],
 )
-@pytest.mark.parametrize("how", ["same", "other spelling", "link", "copy"])
+@pytest.mark.parametrize("how", ["same", "other spelling", "link", "copy", "csv", "mat"])
 def test_a_run_given_twice_is_refused_by_name(
     monday: Path, copy: Path, tmp_path: Path, line: tuple[str, ...], how: str
 ) -> None:
@@ -67,7 +80,7 @@ def test_a_run_given_twice_is_refused_by_name(
         "other spelling": monday / ".." / monday.name,
         "link": tmp_path / "link",
         "copy": copy,
-    }[how]
+    }.get(how) or imported_again(monday, tmp_path / how, how)
     words = [{"MONDAY": str(monday), "AGAIN": str(again)}.get(word, word) for word in line]
     if "m.json" in words:
         words[words.index("m.json")] = str(tmp_path / "m.json")
@@ -79,6 +92,28 @@ def test_a_run_given_twice_is_refused_by_name(
 
 def test_runs_of_equal_size_that_differ_are_two(monday: Path, tmp_path: Path) -> None:
     refuse_repeated([monday, taken(tmp_path / "tuesday", 500), tmp_path / "not-here"])
+
+
+def test_runs_that_begin_alike_are_two(
+    monday: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are read in stretches; the last sample of the last one differs."""
+    monkeypatch.setattr(repeated, "STRETCH", 700)
+    with h5py.File(copy / "records.h5", "a") as file:
+        file["s_r1"]["cap_pressure_2"][-1] += 1.0
+    refuse_repeated([monday, copy])
+    assert load_run(copy).records[0].channels["cap_pressure_2"][-1] > 1.0
+
+
+def test_a_notebook_that_identifies_from_a_run_and_its_copy_is_told(
+    monday: Path, copy: Path
+) -> None:
+    renamed = load_run(copy)
+    renamed = replace(
+        renamed, records=tuple(replace(r, name=f"x{r.name}") for r in renamed.records)
+    )
+    with pytest.raises(InputError, match=rf"^{copy}: is the same run as {monday}.* leave .* out$"):
+        identify([load_run(monday), renamed])
 
 
 def flip_a_sample(run: Path, channel: str) -> None:

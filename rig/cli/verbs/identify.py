@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 def load_runs(folders: Sequence[Path]) -> list[Run]:
     """Load run folders, each once; report progress if it takes long."""
-    from rig.runs.store import load_run, refuse_repeated
+    from rig.runs.repeated import refuse_repeated
+    from rig.runs.store import load_run
 
     refuse_repeated(folders)
     countdown, loaded = Countdown("loading"), []
@@ -61,7 +62,7 @@ def _streamed(
     from analysis.simulation.model import load_model
     from analysis.workers.cluster import DaskCluster
     from analysis.workers.pool import Serial
-    from rig.runs.store import refuse_repeated
+    from rig.runs.repeated import refuse_repeated
 
     refuse_repeated(runs)
     model = None if like is None else load_model(like)

@@ -24,7 +24,8 @@ def validate(
     from analysis.simulation.validate import to_json
     from analysis.simulation.validate import validate as validate_model
     from rig.cli.text.render import validation_text
-    from rig.runs.store import load_run, refuse_repeated
+    from rig.runs.repeated import refuse_repeated
+    from rig.runs.store import load_run
 
     refuse_repeated(runs)
     results = validate_model(load_model(model), [load_run(folder) for folder in runs])
