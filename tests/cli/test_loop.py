@@ -6,6 +6,7 @@ import functools
 import json
 import signal
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from rig.cli.execution.experiment_loop import (
     Loop,
     LoopRequest,
 )
+from rig.cli.simulated import simulated_bench
 from rig.cli.text.trace_text import rounds_text
 from rig.runs.rigs import load_rig
 from tests.analysis.page import Page
@@ -194,6 +196,23 @@ def test_a_terminal_closed_while_a_round_is_traced_ends_the_loop_as_ctrl_c_does(
     assert [r["round"] for r in told["rounds"]] == [1]
     assert told["stopped"] == "stopped"
     assert "Stopped: stopped" in page
+
+
+@pytest.mark.parametrize("simulate", [False, True])
+def test_the_model_becomes_the_twins_unless_the_bench_ended_with_the_loop(
+    air: Inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulate: bool
+) -> None:
+    class Made(Repeated):
+        made = air
+
+    monkeypatch.setattr(experiment_loop, "Loop", Made)
+    monkeypatch.setattr(simulated_bench, "simulated_bench", lambda *_, **__: nullcontext("here"))
+    more = ["--simulate"] if simulate else []
+    line = ("loop", "--rig", RIG, "--out", tmp_path, "--unattended", "--until-visible", *more)
+    done = bramah_here(*line)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "model.json").is_file()
+    assert ("check and run" in done.stderr) == (not simulate)
 
 
 @pytest.mark.slow

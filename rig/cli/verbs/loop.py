@@ -109,7 +109,7 @@ def loop(
             experiments.stopped = code_and_message(error)[1]
             raise
         finally:
-            _show_result(experiments, json, page)
+            _show_result(experiments, json, page, simulate)
 
 
 def _confirmed(experiment: Mapping[str, Any]) -> bool:
@@ -134,8 +134,11 @@ def _write_result(experiments: Loop, json: Path | None, report: Path) -> None:
         )
 
 
-def _show_result(experiments: Loop, json: Path | None, report: Path) -> None:
-    """Write and print the result of a loop that has ended; its model becomes that of the bench."""
+def _show_result(experiments: Loop, json: Path | None, report: Path, simulated: bool) -> None:
+    """Write and print the result of a loop that has ended; its model becomes that of the bench.
+
+    A simulated bench, which ends with the loop, keeps none.
+    """
     from rig.cli.proof.twin_choice import save_identified
     from rig.cli.text.trace_text import rounds_text
 
@@ -146,5 +149,6 @@ def _show_result(experiments: Loop, json: Path | None, report: Path) -> None:
     text = rounds_text(experiments.rounds, experiments.stopped)
     with printed_at_end(json, lambda: f"{text}\nreport: {report}"):
         _write_result(experiments, json, report)
-        model = experiments.rounds[-1].result.model_after
-        save_identified(model, experiments.request.out / "model.json", progress)
+        if not simulated:
+            model = experiments.rounds[-1].result.model_after
+            save_identified(model, experiments.request.out / "model.json", progress)
