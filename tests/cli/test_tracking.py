@@ -18,6 +18,7 @@ from analysis.identify.streams.online import Tracker, track
 from drivers.base import SampleBlock
 from rig.bench.observers import Observers
 from rig.bench.session import Bench
+from rig.cli.execution import tracking as tracking_module
 from rig.cli.execution.tracking import Follower, Tracking, summary
 from rig.model.records import Record, Run, head_of
 from rig.model.rig import Rig
@@ -116,6 +117,36 @@ def test_the_process_beside_the_run_finds_what_is_found_here(
     assert said[-1].startswith("tracked: b 23")
 
 
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize(
+    ("number", "why"),
+    [(signal.SIGKILL, "ended with signal 9"), (signal.SIGSTOP, "did not answer in 0.5 s")],
+)
+def test_estimates_that_are_missing_are_said_to_be_so_and_why(
+    rig: Rig, record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture, number: signal.Signals, why: str, known: bool,
+) -> None:  # fmt: skip
+    """The tracker's process ends or hangs, before its first answer or after some."""
+    monkeypatch.setattr(tracking_module, "FINISH_SECONDS", 0.5)
+    meta = RecordMeta("step1", 1, record.locked, record.period, record.lines)
+    with Tracking(rig, tmp_path, lambda _: None) as tracking:
+        pid = tracking._process.pid
+        assert pid is not None
+        tracking.record_begins(meta, 0, None)
+        for tick, data in blocks(rig, record, 0):
+            tracking.block(block_of(rig, tick, data))
+        while known and not tracking.parameters:
+            time.sleep(0.01)
+            tracking._receive()
+        os.kill(pid, number)
+        if number == signal.SIGKILL:
+            tracking._process.join(20)
+    (event,) = [e for e in read_events(tmp_path) if e["event"] == "not tracked"]
+    for told in (event["message"], caplog.text):
+        assert f"the tracker {why}: estimates are missing" in told
+    assert (tmp_path / "tracked.json").exists() == known
+
+
 def test_a_tracker_that_dies_costs_the_run_nothing(
     rig: Rig, record: Record, tmp_path: Path
 ) -> None:
@@ -203,6 +234,7 @@ def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
     expected = identify([load_run(run)], reject_noise=False, estimator=PLAIN).estimates
     for name in ("b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2"):
         assert kept[name]["value"] == pytest.approx(expected[name].value, rel=1e-9)
+    assert not [e for e in read_events(run) if e["event"] == "not tracked"]
     records = [e["record"] for e in read_events(run) if e["event"] == "tracked"]
     assert records == ["step1_r1", "step1_r2"]
     wrong = bramah_here(

@@ -137,6 +137,7 @@ class Tracking:
         self._notes: list[Callable[[dict[str, Any]], None]] = []
         self._shows: list[Callable[[str], None]] = []
         self._dropped = 0
+        self._failure = ""  # why the tracker stopped, as it said itself
         self._next_report = -math.inf
 
     def subscribe(
@@ -203,24 +204,42 @@ class Tracking:
         written = len(self._history)
         self._notes, self._shows = [], []  # the bench is closed, so waiting is safe
         self._send("stop")
-        deadline = time.monotonic() + FINISH_SECONDS
-        ended = False
-        while not ended and self._process.is_alive() and time.monotonic() < deadline:
-            if self._socket.poll(100):
-                ended = self._receive()
-        if not self.parameters:
+        missing = self._await_last()
+        if missing:
+            kept = f"the last ones before are in {NAME}" if self.parameters else f"no {NAME}"
+            missing = (
+                f"the tracker {missing}: estimates are missing ({kept}), the records are whole"
+            )
+            log.warning("%s", missing)
+        if self.parameters:
+            self._say(f"tracked: {summary(self.parameters)}")
+        if not self._out.is_dir():
             return
-        self._say(f"tracked: {summary(self.parameters)}")
-        if not ended:
-            self._say("the tracker did not finish in time; its last estimates are kept")
-        memory = self._memory if math.isfinite(self._memory) else None
-        data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
-        if self._out.is_dir():
+        events = EventLog(self._out)
+        if self.parameters:
+            memory = self._memory if math.isfinite(self._memory) else None
+            data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
             write_json(self._out / NAME, data)
-            events = EventLog(self._out)
             for entry in self._history[written:]:  # the delayed messages of a slow tracker
                 events.append("tracked", None, entry)
-            events.close()
+        if missing:
+            events.append("not tracked", None, {"message": missing})
+        events.close()
+
+    def _await_last(self) -> str:
+        """Wait for the tracker's last message; return '' or why it does not come."""
+        deadline = time.monotonic() + FINISH_SECONDS
+        while not self._failure:
+            alive = self._process.is_alive()  # asked first: what it sent before its end is read
+            answered = bool(self._socket.poll(100))
+            if answered and self._receive():
+                break
+            if not answered and not alive:
+                code = self._process.exitcode or 0
+                return f"ended with signal {-code}" if code < 0 else f"ended with exit code {code}"
+            if time.monotonic() > deadline:
+                return f"did not {'finish' if answered else 'answer'} in {FINISH_SECONDS:g} s"
+        return self._failure
 
     # Called by the bench
 
@@ -261,7 +280,7 @@ class Tracking:
             except zmq.Again:
                 return False
             if reply["kind"] == "failed":
-                log.warning("the tracker stopped: %s", reply["message"])
+                self._failure = f"stopped ({reply['message']})"
                 return True
             self.parameters = reply["parameters"] or self.parameters
             self.residuals = reply["residuals"]
