@@ -56,10 +56,9 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
         )
     settings = driver_class(url.scheme).settings
     try:
-        values = settings.of_endpoint(url)
-    except ValueError as error:
+        return wire.reached_by(url.scheme, settings.of_endpoint(url))
+    except (ValueError, TypeError) as error:  # TypeError: a key of every wire, such as timeout
         expected = f"the settings of {url.scheme} in the rig file's section `wire`"
         if settings.example:
             expected = f"one like {settings.example}"
         raise InputError(f"--endpoint {endpoint}: expected {expected}") from error
-    return wire.reached_by(url.scheme, values)

@@ -308,6 +308,7 @@ class Oil(Part):
 
 LOCALHOST: Final = "127.0.0.1"
 PORT: Final = 5020  # of a bench on TCP, if its rig file has none
+_PLACES: Final = ("bus", "device", "run")  # keys that name the device, other keys beside them
 
 
 class BenchLimits(Part):
@@ -360,23 +361,29 @@ class Wire(Part):
 
     @property
     def endpoint(self) -> str:
-        """The bench's address in the form of `--endpoint`: device file, bus, or host and port.
+        """The bench's address as `--endpoint` reads it: bus, device file, run, or host and port.
 
-        Two benches of one computer must differ in it: trips are stored and benches locked by it.
-        That of a kind with none of these keys is what names its device: texts, as `address: COM3`,
-        or the card of its outputs' channels, as `Dev1/ao0`.
+        Other settings follow behind ``?``, without tables, for which `--endpoint` has no form. Two
+        benches of one computer must differ before it: trips are stored and benches locked by that.
+        A kind with none of these keys has what names its device: texts, as `address: COM3`, or the
+        card of its outputs' channels, as `Dev1/ao0`.
         """
         at = self.settings
-        if "bus" in at:
-            rest = urlencode({key: value for key, value in at.items() if key != "bus"}, safe="/")
-            return f"{self.kind}://{at['bus']}{'?' if rest else ''}{rest}"
-        if "device" in at:
-            return f"{self.kind}://{at['device']}"
+        for place in _PLACES:
+            if place in at:
+                rest = urlencode(_scalars(at, place), safe="/")
+                return f"{self.kind}://{at[place]}{'?' if rest else ''}{rest}"
         if "host" not in at and "port" not in at and (named := _cards(at) or _texts(at)):
             return f"{self.kind}://{','.join(named)}"
         host = str(at.get("host", LOCALHOST))
         host = f"[{host}]" if ":" in host else host
         return f"{self.kind}://{host}:{at.get('port', PORT)}"
+
+
+def _scalars(settings: Mapping[str, Any], place: str) -> dict[str, str]:
+    """Return the settings beside `place` that are single values, as text."""
+    beside = {key: value for key, value in settings.items() if key != place}
+    return {k: str(v) for k, v in beside.items() if isinstance(v, str | int | float)}
 
 
 def _cards(settings: Mapping[str, Any]) -> list[str]:

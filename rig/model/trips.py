@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import dataclass
 from typing import Final
 
@@ -121,7 +122,8 @@ class SafetyTrip(Exception):
 
 def reset_command(rig: Rig) -> str:
     """Return the command that clears a trip of this rig's bench."""
-    return f"bramah reset --rig {rig.name} --endpoint {rig.wire.endpoint} --reason TEXT"
+    at = shlex.quote(rig.wire.endpoint)
+    return f"bramah reset --rig {rig.name} --endpoint {at} --reason TEXT"
 
 
 class Latched(Exception):
