@@ -273,6 +273,29 @@ def test_what_does_not_go_together_is_said(
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.parametrize(
+    ("rig", "scenario", "words"),
+    [
+        ("shinsu-2dof", "worn-seal", "shinsu-2dof"),
+        ("emps", "worn-seal", "emps"),
+        (RIG, "none.yaml", "none.yaml: no such file"),
+        (RIG, "wrong.yaml", "found 'sensor_gian'"),
+    ],
+)
+def test_a_bench_that_cannot_be_simulated_is_bad_input(
+    rig: str, scenario: str, words: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wrong.yaml").write_text("effects: [{name: sensor_gian, gain: 1.01}]")
+    line = ("loop", "--rig", rig, "--out", "x", "--unattended", "--simulate")
+    done = bramah_here(*line, "--scenario", scenario, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in capfd.readouterr().err  # of the bench's process
+    assert done.stderr == (
+        "bramah: the simulated bench did not start; its error message is above\n"
+    )
+    assert not (tmp_path / "x").exists()
+
+
 def test_nothing_to_gain_is_a_reason_to_stop(air: Inside, tmp_path: Path) -> None:
     from dataclasses import replace
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from analysis.workers.pool import environment
 from rig.bench.latch import STATE_VARIABLE
-from rig.cli.errors import WorkError
+from rig.cli.errors import BAD_INPUT, WorkError
 from rig.cli.text.output import write_json
 from rig.model.parse import InputError
 from rig.queue.processes import BRAMAH
@@ -33,9 +33,10 @@ def simulated_bench(
     scenario: Path | str | None = None,
     wire: str = "modbus-tcp",
 ) -> Iterator[str]:
-    """Start `bramah sim` on a wire and a free port, yield its endpoint, end it; or raise WorkError.
+    """Start `bramah sim` on a wire and a free port, yield its endpoint, end it.
 
-    The child also ends by itself when this process ends.
+    Raises InputError where the child ended because of bad input, WorkError where it did not start
+    for another reason. The child also ends by itself when this process ends.
     """
     words = ["sim", "--rig", rig, "--port", "0", "--seed", str(seed), "--parent", str(os.getpid())]
     words += ["--wire", wire]
@@ -59,8 +60,8 @@ def simulated_bench(
         try:
             endpoint = child.stdout.readline().strip()
             if not endpoint:
-                child.wait(_END_SECONDS)
-                raise WorkError("the simulated bench did not start; its error message is above")
+                error = InputError if child.wait(_END_SECONDS) == BAD_INPUT else WorkError
+                raise error("the simulated bench did not start; its error message is above")
             yield endpoint
         finally:
             child.terminate()
