@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable
+from pathlib import Path
 from urllib.parse import urlencode
 
 import pytest
@@ -71,6 +73,14 @@ def _reaches(kind: str) -> Callable[[str], None]:
         assert driver_class(kind).settings.of(again) == settings
 
     return same
+
+
+@pytest.mark.parametrize("kind", [kind for kind in wire_kinds() if PLACES[kind] is not None])
+def test_the_page_of_rig_files_names_every_key_of_every_wire(kind: str) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "rig-files.md").read_text(encoding="utf-8")
+    _, _, keys = page.partition(f"`{kind}`")
+    keys = keys.partition(";")[0]
+    assert set(driver_class(kind).settings.model_fields) <= set(re.findall(r"`(\w+)`", keys))
 
 
 def test_a_trip_of_a_replayed_run_names_how_it_was_played() -> None:
