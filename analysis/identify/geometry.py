@@ -25,8 +25,9 @@ from analysis.identify.checks import Check
 from analysis.identify.reduction import Part, RecordReduction, folded
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
+from analysis.regression.nonlinear import reduced
 from analysis.regression.rows import Rows, parameters_of, record_rows
-from analysis.regression.solve import RowCluster, solve
+from analysis.regression.solve import RowCluster, Solution, solve
 from analysis.signals.conditioning import of_other_geometry
 from analysis.simulation.model import Estimate, finite
 from analysis.terms.base import FAMILIES, Used
@@ -190,17 +191,18 @@ def _parts_of(reductions: Sequence[RecordReduction]) -> Parts:
 
 def _shifts(rig: Rig, terms: Sequence[Used], base: Parts, moved: Sequence[Parts]) -> GeometryShifts:
     """Return the shifts from the triangles of the nominal rig and of each changed one."""
-    names = {f: names for f in FAMILIES if (names := parameters_of(rig, terms, f))}
-    shifts = {
-        family: np.column_stack(
-            [_solved(columns, parts[family]) for parts in moved]
-        ) - _solved(columns, base[family])[:, None]
-        for family, columns in names.items()
-    }  # fmt: skip
+    names, shifts = {}, {}
+    for family in FAMILIES:
+        if parameters_of(rig, terms, family):
+            nominal, *others = (_solved(rig, terms, family, parts) for parts in (base, *moved))
+            names[family] = nominal.names
+            shifts[family] = np.column_stack([s.value - nominal.value for s in others])
     reciprocal = {c.parameter for u in terms for c in u.term.coefficients(rig) if c.reciprocal}
     return GeometryShifts(rig.uncertain_numbers, names, shifts, frozenset(reciprocal))
 
 
-def _solved(names: Sequence[str], parts: Sequence[Part]) -> Array:
-    """Return the least-squares coefficients (k,), NaN where the rows do not determine one."""
-    return solve(names, [RowCluster(0, 0, R, rows) for R, rows in parts]).value
+def _solved(rig: Rig, terms: Sequence[Used], family: str, parts: Parts) -> Solution:
+    """Return one family's least squares, NaN where the rows do not determine a coefficient."""
+    clusters = [RowCluster(0, 0, R, rows) for R, rows in parts[family]]
+    linear = solve(parameters_of(rig, terms, family), clusters)
+    return reduced(rig, terms, linear, clusters)

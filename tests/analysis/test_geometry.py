@@ -14,6 +14,8 @@ from analysis.identify.physical import physical, with_physics
 from analysis.identify.result import PLAIN, Identification, to_json
 from analysis.identify.streams.out_of_core import identify_folders
 from analysis.simulation.synthetic import multisine, synthetic_run
+from analysis.terms import with_effects
+from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from rig.model.records import Run
@@ -87,6 +89,22 @@ def test_the_values_stay_and_the_intervals_grow_in_quadrature(
         assert new.ci95[1] - new.value == pytest.approx(
             np.hypot(old.ci95[1] - old.value, QUANTILE * more)
         )
+
+
+def test_with_an_unknown_slope_weights_and_slope_move_as_on_the_changed_rig(
+    multisine_run: Run,
+) -> None:
+    """2 N columns of gravity have N weights and one slope; each pin of joint 2 is moved."""
+    pins = stating(multisine_run, Tolerances(pin=2e-4))
+    terms = [Used(term) for term in with_effects(pins.rig, ["base_inclination"])]
+    found = identify([pins], terms=terms, estimator=PLAIN)
+    moved = shifts(found)
+    for k, number in enumerate(pins.rig.uncertain_numbers[-2:], start=-2):
+        other = replace(multisine_run, rig=pins.rig.with_moved(number))
+        changed = identify([other], terms=terms, estimator=PLAIN)
+        for name in ("M1", "W1", "W2", "base_inclination"):
+            expected = changed.estimates[name].value - found.estimates[name].value
+            assert moved[name][k] == pytest.approx(expected, rel=0.01), name
 
 
 def test_a_number_that_all_share_moves_all_together(
