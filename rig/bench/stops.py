@@ -39,6 +39,8 @@ class StopFlag:
         if threading.current_thread() is not threading.main_thread() or self._previous:
             return
         for number in _SIGNALS:
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # nohup: a run that shall outlive its terminal
             previous = self._previous[number] = signal.signal(number, self._heard)
             if getattr(previous, "heard", False):
                 self.request(_REASONS[number])

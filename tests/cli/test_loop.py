@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import json
 import signal
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -176,20 +176,47 @@ def test_each_round_is_on_the_disk_when_the_next_begins(
     assert f"Stopped: {FLOOR}" in page
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
-def test_a_terminal_closed_while_a_round_is_traced_ends_the_loop_as_ctrl_c_does(
-    air: Inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
-) -> None:
-    class Hung(Repeated):
-        made = air
+def signalled(made_by: Inside, number: signal.Signals) -> type[Repeated]:
+    """A loop that gets a signal while it traces its second round."""
+
+    class Signalled(Repeated):
+        made = made_by
 
         def _trace(self, round_: int, experiment: object) -> None:
             if round_ == 2:
                 signal.raise_signal(number)
             super()._trace(round_, experiment)
 
-    monkeypatch.setattr(experiment_loop, "Loop", Hung)
-    done = bramah_here("loop", "--rig", RIG, "--out", tmp_path, "--unattended", "--until-visible")
+    return Signalled
+
+
+@contextmanager
+def hang_up(action: signal.Handlers) -> Iterator[None]:
+    """What SIGHUP does to a process that is started now, whatever it does to these tests."""
+    before = signal.signal(signal.SIGHUP, action)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_loop_under_nohup_outlives_its_terminal(
+    air: Inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(experiment_loop, "Loop", signalled(air, signal.SIGHUP))
+    line = ("loop", "--rig", RIG, "--out", tmp_path, "--unattended", "--until-visible")
+    with hang_up(signal.SIG_IGN):
+        assert bramah_here(*line).returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_a_terminal_closed_while_a_round_is_traced_ends_the_loop_as_ctrl_c_does(
+    air: Inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    monkeypatch.setattr(experiment_loop, "Loop", signalled(air, number))
+    line = ("loop", "--rig", RIG, "--out", tmp_path, "--unattended", "--until-visible")
+    with hang_up(signal.SIG_DFL):
+        done = bramah_here(*line)
     assert done.returncode == 130
     assert done.stderr.splitlines()[-1] == "bramah: stopped"
     told, page = of_a_killed_loop(tmp_path)

@@ -16,7 +16,8 @@ from rig.cli.main import Interruption
 @pytest.fixture
 def handlers() -> Iterator[None]:
     """Put this process's own handlers back afterwards."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
     for number in before:
         signal.signal(number, Interruption())
     yield
@@ -27,7 +28,11 @@ def handlers() -> Iterator[None]:
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize(
     ("number", "reason"),
-    [(signal.SIGINT, "stopped by operator (Ctrl-C)"), (signal.SIGTERM, "stopped by SIGTERM")],
+    [
+        (signal.SIGINT, "stopped by operator (Ctrl-C)"),
+        (signal.SIGTERM, "stopped by SIGTERM"),
+        (signal.SIGHUP, "stopped because the terminal closed"),
+    ],
 )
 def test_a_swallowed_signal_stops_the_bench_that_is_driven_next(
     number: signal.Signals, reason: str
@@ -38,6 +43,24 @@ def test_a_swallowed_signal_stops_the_bench_that_is_driven_next(
     flag.install()
     assert flag.reason == reason
     flag.restore()
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_terminal_that_closes_interrupts_once_though_it_signals_twice() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGHUP)
+    signal.raise_signal(signal.SIGHUP)  # the report is being written
+
+
+@pytest.mark.usefixtures("handlers")
+def test_under_nohup_the_terminal_may_close() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    flag = StopFlag()
+    flag.install()
+    signal.raise_signal(signal.SIGHUP)
+    assert flag.reason is None
+    flag.restore()
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
 
 
 @pytest.mark.usefixtures("handlers")
