@@ -9,7 +9,6 @@ blocks.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,7 +21,7 @@ from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.settings import DATA, TRACE
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Run, samples_digest
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -124,7 +123,9 @@ def refuse_repeated_records(
     for kind, option, checked in (
         ("training", "", runs), ("held-out", "--holdout", holdout), ("judging", "--judge", judge),
     ):  # fmt: skip
-        digests = [(_digest(record), record.name) for run in checked for record in run.records]
+        digests = [
+            (samples_digest(record), record.name) for run in checked for record in run.records
+        ]
         for digest, name in digests if option else ():
             if digest in known:
                 raise InputError(
@@ -132,12 +133,3 @@ def refuse_repeated_records(
                     f"used twice: give {option} other records"
                 )
         known |= {digest: f"{kind} record {name!r}" for digest, name in digests}
-
-
-def _digest(record: Record) -> str:
-    """Return a digest of a record's samples, the same whatever its name."""
-    digest = hashlib.sha256()
-    for name in sorted(record.channels):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
-    return digest.hexdigest()
