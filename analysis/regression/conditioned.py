@@ -34,7 +34,12 @@ class ConditionedRecord:
     def condition_alike(self, rig: Rig, record: Record) -> ConditionedRecord:
         """Condition another record (averaged repeats, added noise) with this one's settings."""
         signals = _weighted_signals(rig, record, self.filtering, self.signals.bands)
-        return replace(self, record=record, signals=signals)
+        return replace(self, record=record, signals=signals, repeats=())
+
+    def with_changed_signals(self, change: Callable[[Signals], Signals]) -> ConditionedRecord:
+        """Return the record with changed signals, those of its repeats too."""
+        repeats = tuple(repeat.with_changed_signals(change) for repeat in self.repeats)
+        return replace(self, signals=change(self.signals), repeats=repeats)
 
     def samples_at(self, time: Array) -> Indices:
         """Return the indices of the samples (m,) nearest to the times (m,) [s]."""

@@ -16,7 +16,11 @@ from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.regression.least_squares import column_scale
 from analysis.regression.rows import in_common, matrix_of, parameters_of
 from analysis.terms.base import Used, family_of
-from analysis.trace.data.conditioned_record import acting_on, shared_rows
+from analysis.trace.data.conditioned_record import (
+    acting_on,
+    model_rows,
+    shared_rows,
+)
 from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.settings import TRACE
@@ -274,7 +278,11 @@ def noise_amplification(data: RegressionData, fit: ExactFit) -> Array:
     equation's rms by stated noise under the fit's terms and under the data's own, at least 1.
     """
     factors = np.ones(len(data.base))
-    for conditioned, rows in zip(data.records, data.rows, strict=True):
+    for average, of_average in zip(data.records, data.rows, strict=True):
+        conditioned, rows = average, of_average
+        if average.repeats:  # one stands for all: averaged channels are of no motion
+            conditioned = average.repeats[0]
+            rows = model_rows(data.rig, data.terms, conditioned)
         after = shared_rows(data.rig, fit.terms, conditioned, data.cache)
         noise = stated_noise(data.rig, data.terms, conditioned, rows, data.beta)
         amplified = stated_noise(data.rig, fit.terms, conditioned, after, fit.beta)

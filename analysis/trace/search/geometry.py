@@ -12,6 +12,7 @@ residual when each number is one sigma larger, and the share w of the rows that 
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -92,9 +93,8 @@ def residual_changes(
     stated, columns = residual(data), []
     for number in numbers:
         other = data.rig.with_moved(number)
-        records = tuple(
-            replace(c, signals=of_other_geometry(data.rig, c.signals, other)) for c in data.records
-        )
+        moved = functools.partial(of_other_geometry, data.rig, other=other)
+        records = tuple(c.with_changed_signals(moved) for c in data.records)
         columns.append(
             residual(replace(data, rig=other, records=records, cache=RowCache())) - stated
         )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from analysis.trace import engine
+from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.trace_rows import with_other_motions_apart
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -46,6 +47,16 @@ def test_a_joint_that_drifts_between_repeats_still_repeats_its_motion(rig: Rig) 
         records.append(replace(record, channels={**record.channels, "piston_2": piston}))
     (alike,), nothing = with_other_motions_apart([replace(train, records=tuple(records))])
     assert ([r.step for r in alike.records], nothing) == (["step1"] * 4, ())
+
+
+def test_another_geometry_or_noise_is_that_of_the_repeats_too(rig: Rig) -> None:
+    """The rows of an average of repeats that differ are made of the repeats' signals."""
+    first, *others = conditioned_records(rig, [pair_of_runs(rig)[0]])
+    average = replace(first, repeats=(first, *others))
+    moved = average.with_changed_signals(lambda signals: replace(signals, u=2.0 * signals.u))
+    for before, after in zip((first, first, *others), (moved, *moved.repeats), strict=True):
+        np.testing.assert_array_equal(after.signals.u, 2.0 * before.signals.u)
+    assert average.condition_alike(rig, first.record).repeats == ()
 
 
 def test_a_clean_bench_stays_clean(rig: Rig) -> None:
