@@ -166,10 +166,11 @@ def refitted_notes(
         for name, change in changes.items()
     ]
     if parts:
+        lubricant = "a lubricant" if model.rig.electric else "oil"
         notes.append(
             f"the held-out records have {' and '.join(parts)} than the training records, as with "
-            "oil of another temperature: the errors are given with that; measure the oil's "
-            "temperature, or hold out records with oil as warm"
+            f"{lubricant} of another temperature: the errors are given with that; hold out records "
+            "as warm as the training records"
         )
     names = [n for n in refitted_names(fit, judged, oil) if n in model.parameters]
     if names:
