@@ -115,13 +115,15 @@ def judge_effects(
         removes = removed.share >= TRACE.least_removed and not disturbed
         significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown_size else "")
         rival_words = rivals.rivals_in_words([*inseparable, *others])
-        rival_words += rivals.pair_in_words(hypotheses, winner, used, tie_test)
+        separated = not (inseparable or any(r.tied for r in others))
+        if separated:
+            rival_words += rivals.pair_in_words(hypotheses, winner, used, tie_test)
         gates = (
             Gate(REMOVES, removes, held_out.removal_in_words(removed, disturbed)),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences_in_words(differing)),
             Gate(SIGNIFICANT, p <= TRACE.p_limit and not unknown_size, significance),
-            Gate(NO_RIVAL, not (inseparable or any(r.tied for r in others)), rival_words),
+            Gate(NO_RIVAL, separated, rival_words),
         )
         out.append(
             JudgedEffect(
