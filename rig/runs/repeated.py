@@ -16,8 +16,8 @@ STRETCH: Final = 100_000  # samples of a record in memory at a time
 _Place = tuple[Path, str]  # folder of a run, and the name of a record in it
 
 
-def refuse_repeated(folders: Sequence[str | Path]) -> None:
-    """Raise InputError if two folders are the same run, or have a record with the same samples.
+def refuse_repeated(folders: Sequence[str | Path], partly: bool = True) -> None:
+    """Raise InputError if two folders are the same run or, if `partly`, have a record in common.
 
     Records are read in full only where they begin alike. Folders that do not exist here (a cluster
     may read them elsewhere) are compared by name only. Raises InputError as `load_run` does.
@@ -28,21 +28,27 @@ def refuse_repeated(folders: Sequence[str | Path]) -> None:
             raise repeated_run(str(folder), str(known[folder.resolve()]))
         known[folder.resolve()] = folder
     if len(known) > 1:
-        _refuse_shared_records(
-            [folder for folder in known.values() if (folder / ARCHIVE).is_file()]
-        )
+        stored = [folder for folder in known.values() if (folder / ARCHIVE).is_file()]
+        _refuse_shared_records(stored, partly)
 
 
-def _refuse_shared_records(folders: Sequence[Path]) -> None:
+def _refuse_shared_records(folders: Sequence[Path], partly: bool) -> None:
     begun: dict[str, list[_Place]] = {}
+    counts: dict[Path, int] = {}
     for folder in folders:
-        for head in read_run_head(folder).records:
+        heads = read_run_head(folder).records
+        counts[folder] = len(heads)
+        shared: dict[Path, list[tuple[str, str]]] = {}
+        for head in heads:
             with open_record(folder, head.name) as reader:
                 alike = begun.setdefault(samples_digest(reader.read(0, FIRST)), [])
             for other, name in alike:
                 if other != folder and _same_samples((folder, head.name), (other, name)):
-                    raise repeated_run(str(folder), str(other), (head.name, name))
+                    shared.setdefault(other, []).append((head.name, name))
             alike.append((folder, head.name))
+        for other, pairs in shared.items():
+            if partly or len(pairs) == len(heads) == counts[other]:
+                raise repeated_run(str(folder), str(other), pairs[0])
 
 
 def _same_samples(one: _Place, other: _Place) -> bool:

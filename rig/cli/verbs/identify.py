@@ -22,12 +22,15 @@ if TYPE_CHECKING:
     from rig.model.records import Record, Run
 
 
-def load_runs(folders: Sequence[Path]) -> list[Run]:
-    """Load run folders, each once; report progress if it takes long."""
+def load_runs(folders: Sequence[Path], partly: bool = True) -> list[Run]:
+    """Load run folders, each once; report progress if it takes long.
+
+    Raises InputError for the same run twice and, if `partly`, for runs that share a record.
+    """
     from rig.runs.repeated import refuse_repeated
     from rig.runs.store import load_run
 
-    refuse_repeated(folders)
+    refuse_repeated(folders, partly)
     countdown, loaded = Countdown("loading"), []
     for folder in folders:
         loaded.append(load_run(folder))

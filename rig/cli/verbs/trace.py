@@ -64,7 +64,8 @@ def trace(
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
     families = FAMILIES_OF[equations]
-    all_runs = load_runs([*runs, *holdout, *(judge or ())])
+    # The trace itself says which purpose a record serves twice.
+    all_runs = load_runs([*runs, *holdout, *(judge or ())], partly=False)
     training, unseen = all_runs[: len(runs)], all_runs[len(runs) :]
     chosen_by, judged_by = unseen[: len(holdout)], unseen[len(holdout) :]
     rigs = {run.source: run.rig for run in all_runs}
