@@ -71,15 +71,23 @@ def _with_another(hypotheses: HypothesisSet, current: Hypothesis) -> list[Hypoth
     """Return the sets with one of the best other candidates in the place of an effect.
 
     Columns under the baseline choose the candidates: to compute them anew for each set takes long.
-    A single effect has been compared with the others already.
+    Beside them the best candidate is tried that was fitted alone and that they do not show: columns
+    of first order do not reach an inclination of 0.3 rad. A single effect has been compared with
+    the others already.
     """
     if len(current.effects) < 2:
         return []
     columns = [c for c in hypotheses.columns if c.used.term.key not in current.keys]
+    alone = [o for o in hypotheses.fitted.values() if o.size[0] == 1 and not o.keys & current.keys]
+    alone.sort(key=lambda o: o.total)
     sets = []
     for used in current.effects:
         smaller = hypotheses.refined_anew(current.without(used))
         data = rebased(hypotheses.train_data, smaller.fit)
-        starts = hypotheses.best_additions(data, smaller, columns)[: SEARCH.replacements]
-        sets += [hypotheses.extended(smaller, effects) for effects in starts]
+        starts = hypotheses.best_additions(data, smaller, columns)
+        sets += [hypotheses.extended(smaller, effects) for effects in starts[: SEARCH.replacements]]
+        shown = {effects[-1].term.key for effects in starts}
+        hidden = [o for o in alone if not o.keys & shown and not hypotheses.physical_problem(o)]
+        for single in hidden[:1]:
+            sets.append(hypotheses.refined((*smaller.effects, *single.effects), current))
     return sets
