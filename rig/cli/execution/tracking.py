@@ -281,6 +281,7 @@ class Tracking:
                 return False
             if reply["kind"] == "failed":
                 self._failure = f"stopped ({reply['message']})"
+                log.warning("the tracker %s", self._failure)
                 return True
             self.parameters = reply["parameters"] or self.parameters
             self.residuals = reply["residuals"]
