@@ -96,7 +96,8 @@ def judge_effects(
         without = held_out_residual(holdout_data, alternative.fit)
         changes = held_out.removed_energy(winner, alternative)
         tie_test = rivals.TieTest(holdout_data, changes, after, without)
-        others = rivals.rivals_of(hypotheses, winner, used, alternative, tie_test)
+        pairs = rivals.tied_pairs(hypotheses, winner, used, tie_test)
+        others = rivals.rivals_of(hypotheses, winner, used, alternative, tie_test, pairs)
         removed = held_out.removal_of(holdout_data, changes, without, after)
         disturbed = {
             *held_out.disturbed_equations(hypotheses, winner, alternative),
@@ -117,7 +118,7 @@ def judge_effects(
         rival_words = rivals.rivals_in_words([*inseparable, *others])
         separated = not (inseparable or any(r.tied for r in others))
         if separated:
-            rival_words += rivals.pair_in_words(hypotheses, winner, used, tie_test)
+            rival_words += rivals.pair_in_words(pairs)
         gates = (
             Gate(REMOVES, removes, held_out.removal_in_words(removed, disturbed)),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,14 +42,28 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class TiedPair:
+    """A fitted set with two `effects` in the place of one, tied with it in held-out rows.
+
+    `ratio` is that of `TieTest`, `cost` the energy of the set with the price of its numbers.
+    """
+
+    hypothesis: Hypothesis
+    effects: tuple[Used, Used]
+    ratio: float
+    cost: float
+
+
 def rivals_of(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
     used: Used,
     alternative: Hypothesis,
     held_out_test: TieTest,
+    pairs: Sequence[TiedPair],
 ) -> list[Rival]:
-    """Return the rivals of an effect: fitted sets with another effect in its place.
+    """Return the rivals of an effect: fitted sets with another effect, or a pair, in its place.
 
     Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
     held-out records have shown that it is too simple; a richer one is a rival where it changes a
@@ -103,13 +117,13 @@ def rivals_of(
             out.append(rival)
         elif tied:
             richer.append(rival)
-    least = cost(train_data, winner, holdout_data)
-    for with_pair, ratio, effects in _tied_pairs(hypotheses, winner, used, held_out_test):
-        moved = moved_parameter(train_data, winner, with_pair)
-        # One effect is the simpler explanation, unless training and held-out rows prefer two.
-        if moved and cost(train_data, with_pair, holdout_data) < least:
-            ratios = ratio, training_test.ratio(with_pair.fit.residual)
-            one, two = (_rival(effect_in(u), *ratios, True) for u in effects)
+    # One effect is the simpler explanation, unless training and held-out rows prefer two.
+    least = cost(train_data, winner, holdout_data) if pairs else 0.0
+    for tied_pair in (p for p in pairs if p.cost < least):
+        moved = moved_parameter(train_data, winner, tied_pair.hypothesis)
+        if moved:
+            ratios = tied_pair.ratio, training_test.ratio(tied_pair.hypothesis.fit.residual)
+            one, two = (_rival(effect_in(u), *ratios, True) for u in tied_pair.effects)
             out.append(replace(one, moved=moved, beside=two))
     if any(rival.tied for rival in out):
         out += richer
@@ -336,33 +350,33 @@ def _law_parameters(rig: Rig, law: str) -> set[str]:
     return {c.parameter for term in terms for c in term.coefficients(rig)}
 
 
-def _tied_pairs(
+def tied_pairs(
     hypotheses: HypothesisSet, winner: Hypothesis, used: Used, held_out_test: TieTest
-) -> list[tuple[Hypothesis, float, tuple[Used, Used]]]:
+) -> list[TiedPair]:
     """Return the sets with two effects in the place of one that leave as little in held-out rows.
 
-    Each with its ratio of `TieTest` and the two effects, the set that costs least first.
+    The set that costs least comes first.
     """
-    out = []
-    for pair, (first, second) in hypotheses.replacements(winner, used, by=2):
-        residual = held_out_residual(held_out_test.data, pair.fit)
-        if held_out_test.ties(residual, TRACE.tie_ratio) and not hypotheses.physical_problem(pair):
-            out.append((pair, held_out_test.ratio(residual), (first, second)))
-    data = hypotheses.train_data
-    return sorted(out, key=lambda tied: cost(data, tied[0], held_out_test.data))
+    holdout_data, out = held_out_test.data, []
+    for hypothesis, (first, second) in hypotheses.replacements(winner, used, by=2):
+        residual = held_out_residual(holdout_data, hypothesis.fit)
+        tied = held_out_test.ties(residual, TRACE.tie_ratio)
+        if tied and not hypotheses.physical_problem(hypothesis):
+            price = cost(hypotheses.train_data, hypothesis, holdout_data)
+            ratio = held_out_test.ratio(residual)
+            out.append(TiedPair(hypothesis, (first, second), ratio, price))
+    return sorted(out, key=lambda pair: pair.cost)
 
 
-def pair_in_words(
-    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, held_out_test: TieTest
-) -> str:
+def pair_in_words(pairs: Sequence[TiedPair]) -> str:
     """Name the best two effects that together leave as little as one ('' if none do).
 
     They are no rival where no parameter changes with them, since one effect is simpler.
     """
-    for _, ratio, effects in _tied_pairs(hypotheses, winner, used, held_out_test)[:1]:
-        names = " and ".join(u.term.name for u in effects)
-        return f"; {names} together would leave {ratio:.2f} times the held-out rms"
-    return ""
+    if not pairs:
+        return ""
+    names = " and ".join(u.term.name for u in pairs[0].effects)
+    return f"; {names} together would leave {pairs[0].ratio:.2f} times the held-out rms"
 
 
 def _is_refused_simpler_name(

@@ -188,7 +188,7 @@ RULES: Final = (
          "a rival with further numbers must remove the price of each, whatever it means",
          ((rivals, "moved_parameter", lambda *_: None),)),
     Rule("two in place of one", "two effects are no rival of one",
-         ((rivals, "_tied_pairs", lambda *_: []),)),
+         ((rivals, "tied_pairs", lambda *_: []),)),
     Rule("small effects", "an effect too small to be named widens no interval",
          ((fitted_model, "sets_with_small_effect", lambda *_: []),)),
     Rule("open parameters", "a richer name that leaves another parameter open is no rival",
