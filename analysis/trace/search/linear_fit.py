@@ -215,14 +215,7 @@ def best_pairs(
 
     Effects `left_out` (name, where) are in none.
     """
-    g = gains(
-        candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
-    )
-    best_variant: dict[Key, int] = {}
-    for i in map(int, np.argsort(-g)[: 6 * SEARCH.pair_starts]):
-        key = candidates.entries[i].used.term.key
-        if g[i] > 0 and key not in left_out:
-            best_variant.setdefault(key, i)
+    best_variant = _best_variants(candidates, r, left_out, 6 * SEARCH.pair_starts)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(best_variant.values())[: SEARCH.pair_starts]:
         for pair in sets_with_one_more(candidates, (first,), r, left_out)[:3]:
@@ -230,6 +223,24 @@ def best_pairs(
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
     return sorted(pairs.values(), key=lambda p: p.total)[: SEARCH.refined_pairs]
+
+
+def _best_variants(
+    candidates: CandidateColumns, r: Array, left_out: Collection[Key], most: int | None = None
+) -> dict[Key, int]:
+    """Return the entry of each effect that removes most, the best first; of the `most` best ones.
+
+    Effects `left_out` (name, where) and those that remove nothing are not among them.
+    """
+    g = gains(
+        candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
+    )
+    best: dict[Key, int] = {}
+    for i in map(int, np.argsort(-g)[:most]):
+        key = candidates.entries[i].used.term.key
+        if g[i] > 0 and key not in left_out:
+            best.setdefault(key, i)
+    return best
 
 
 def pairs_of_chambers(
@@ -240,14 +251,7 @@ def pairs_of_chambers(
     Both pipes longer than stated, or both pressures read against vacuum, are as likely as one, and
     details of form that the columns lack may hide each alone. Effects `left_out` are in none.
     """
-    g = gains(
-        candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
-    )
-    best: dict[Key, int] = {}
-    for i in map(int, np.argsort(-g)):
-        key = candidates.entries[i].used.term.key
-        if g[i] > 0 and key not in left_out:
-            best.setdefault(key, i)
+    best = _best_variants(candidates, r, left_out)
     others = {(name, where): (name, where.removesuffix("cap") + "rod") for name, where in best}
     pairs = [
         fit_members(candidates, (best[cap], best[rod]), r)
