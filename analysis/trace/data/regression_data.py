@@ -145,8 +145,6 @@ class RegressionData:
 def _averaged_record(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecord:
     """Return the average of the repeats' channels, filtered like them."""
     reference = repeats[0]
-    if len(repeats) == 1:
-        return reference
     count = min(conditioned.record.samples for conditioned in repeats)
     names = [c for c in reference.record.channels if all(c in s.record.channels for s in repeats)]
     channels = {
@@ -176,6 +174,8 @@ def _average(
     the mean. Rows weighted by speed do not count: the noise of a speed alone changes its weight.
     `noise` [SI] is that of one record, by equation.
     """
+    if len(repeats) == 1:
+        return repeats[0], dict(of_repeats[0])
     average = _averaged_record(rig, repeats)
     of_average, mean = model_rows(rig, terms, average), mean_rows(of_repeats)
     in_motion = average.filtering.in_motion

@@ -280,7 +280,7 @@ def noise_amplification(data: RegressionData, fit: ExactFit) -> Array:
     factors = np.ones(len(data.base))
     for average, of_average in zip(data.records, data.rows, strict=True):
         conditioned, rows = average, of_average
-        if average.repeats:  # one stands for all: averaged channels are of no motion
+        if average.repeats:  # the averaged channels belong to no motion
             conditioned = average.repeats[0]
             rows = model_rows(data.rig, data.terms, conditioned)
         after = shared_rows(data.rig, fit.terms, conditioned, data.cache)

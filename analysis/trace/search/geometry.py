@@ -63,7 +63,7 @@ def geometry_for_smaller_set(
     largest = winner if explained else min(hypotheses.fitted.values(), key=lambda o: o.total)
     for size in range(1, len(largest.effects)):
         for effects in itertools.combinations(largest.effects, size):
-            hypotheses.refined(effects)  # some of them may stand for the geometry
+            hypotheses.refined(effects)  # fitted, so that the geometry is tried beside each
     for hypothesis in (hypotheses.empty, *hypotheses.fitted.values()):
         if explained and hypothesis.size >= winner.size:
             continue
