@@ -16,6 +16,8 @@ from analysis.trace.finding import Finding, has_tied_rival, remainders
 from analysis.trace.judge import gates
 from analysis.trace.judge.curves import CurveRange
 from analysis.trace.result import CONFOUNDED, EXPLAINED, UNEXPLAINED
+from analysis.trace.search.extensions import extended_in, extensions
+from analysis.trace.search.forward_search import completed_to_noise
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     act_at_one_joint,
@@ -79,7 +81,7 @@ def _sets_with_free_form(
     for start in _sets_to_extend(hypotheses, winner, explained):
         if len(start.laws) >= most:
             continue
-        for single in hypotheses.extensions(start, free=True):
+        for single in extensions(hypotheses, start, free=True):
             # An effect that removes so little would be needless beside a further one.
             if removes_too_little(start, single, hypotheses.noise_band):
                 continue
@@ -156,9 +158,9 @@ def _with_further_effect(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> H
     above_form_error = {e for e, v in energy.items() if not hypotheses.negligible(e, v)}
     larger: Hypothesis | None = None
     if not above_form_error:
-        larger = hypotheses.completed_to_noise(hypothesis)
+        larger = completed_to_noise(hypotheses, hypothesis)
     elif may_grow(hypothesis.effects):
-        larger = hypotheses.extended_in(hypothesis, above_form_error)
+        larger = extended_in(hypotheses, hypothesis, above_form_error)
     return hypothesis if larger is None or _curves_share_a_balance(hypotheses, larger) else larger
 
 

@@ -25,6 +25,8 @@ from analysis.trace.judge.unrepeated import unrepeated_floors
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.exchanges import exchanged
+from analysis.trace.search.extensions import extended_in, with_parts_beside
+from analysis.trace.search.forward_search import search
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH
@@ -59,7 +61,7 @@ def search_and_judge(
     in_noise = hypotheses.within_noise(hypotheses.empty)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    found = exchanged(hypotheses, hypotheses.run(progress))
+    found = exchanged(hypotheses, search(hypotheses, progress))
     winner = improved_by_exact_trials(hypotheses, found)
     if in_noise:
         winner = _shown_by_held_out_rows(hypotheses, winner, choosing)
@@ -156,7 +158,7 @@ class Judge:
         They are those that the search found, then both parts of a law, of which one was judged: a
         level alone, or a breakaway alone, has not the same size at all speeds where both act.
         """
-        parts = map(self.hypotheses.refined, self.hypotheses.with_parts_beside(simplest))
+        parts = map(self.hypotheses.refined, with_parts_beside(self.hypotheses, simplest))
         for other in (winner, *sorted(parts, key=lambda o: o.total)):
             if other.keys != simplest.keys:
                 finding = self.apply_gates(other)
@@ -259,7 +261,7 @@ class Judge:
         while finding.remainders:
             winner, remaining = finding.winner, finding.remainders
             equations = {r.equation for r in remaining}
-            larger = self.hypotheses.extended_in(winner, equations)
+            larger = extended_in(self.hypotheses, winner, equations)
             if larger is None:
                 break
             judged = gates.judge_effects(self.hypotheses, larger, self.choosing, self.rng)

@@ -28,6 +28,7 @@ from analysis.trace.search.exact_fit import (
     over_amplified_noise,
     rescale,
 )
+from analysis.trace.search.extensions import with_parts_beside
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -276,7 +277,7 @@ def alternatives_of(
             if richer not in tied and moved_parameter(rows, winner, richer, law) is None:
                 possible = not hypotheses.physical_problem(richer)
                 out.append((richer, "" if possible else law))
-    for parts in map(hypotheses.refined, hypotheses.with_parts_beside(winner)):
+    for parts in map(hypotheses.refined, with_parts_beside(hypotheses, winner)):
         if not hypotheses.physical_problem(parts):
             out.append((parts, ""))
     return out

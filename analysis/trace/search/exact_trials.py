@@ -13,6 +13,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import effect_in
 from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.exchanges import exchanged
+from analysis.trace.search.extensions import may_act
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -71,7 +72,7 @@ def _best_additions(
     for used in hypotheses.variants_of(data, current.fit.residual):
         effect = effect_in(used)
         may_join = effect.key not in current.keys and not effect.free
-        if may_join and hypotheses.may_act(effect, current, equations):
+        if may_join and may_act(hypotheses, effect, current, equations):
             effects = (*start, used)
             energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
             if energy < best_trial.get(effect.key, (float("inf"), ()))[0]:

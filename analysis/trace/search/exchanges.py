@@ -6,6 +6,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import complexity
 from analysis.trace.search import linear_fit
 from analysis.trace.search.exact_fit import rebased
+from analysis.trace.search.extensions import best_additions, candidates_beside, extended
 from analysis.trace.search.hypothesis import Hypothesis, keys_of, may_grow
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
@@ -47,7 +48,7 @@ def _with_two_for_one(
     columns = [c for c in hypotheses.columns if c.used.term.key not in taken]
     smaller = hypotheses.refined(others)
     data = rebased(hypotheses.train_data, smaller.fit)
-    candidates, r = hypotheses.candidates_beside(data, smaller, columns)
+    candidates, r = candidates_beside(hypotheses, data, smaller, columns)
     alone = [m for m, e in enumerate(candidates.entries) if e.used.term.key == key]
     least = min((linear_fit.fit_members(candidates, [m], r).total for m in alone), default=0.0)
     limit = least + sum(hypotheses.noise_band.values())
@@ -84,8 +85,10 @@ def _with_another(hypotheses: HypothesisSet, current: Hypothesis) -> list[Hypoth
     for used in current.effects:
         smaller = hypotheses.refined_anew(current.without(used))
         data = rebased(hypotheses.train_data, smaller.fit)
-        starts = hypotheses.best_additions(data, smaller, columns)
-        sets += [hypotheses.extended(smaller, effects) for effects in starts[: SEARCH.replacements]]
+        starts = best_additions(hypotheses, data, smaller, columns)
+        sets += [
+            extended(hypotheses, smaller, effects) for effects in starts[: SEARCH.replacements]
+        ]
         shown = {effects[-1].term.key for effects in starts}
         hidden = [o for o in alone if not o.keys & shown and not hypotheses.physical_problem(o)]
         for single in hidden[:1]:

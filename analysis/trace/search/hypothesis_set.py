@@ -1,8 +1,6 @@
-"""The search for a set of effects: candidates ranked by their columns, then fitted exactly.
+"""The sets of effects fitted in a search, and the choice among them.
 
-The columns are of first order in a change of signals. The best single effects and pairs are fitted
-exactly and, where more than noise remains, extended from data that have the set among their terms.
-Every set fitted on the way is kept, since the rivals of the winner are taken from these sets.
+Every set that is fitted is kept, since the rivals of the winner are taken from these sets.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +15,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import at_start, complexity, effect_in, effects_among, variants
+from analysis.trace.data.candidates import at_start, complexity, effect_in, variants
 from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
@@ -30,28 +27,20 @@ from analysis.trace.search import linear_fit
 from analysis.trace.search.exact_fit import (
     ExactFit,
     fit_coefficients,
-    jacobian,
     parameter_values,
-    rebased,
 )
 from analysis.trace.search.hypothesis import (
-    BENCH,
     Hypothesis,
     Key,
     effect_of,
     energy_above_noise,
     is_preferred,
     keys_of,
-    law_of,
-    log_energy_ratio,
-    may_grow,
     negative_body,
     noise_band,
-    of_one_law,
     removes_too_little,
-    spoils_equation,
 )
-from analysis.trace.search.refinement import at_best_size, refine
+from analysis.trace.search.refinement import refine
 from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
@@ -63,7 +52,7 @@ class HypothesisSet:
 
     `base` are the model's own terms, `effects` the candidates, `fitted` all sets fitted so far by
     names and places, `empty` the set without effects (the baseline), `noise_band` the energy that
-    counts as noise. `columns` and `candidates` are set by `run`.
+    counts as noise. `columns` and `candidates` are set by `compute_columns`.
     """
 
     def __init__(self, train_data: RegressionData, effects: Sequence[Effect]) -> None:
@@ -84,14 +73,19 @@ class HypothesisSet:
         fit = fit_coefficients(self.train_data, (*self.base, *effects))
         return self._hypothesis(fit.terms[len(self.base) :], fit)
 
+    def compute_columns(self, progress: Callable[[float], None] | None = None) -> None:
+        """Compute the candidates' columns under the baseline; `progress` receives the share."""
+        data = self.train_data
+        self.columns = variant_columns(data, self.variants_of(data, data.mean_residual), progress)
+        self.candidates = self.candidate_columns(data, self.columns)
+
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
         """Return a copy with further candidates, which shares the sets fitted so far."""
         extended = copy.copy(self)
         extended.effects = tuple(effects)
-        data = self.train_data
-        new_columns = variant_columns(data, extended.variants_of(data, data.mean_residual))
-        extended.columns = [*self.columns, *new_columns]
-        extended.candidates = self._candidate_columns(data, extended.columns)
+        extended.compute_columns()
+        extended.columns = [*self.columns, *extended.columns]
+        extended.candidates = self.candidate_columns(self.train_data, extended.columns)
         extended.effects = (*self.effects, *effects)
         return extended
 
@@ -180,7 +174,7 @@ class HypothesisSet:
 
         Where an effect equals a simpler one that it includes, the set with that one is tried too.
         """
-        physical = [o for o in (*among, *self._simpler_sets(among)) if not self.physical_problem(o)]
+        physical = [o for o in (*among, *self.simpler_sets(among)) if not self.physical_problem(o)]
         if not physical:
             return self.empty
 
@@ -195,7 +189,7 @@ class HypothesisSet:
             preferred, (o for o in similar if (sum(o.size), o.size[0]) == least_size)
         )
 
-    def _simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
+    def simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the sets with an effect replaced by a simpler one that it equals."""
         rig, out = self.train_data.rig, []
         in_model = {u.term.key for u in self.base}
@@ -207,70 +201,6 @@ class HypothesisSet:
                     simple = at_start(rig, effect_of(name, where))
                     out.append(self.refined([*hypothesis.without(used), simple]))
         return out
-
-    def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
-        """Search single effects, pairs and extensions, and return the best set.
-
-        `progress` is called with the share of the candidates' columns that is computed.
-        """
-        data, r = self.train_data, self.train_data.mean_residual
-        self.columns = variant_columns(data, self.variants_of(data, r), progress)
-        candidates = self.candidates = self._candidate_columns(data, self.columns)
-        r = r - candidates.basis @ (candidates.basis.T @ r)
-        result = self._searched(candidates, r)
-        return self.fitted.get(result.keys, result)  # a later start may have found better shapes
-
-    def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
-        """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
-        band = self.noise_band
-        singles = [self.refined(effects) for effects in self._best_singles(candidates, r)]
-        current = self.prune(self.best([self.empty, *singles]))
-        if self.within_noise(current):
-            return current
-        pairs = [
-            self.refined([candidates.entries[m].used for m in pair.members])
-            for pair in (
-                *linear_fit.best_pairs(candidates, r),
-                *linear_fit.pairs_of_chambers(candidates, r),
-            )
-        ]
-        if self.within_form_tolerance(current):
-            others = [o for o in pairs if not current.keys & o.keys]
-            far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]
-            return self.completed_to_noise(self.prune(self.best([current, *far])), pairs)
-        current = self._grown(self.prune(self.best([self.empty, *singles, *pairs])))
-        if self.within_form_tolerance(current):
-            return current
-        return self._grown(self._begun_with_another(current, singles))
-
-    def _begun_with_another(self, current: Hypothesis, singles: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the set, or a better pair that begins with a single effect which it lacks.
-
-        A cross-talk may leave less than the true gain while a second effect is missing, and no
-        further effect beside the cross-talk explains what it leaves.
-        """
-        others = [o for o in singles if not o.keys & current.keys and not self.physical_problem(o)]
-        nearest = sorted(others, key=lambda o: o.total)[: SEARCH.other_starts]
-        pairs = [pair for single in nearest for pair in self.extensions(single)]
-        return self.prune(self.best([current, *pairs]))
-
-    def _grown(self, current: Hypothesis) -> Hypothesis:
-        """Return the set with further effects, while each leaves enough less and more than noise.
-
-        A set within the tolerance for its forms grows only to one that leaves noise alone.
-        """
-        band = self.noise_band
-        while not self.within_noise(current) and may_grow(current.effects):
-            grown = self.prune(self.best([current, *self.extensions(current)]))
-            if (
-                grown.keys == current.keys
-                or log_energy_ratio(current, grown, band) < SEARCH.least_log_gain
-            ):
-                break
-            current = grown
-            if self.within_form_tolerance(current):
-                return self.completed_to_noise(current)
-        return current
 
     def within_noise(self, hypothesis: Hypothesis) -> bool:
         """Return whether every equation's energy above noise lies within the noise's band."""
@@ -289,22 +219,10 @@ class HypothesisSet:
         allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band[equation]
         return energy <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
-    def completed_to_noise(
-        self, current: Hypothesis, others: Sequence[Hypothesis] = ()
-    ) -> Hypothesis:
-        """Return a set within form error, or a larger or another one if that leaves noise alone.
-
-        An effect that leaves less, but more than noise, would only fit the form error.
-        """
-        if self.within_noise(current) or not may_grow(current.effects):
-            return current
-        larger = [*self.extensions(current), *others]
-        best = self.best([o for o in larger if self.within_noise(o)])
-        return best if best.effects and self.prune(best).keys == best.keys else current
-
-    def _candidate_columns(
+    def candidate_columns(
         self, data: RegressionData, columns: Sequence[VariantColumns], mask: Array | None = None
     ) -> linear_fit.CandidateColumns:
+        """Return columns without what the data's own terms explain; `mask` (M,) as weights."""
         rig = data.rig
         values = parameter_values(rig, data.terms, data.beta)
 
@@ -325,185 +243,17 @@ class HypothesisSet:
 
         return linear_fit.project(data, columns, size, allowed, mask)
 
-    def _best_singles(
-        self, candidates: linear_fit.CandidateColumns, r: Array
-    ) -> list[tuple[Used, ...]]:
-        g = linear_fit.gains(
-            candidates.K, candidates.columns.T @ r, candidates.groups, candidates.visibility_limit
-        )
-        out: dict[Key, tuple[Used, ...]] = {}
-        least = SEARCH.near_gain * float(np.max(g, initial=0.0))
-        for i in map(int, np.argsort(-g)):
-            used = candidates.entries[i].used
-            if (
-                (g[i] > least or (g[i] > 0 and len(out) < 3))
-                and used.term.key not in out
-                and len(out) < SEARCH.refined_singles
-            ):
-                out[used.term.key] = (used,)
-        return list(out.values())
-
-    def extensions(
-        self, current: Hypothesis, equations: Collection[str] = (), free: bool = False
-    ) -> list[Hypothesis]:
-        """Return the best sets with one more effect, found on data with the set in their model.
-
-        `equations` restricts the search to their rows, `free` to free mechanisms. A free mechanism
-        and a name of it are not combined at one place: one would fit the other's form error.
-        """
-        data, taken, laws = rebased(self.train_data, current.fit), current.keys, current.laws
-        members = effects_among(current.effects)
-        curves = {law_of(e) for e in members if e.free}
-        tried = [
-            used
-            for used in self.variants_of(data, current.fit.residual)
-            for effect in (effect_in(used),)
-            if effect.key not in taken and (not free or effect.free)
-            and law_of(effect) not in (laws if effect.free else curves)
-            and self.may_act(effect, current, equations)
-        ]  # fmt: skip
-        columns = variant_columns(data, tried, equations=equations)
-        mask = data.in_equations(equations or data.row_counts).astype(np.float64)
-        starts = self.best_additions(data, current, columns, mask)[: SEARCH.refined_extensions]
-        larger = [self.extended(current, effects) for effects in starts]
-        if free:
-            return larger
-        with_parts: dict[frozenset[Key], tuple[Used, ...]] = {}
-        # Alone, a sensor's gain is fitted far from its size beside an offset, and the reverse.
-        for effect in self.effects if may_grow(current.effects) else ():
-            goes_with = any(map(effect.is_alternative_to_detail, members))
-            if goes_with and not any(effect.key in o.keys for o in (current, *larger)):
-                grown = (*current.effects, at_start(self.train_data.rig, effect))
-                with_parts[keys_of(grown)] = grown
-        for hypothesis in (current, *filter(self.physical_problem, larger)):
-            for effects in self.with_parts_beside(hypothesis, equations):
-                with_parts.setdefault(keys_of(effects), effects)
-        return larger + [self.extended(current, effects) for effects in with_parts.values()]
-
-    def best_additions(
-        self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
-        mask: Array | None = None,
-    ) -> list[tuple[Used, ...]]:  # fmt: skip
-        """Return the set with each candidate, in the order of what they leave by their columns.
-
-        `data` have the set in their model; `mask` (M,) is 0 for rows that do not count.
-        """
-        candidates, r = self.candidates_beside(data, current, columns, mask)
-        starts: dict[Key, tuple[Used, ...]] = {}
-        for trial in linear_fit.sets_with_one_more(candidates, (), r):
-            used = candidates.entries[trial.members[0]].used
-            starts.setdefault(used.term.key, (*current.effects, used))
-        return list(starts.values())
-
-    def candidates_beside(
-        self, data: RegressionData, current: Hypothesis, columns: Sequence[VariantColumns],
-        mask: Array | None = None,
-    ) -> tuple[linear_fit.CandidateColumns, Array]:  # fmt: skip
-        """Return candidates and residual (M,), orthogonal to what the set can remove itself.
-
-        The set's shapes are fitted again beside a new effect: energy that they can remove is no
-        gain of that effect.
-        """
-        moves = (jacobian(self.train_data, current.fit, used)[1] for used in current.effects)
-        absorbing = replace(data, base=np.hstack((data.base, *moves)))
-        candidates = self._candidate_columns(absorbing, columns, mask)
-        r = current.fit.residual if mask is None else current.fit.residual * mask
-        return candidates, r - candidates.basis @ (candidates.basis.T @ r)
-
-    def with_parts_beside(
-        self, hypothesis: Hypothesis, equations: Collection[str] = ()
-    ) -> Iterator[tuple[Used, ...]]:
-        """Yield the sets with another part of an effect's law beside it, both at their start.
-
-        Alone, a breakaway is fitted far from its size beside Coulomb friction: first-order columns
-        do not show the pair, and each alone may be physically impossible.
-        """
-        rig = self.train_data.rig
-        if not may_grow(hypothesis.effects):
-            return
-        for used in hypothesis.effects:
-            member = effect_in(used)
-            for effect in self.effects:
-                part = of_one_law(effect, member) and (effect.beside or member.beside)
-                acts = not equations or self._acting.get(effect.key, set()) & set(equations)
-                if part and acts and effect.key not in hypothesis.keys:
-                    yield (*hypothesis.without(used), at_start(rig, member), at_start(rig, effect))
-
-    def extended(self, current: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
-        """Return the exact fit of a set that extends `current`, with its shapes as starting points.
-
-        A new effect starts at the size that leaves least. Where an equation keeps more than under
-        `current`, an earlier fit of the same set ended in a local minimum and is repeated.
-        """
-        added = [u for u in effects if u.term.key not in current.keys]
-        others = [u for u in effects if u not in added]
-        effects = [*others, *(at_best_size(self.train_data, u, others) for u in added)]
-        earlier = self.refined(effects)
-        spoils = spoils_equation(earlier, current, self.noise_band)
-        return self.refined_anew(effects) if spoils else earlier
-
-    def may_act(self, effect: Effect, current: Hypothesis, equations: Collection[str]) -> bool:
-        """Return whether a candidate may have columns in some of `equations`, true without any.
-
-        They are those in which it has columns under the baseline. Beside an effect of the bench,
-        which couples the joints' flows, it may act in any.
-        """
-        coupled = any(u.term.where.startswith(BENCH) for u in current.effects)
-        if not equations or coupled or effect.key not in self._acting:
-            return True
-        return not self._acting[effect.key].isdisjoint(equations)
-
     @functools.cached_property
     def _signals(self) -> list[Signals]:
         return signals_of(self.train_data)
 
     @functools.cached_property
-    def _acting(self) -> dict[Key, set[str]]:
+    def acting_equations(self) -> dict[Key, set[str]]:
         """Equations in which each candidate has columns under the baseline."""
         out: dict[Key, set[str]] = {}
         for entry in self.columns:
             out.setdefault(entry.used.term.key, set()).update(entry.touched)
         return out
-
-    def extended_in(self, current: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
-        """Return the set with the effect that removes most from `equations`, None if none does.
-
-        Other equations do not count: the form error of a large effect there would hide a small one
-        here. A set that leaves as little in `equations` with fewer effects is returned instead.
-        """
-        if not may_grow(current.effects):
-            return None
-
-        def remaining(hypothesis: Hypothesis) -> float:
-            return sum(hypothesis.excess_energy[e] for e in equations)
-
-        def removes_enough(hypothesis: Hypothesis) -> bool:
-            drop = {e: current.excess_energy[e] - hypothesis.excess_energy[e] for e in equations}
-            acting = [e for e, v in drop.items() if v >= SEARCH.acting_share * max(drop.values())]
-            start = sum(max(0.0, current.excess_energy[e]) for e in acting)
-            least = SEARCH.number_price * (hypothesis.size[1] - current.size[1])
-            return sum(drop[e] for e in acting) > max(least, SEARCH.add_share * start)
-
-        tried = self.extensions(current, equations)
-        tried += self._simpler_sets(tried)
-        tried += self._smaller_sets(current, tried)
-        useful = [o for o in tried if removes_enough(o) and not self.physical_problem(o)]
-        if not useful:
-            return None
-        least = min(map(remaining, useful))
-        slack = max((SEARCH.simpler_ratio - 1.0) * max(0.0, least), SEARCH.number_price)
-        similar = [o for o in useful if remaining(o) <= least + slack]
-        return min(similar, key=lambda o: (sum(o.size), remaining(o)))
-
-    def _smaller_sets(self, current: Hypothesis, tried: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return the fitted sets of fewer effects than `tried`, none larger, none spoiling one."""
-        least = min(((o.size[0], sum(o.size)) for o in tried), default=(0, 0))
-        return [
-            o
-            for o in self.fitted.values()
-            if 0 < o.size[0] < least[0] and sum(o.size) <= least[1]
-            and not spoils_equation(o, current, self.noise_band)
-        ]  # fmt: skip
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:
         """Return the set without effects that are not needed or remove too little."""

@@ -20,6 +20,7 @@ from analysis.trace.judge import gates
 from analysis.trace.judging import Judge
 from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.search.exchanges import exchanged
+from analysis.trace.search.forward_search import search
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns
@@ -88,7 +89,7 @@ def searched(rig: Rig, train: Run, held_out: Run, *names: str) -> Searched:
     data = regression_data(rig, terms, conditioned_records(rig, [train]))
     judged = regression_data(rig, terms, conditioned_records(rig, [held_out]), data.beta)
     hypotheses = HypothesisSet(data, at_joint_2(rig, *names))
-    return Searched(hypotheses, exchanged(hypotheses, hypotheses.run()), judged)
+    return Searched(hypotheses, exchanged(hypotheses, search(hypotheses)), judged)
 
 
 def traced(rig: Rig, runs: tuple[Run, Run], *names: str, free_forms: bool = False) -> Trace:

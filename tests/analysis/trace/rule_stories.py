@@ -29,6 +29,7 @@ from analysis.trace.judge import gates, held_out, inference
 from analysis.trace.result import Trace
 from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
+from analysis.trace.search.extensions import extended, extended_in
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -514,7 +515,7 @@ def two_quiet_levels_are_not_one_level_and_a_torque(b: Benches) -> None:
     runs = b.kept("quiet levels", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
     names = ("coulomb_friction", "asymmetric_friction", "torque_offset", "sensor_offset")
     s = b.searched(runs, *names)
-    larger = s.hypotheses.extended_in(s.set_of("coulomb_friction"), {"torque_2"})
+    larger = extended_in(s.hypotheses, s.set_of("coulomb_friction"), {"torque_2"})
     assert larger is not None
     assert {name for name, _ in larger.keys} == {"asymmetric_friction"}
 
@@ -589,7 +590,7 @@ def a_small_overlap_is_found_from_a_start_far_above_it(b: Benches) -> None:
     band, hypotheses = ValveDeadband("joint 2"), s.hypotheses
     known = hypotheses.fitted.pop(frozenset({(band.name, band.where)}))
     try:
-        found = hypotheses.extended(hypotheses.empty, [Used(band, (0.5, 0.5, 0.003))])
+        found = extended(hypotheses, hypotheses.empty, [Used(band, (0.5, 0.5, 0.003))])
     finally:
         hypotheses.fitted[known.keys] = known
     assert found.effects[0].shape[:2] == pytest.approx((0.003, 0.003), rel=0.05)

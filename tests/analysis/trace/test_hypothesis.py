@@ -11,6 +11,7 @@ from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
 from analysis.trace.search.exchanges import exchanged
+from analysis.trace.search.extensions import extensions
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     energy_above_noise,
@@ -87,7 +88,7 @@ def test_an_extension_that_ended_in_a_local_minimum_is_fitted_again(rig: Rig) ->
     fit = fit_coefficients(data, (*base, *astray))
     excess = energy_above_noise(data, fit.residual)
     s.hypotheses.fitted[both.keys] = replace(both, fit=fit, excess_energy=excess)
-    again = next(o for o in s.hypotheses.extensions(alone) if o.keys == both.keys)
+    again = next(o for o in extensions(s.hypotheses, alone) if o.keys == both.keys)
     assert again.total == pytest.approx(both.total, abs=0.01 * sum(excess.values()))
 
 

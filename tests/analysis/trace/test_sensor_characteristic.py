@@ -16,7 +16,9 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace
-from analysis.trace.search import hypothesis_set
+from analysis.trace.search import extensions as search_extensions
+from analysis.trace.search.extensions import extensions
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import refine
 from analysis.trace.settings import SEARCH
 from rig.model.records import Run
@@ -84,15 +86,13 @@ def test_a_gain_is_tried_beside_an_offset_whatever_else_seems_to_leave_less(
     rig: Rig, runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Alone the offset is fitted at three times its size, and no column shows the gain."""
-    monkeypatch.setattr(hypothesis_set, "SEARCH", replace(SEARCH, refined_extensions=0))
+    monkeypatch.setattr(search_extensions, "SEARCH", replace(SEARCH, refined_extensions=0))
     records = conditioned_records(rig, [read_by(runs[0], lambda p: 0.95 * p - 0.24e6)])
     data = regression_data(rig, tuple(map(Used, baseline())), records)
     gain, offset = (make(name, "joint 2 cap") for name in ("sensor_gain", "sensor_offset"))
-    hypotheses = hypothesis_set.HypothesisSet(
-        data, [gain, offset, make("torque_offset", "joint 2")]
-    )
+    hypotheses = HypothesisSet(data, [gain, offset, make("torque_offset", "joint 2")])
     alone = hypotheses.refined([at_start(rig, offset)])
-    (both,) = hypotheses.extensions(alone)
+    (both,) = extensions(hypotheses, alone)
     assert both.keys == {gain.key, offset.key}
     assert both.total < 0.01 * alone.total
 

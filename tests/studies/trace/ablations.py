@@ -19,7 +19,7 @@ from analysis.trace import engine, fitted_model
 from analysis.trace.data import trace_rows
 from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
-from analysis.trace.search import hypothesis_set
+from analysis.trace.search import exchanges, extensions, hypothesis_set
 from rig.model.records import Record, Run
 from rig.runs.rigs import load_rig
 from tests.studies.foreign.bench import runs_of
@@ -147,7 +147,9 @@ def decisions_only(kept: Kept) -> Iterator[None]:
             ),
         ),
         (hypothesis_set, "refine", _arguments),
-        (hypothesis_set, "rebased", _arguments),
+        (exchanges, "rebased", _arguments),
+        (extensions, "rebased", _arguments),
+        (extensions, "variant_columns", _arguments),
         (hypothesis_set, "variant_columns", _arguments),
     )
     changes = (

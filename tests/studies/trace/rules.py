@@ -19,10 +19,10 @@ from analysis.effects.friction import Friction
 from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
-from analysis.trace import engine, finding, fitted_model, in_motion, judging
+from analysis.trace import engine, finding, fitted_model, free_forms, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import gates, held_out, inference, rivals
-from analysis.trace.search import exchanges, hypothesis_set, linear_fit
+from analysis.trace.search import exchanges, extensions, forward_search, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
 
@@ -202,7 +202,8 @@ RULES: Final = (
     Rule("held-out rows choose", "where training rows hold noise alone, they choose alone",
          ((judging, "_shown_by_held_out_rows", lambda _sets, winner, _rows: winner),)),
     Rule("further search", "no further effect is searched for in single equations",
-         ((HypothesisSet, "extended_in", lambda *_: None),)),
+         ((free_forms, "extended_in", lambda *_: None),
+          (judging, "extended_in", lambda *_: None))),
     Rule("price of parameters", "a further parameter costs nothing",
          ((SEARCH, "number_price", 0.0), (SEARCH, "simpler_ratio", 1.0),
           (SEARCH, "add_share", 0.0)),
@@ -225,27 +226,28 @@ RULES: Final = (
     Rule("unstated noise", "where nothing repeats, the noise is the stated one",
          ((engine, "unstated_noise", lambda *_: None),)),
     Rule("other starts", "a search that explains nothing does not begin with another effect",
-         ((HypothesisSet, "_begun_with_another", lambda _, current, _singles: current),)),
+         ((forward_search, "_begun_with_another", lambda _, current, _singles: current),)),
     Rule("exchanges", "no effect is exchanged for another one",
          ((judging, "exchanged", lambda _, now: now),
           (exchanges, "_with_another", lambda *_: []))),
     Rule("two for one", "no effect is exchanged for two that leave less",
          ((exchanges, "_with_two_for_one", lambda *_: []),)),
     Rule("fewer effects", "an effect is added where another set of fewer leaves as little",
-         ((HypothesisSet, "_smaller_sets", lambda *_: []),)),
+         ((extensions, "_smaller_sets", lambda *_: []),)),
     Rule("parts of a law", "a breakaway and the level below it are tried one by one",
-         ((HypothesisSet, "with_parts_beside", lambda *_: iter(())),)),
+         tuple((module, "with_parts_beside", lambda *_: iter(()))
+               for module in (extensions, judging, rivals))),
     Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
          ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),),
          comparable=False),
     Rule("nearer start", "a further effect begins at its size by first-order columns",
-         ((hypothesis_set, "at_best_size", lambda _, used, _others: used),)),
+         ((extensions, "at_best_size", lambda _, used, _others: used),)),
     Rule("exact columns", "first-order columns alone find the effects",
          ((judging, "improved_by_exact_trials", lambda _sets, now: now),)),
     Rule("unknown cause", "names beside an unknown cause need no more than other names do",
          ((judging, "judged_beside_unknown_cause", lambda _sets, _set, effects, _left: effects),)),
     Rule("simpler name", "an effect that equals a simpler one is refused, and that one not tried",
-         ((HypothesisSet, "_simpler_sets", lambda *_: []),)),
+         ((HypothesisSet, "simpler_sets", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_form_starts", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
