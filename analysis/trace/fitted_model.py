@@ -36,14 +36,14 @@ from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.finding import Finding
 from analysis.trace.in_motion import equations_above_noise
-from analysis.trace.judge.held_out import rms_of
-from analysis.trace.judge.inference import with_form_error
-from analysis.trace.judge.rivals import (
+from analysis.trace.judge.alternatives import (
     alternatives_of,
-    deviations,
     errors_by_alternatives,
     shape_errors_by_alternatives,
 )
+from analysis.trace.judge.held_out import rms_of
+from analysis.trace.judge.inference import with_form_error
+from analysis.trace.judge.rivals import deviations
 from analysis.trace.judge.scatter import form_shift, with_errors, with_form_errors
 from analysis.trace.next_experiment.detection_limits import (
     AbsorbedEffects,

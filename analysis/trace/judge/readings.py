@@ -117,35 +117,49 @@ def _needs_richer(
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records need `other`, the richer of two sets.
 
-    In training `other` must remove: with the same number of effects more than noise for each
-    number, and `_form_error_energy`; with one more effect what a further effect must. In held-out
-    records `hypothesis`, with `residual` (M,) there, must leave more than `other` and lose more
-    than `TRACE.standard_errors`. The training rows must determine an effect that is added
-    (`_is_determined`). One that replaces another removes `TRACE.richer_name_share` of what
-    `hypothesis` leaves, or has intervals that exclude the simpler one (`Effect.distinct`): two
-    levels of friction remove little where a change of W makes most of their difference.
+    In training `other` must remove enough (`_least_removed`). In held-out records `hypothesis`,
+    with `residual` (M,) there, must leave more than `other` and lose more than
+    `TRACE.standard_errors`. The training rows must determine an effect that is added, and one that
+    replaces another must differ from it.
     """
-    further = other.size[1] - hypothesis.size[1]
-    added = len(other.effects) > len(hypothesis.effects)
-    if added:
-        least_removed = max(SEARCH.number_price * further, SEARCH.add_share * hypothesis.total)
-    else:
-        noise = TRACE.standard_errors**2 * further
-        least_removed = max(noise, _form_error_energy(hypotheses, hypothesis, other))
-    removed = hypothesis.fit.energy - other.fit.energy
-    if removed <= least_removed:
+    if hypothesis.fit.energy - other.fit.energy <= _least_removed(hypotheses, hypothesis, other):
         return False
     if not loses_by_restriction(residual, held_out_residual(holdout_data, other.fit)):
         return False
-    new_effects = [u for u in other.effects if u.term.key not in hypothesis.keys]
-    if added:
-        return all(_is_determined(hypotheses, other, u) for u in new_effects)
-    # A law leaves form error beside noise: a number that removes little may only adapt the form.
+    if len(other.effects) == len(hypothesis.effects):
+        return _is_distinct(hypotheses, hypothesis, other)
+    new_effects = (u for u in other.effects if u.term.key not in hypothesis.keys)
+    return all(_is_determined(hypotheses, other, u) for u in new_effects)
+
+
+def _least_removed(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis) -> float:
+    """Return the energy that the richer set `other` must remove from the training rows.
+
+    With one more effect what a further effect must. With the same number of effects more than noise
+    for each further number, and `_form_error_energy`.
+    """
+    further = other.size[1] - hypothesis.size[1]
+    if len(other.effects) > len(hypothesis.effects):
+        return max(SEARCH.number_price * further, SEARCH.add_share * hypothesis.total)
+    noise = TRACE.standard_errors**2 * further
+    return max(noise, _form_error_energy(hypotheses, hypothesis, other))
+
+
+def _is_distinct(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis) -> bool:
+    """Return whether the effect of `other` that replaces a simpler one differs from it.
+
+    It removes `TRACE.richer_name_share` of what `hypothesis` leaves, or has intervals that exclude
+    the simpler one (`Effect.distinct`): two levels of friction remove little where a change of W
+    makes most of their difference. A number that removes little may only adapt the form of a law
+    that leaves form error beside noise.
+    """
+    removed = hypothesis.fit.energy - other.fit.energy
     if removed > TRACE.richer_name_share * hypothesis.total:
         return True
     return all(
         effect_in(u).distinct({n: e.ci95 for n, e in _numbers(hypotheses, other, u).items()})
-        for u in new_effects
+        for u in other.effects
+        if u.term.key not in hypothesis.keys
     )
 
 

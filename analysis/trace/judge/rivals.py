@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,16 +12,14 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.identify.settings import IDENTIFY
-from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import at_start, details, effect_in, effects_among
+from analysis.trace.data.candidates import details, effect_in, effects_among
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import held_out
 from analysis.trace.judge.curves import noise_covariance
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.readings import loss_in_deviations
-from analysis.trace.judge.scatter import fitted_shapes
 from analysis.trace.result import JudgedEffect, Rival
 from analysis.trace.search.exact_fit import (
     ExactFit,
@@ -28,7 +27,6 @@ from analysis.trace.search.exact_fit import (
     over_amplified_noise,
     rescale,
 )
-from analysis.trace.search.extensions import with_parts_beside
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -70,66 +68,106 @@ def rivals_of(
     held-out records have shown that it is too simple; a richer one is a rival where it changes a
     parameter of another law, or where another rival is tied.
     """
-    judged_effect, train_data = effect_in(used), hypotheses.train_data
-    holdout_data, rig = held_out_test.data, train_data.rig
-    others = winner.keys - {judged_effect.key}
-    training_test = TieTest(
-        train_data,
-        held_out.removed_energy(winner, alternative),
-        winner.fit.residual,
-        alternative.fit.residual,
-    )
+    comparison = _Comparison(hypotheses, winner, used, alternative, held_out_test)
     out: list[Rival] = []
     richer: list[Rival] = []
-    for fitted, (rival_term,) in hypotheses.replacements(winner, used):
-        other = effect_in(rival_term)
-        same_law = of_one_law(judged_effect, other)
+    for hypothesis, (rival_term,) in hypotheses.replacements(winner, used):
+        rival = comparison.rival(hypothesis, effect_in(rival_term))
+        if rival is not None:
+            only_richer = rival.moved is None and comparison.of_same_law(effect_in(rival_term))
+            (richer if only_richer else out).append(rival)
+    out += comparison.rival_pairs(pairs)
+    if any(rival.tied for rival in out):
+        out += [rival for rival in richer if rival.tied]
+    out.sort(key=lambda r: (not r.tied, r.ratio))
+    return out[: max(TRACE.most_rivals, sum(r.tied for r in out))]
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Comparison of fitted sets with the winner, of which they lack the effect `used`.
+
+    `alternative` is the set without it, `held_out_test` compares in the held-out rows.
+    """
+
+    hypotheses: HypothesisSet
+    winner: Hypothesis
+    used: Used
+    alternative: Hypothesis
+    held_out_test: TieTest
+
+    @functools.cached_property
+    def training_test(self) -> TieTest:
+        """The comparison in the training rows."""
+        return TieTest(
+            self.hypotheses.train_data,
+            held_out.removed_energy(self.winner, self.alternative),
+            self.winner.fit.residual,
+            self.alternative.fit.residual,
+        )
+
+    def of_same_law(self, other: Effect) -> bool:
+        """Return whether another effect is a simpler or richer form of the effect."""
+        return of_one_law(effect_in(self.used), other)
+
+    def rival(self, fitted: Hypothesis, other: Effect) -> Rival | None:
+        """Return the effect `other` of a fitted set as a rival, None where it is none."""
+        train_data, rig = self.hypotheses.train_data, self.hypotheses.train_data.rig
         hypothesis = _over_its_noise(train_data, fitted)
-        # Each further free number must remove its price.
-        further = hypothesis.size[1] - winner.size[1]
-        price = SEARCH.number_price * further
-        justified = further <= 0 or hypothesis.total <= winner.total - price
-        tie_ratios = TRACE.tie_ratio, TRACE.tie_ratio_training
-        if details(rig, hypothesis.effects) > details(rig, winner.effects):
-            tie_ratios = TRACE.tie_ratio_detailed, TRACE.tie_ratio_detailed
-        alike = training_test.ties(hypothesis.fit.residual, tie_ratios[1])
-        if (
-            not (justified or alike)
-            or (same_law and hypothesis.size <= winner.size)
-            or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
-            or held_out.disturbed_equations(hypotheses, hypothesis, alternative)
-        ):
-            continue
+        effect, same_law = effect_in(self.used), self.of_same_law(other)
+        held_out_limit, training_limit = TRACE.tie_ratio, TRACE.tie_ratio_training
+        if details(rig, hypothesis.effects) > details(rig, self.winner.effects):
+            held_out_limit = training_limit = TRACE.tie_ratio_detailed
+        justified = self._pays_for_numbers(hypothesis)
+        alike = self.training_test.ties(hypothesis.fit.residual, training_limit)
+        if not (justified or alike) or not self._is_possible(hypothesis, same_law):
+            return None
+        holdout_data, others = self.held_out_test.data, self.winner.keys - {effect.key}
         residual = _held_out(holdout_data, hypothesis)
-        pair = (judged_effect, other)
-        if _is_refused_simpler_name(hypotheses, holdout_data, pair, others, residual):
-            continue
-        ratio = held_out_test.ratio(residual)
-        tied = held_out_test.ties(residual, tie_ratios[0])
+        pair = (effect, other)
+        if _is_refused_simpler_name(self.hypotheses, holdout_data, pair, others, residual):
+            return None
+        ratio = self.held_out_test.ratio(residual)
+        tied = self.held_out_test.ties(residual, held_out_limit)
         tied = tied and (alike or ratio < TRACE.decisive_ratio)
-        law = judged_effect.family if same_law else ""
-        moved = moved_parameter(train_data, winner, hypothesis, law) if tied else None
+        law = effect.family if same_law else ""
+        moved = moved_parameter(train_data, self.winner, hypothesis, law) if tied else None
         # However many numbers it has: a free form has no parameters to compare.
         free = any(effect.free for effect in effects_among(hypothesis.effects))
         if not same_law and not justified and (moved is None or free):
-            continue
-        rival = _rival(other, ratio, training_test.ratio(hypothesis.fit.residual), tied, moved)
-        if not same_law or moved is not None:
-            out.append(rival)
-        elif tied:
-            richer.append(rival)
-    # One effect is the simpler explanation, unless training and held-out rows prefer two.
-    least = cost(train_data, winner, holdout_data) if pairs else 0.0
-    for tied_pair in (p for p in pairs if p.cost < least):
-        moved = moved_parameter(train_data, winner, tied_pair.hypothesis)
-        if moved:
-            ratios = tied_pair.ratio, training_test.ratio(tied_pair.hypothesis.fit.residual)
-            one, two = (_rival(effect_in(u), *ratios, True) for u in tied_pair.effects)
-            out.append(replace(one, moved=moved, beside=two))
-    if any(rival.tied for rival in out):
-        out += richer
-    out.sort(key=lambda r: (not r.tied, r.ratio))
-    return out[: max(TRACE.most_rivals, sum(r.tied for r in out))]
+            return None
+        training_ratio = self.training_test.ratio(hypothesis.fit.residual)
+        return _rival(other, ratio, training_ratio, tied, moved)
+
+    def _pays_for_numbers(self, hypothesis: Hypothesis) -> bool:
+        """Return whether each free number beyond the winner's removes its price."""
+        further = hypothesis.size[1] - self.winner.size[1]
+        price = SEARCH.number_price * further
+        return further <= 0 or hypothesis.total <= self.winner.total - price
+
+    def _is_possible(self, hypothesis: Hypothesis, same_law: bool) -> bool:
+        """Return whether a set is physical, disturbs no equation, and is no simpler reading."""
+        hypotheses, others = self.hypotheses, self.winner.keys - {self.used.term.key}
+        return (
+            not (same_law and hypothesis.size <= self.winner.size)
+            and not hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
+            and not held_out.disturbed_equations(hypotheses, hypothesis, self.alternative)
+        )
+
+    def rival_pairs(self, pairs: Sequence[TiedPair]) -> list[Rival]:
+        """Return the pairs that change a parameter and that training and held-out rows prefer.
+
+        Otherwise one effect is the simpler explanation.
+        """
+        train_data, out = self.hypotheses.train_data, []
+        least = cost(train_data, self.winner, self.held_out_test.data) if pairs else 0.0
+        for pair in (p for p in pairs if p.cost < least):
+            moved = moved_parameter(train_data, self.winner, pair.hypothesis)
+            if moved:
+                ratios = pair.ratio, self.training_test.ratio(pair.hypothesis.fit.residual)
+                one, two = (_rival(effect_in(u), *ratios, True) for u in pair.effects)
+                out.append(replace(one, moved=moved, beside=two))
+        return out
 
 
 def _over_its_noise(data: RegressionData, hypothesis: Hypothesis) -> Hypothesis:
@@ -168,7 +206,7 @@ def moved_parameter(
     std, own_std = (deviations(train_data, hypothesis.fit) for hypothesis in (rival, winner))
     largest: tuple[str, float] | None = None
     rig = train_data.rig
-    left_out = _law_parameters(rig, law)
+    left_out = law_parameters(rig, law)
     for c in (c for term in baseline_of(rig) for c in term.coefficients(rig)):
         if c.parameter in left_out:
             continue
@@ -247,105 +285,7 @@ def cost(train_data: RegressionData, hypothesis: Hypothesis, holdout_data: Regre
     return energy + SEARCH.number_price * sum(hypothesis.size)
 
 
-def alternatives_of(
-    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect],
-    holdout_data: RegressionData,
-) -> list[tuple[Hypothesis, str]]:  # fmt: skip
-    """Return the sets that could hold in place of the winner, and the law that each leaves out.
-
-    They are those with a tied rival; those with a richer form of a named effect, such as two levels
-    of friction for one, that move parameters too little to be rivals; those with another effect of
-    more numbers that fits as well; and those with another part of its law beside it, such as a
-    level beside a breakaway. Most leave out none (''). A richer form that is not possible (its
-    levels are equal) leaves out its law's term of the baseline, viscous friction: forms of friction
-    differ by a slope too.
-    """
-    tied = tied_sets(hypotheses, winner, effects)
-    out = [(hypothesis, "") for hypothesis in tied]
-    named = {(effect.name, effect.at) for effect in effects}
-    for used in winner.effects:
-        effect = effect_in(used)
-        if effect.key not in named:
-            continue
-        equal = _equal_with_more_numbers(hypotheses, winner, used, holdout_data)
-        out += [(hypothesis, "") for hypothesis in equal if hypothesis not in tied]
-        for form in hypotheses.effects:
-            if not is_special_case(effect, form) or form.key in winner.keys:
-                continue
-            rows, law = hypotheses.train_data, effect.family
-            richer = hypotheses.refined([*winner.without(used), at_start(rows.rig, form)])
-            if richer not in tied and moved_parameter(rows, winner, richer, law) is None:
-                possible = not hypotheses.physical_problem(richer)
-                out.append((richer, "" if possible else law))
-    for parts in map(hypotheses.refined, with_parts_beside(hypotheses, winner)):
-        if not hypotheses.physical_problem(parts):
-            out.append((parts, ""))
-    return out
-
-
-def _equal_with_more_numbers(
-    hypotheses: HypothesisSet, winner: Hypothesis, used: Used, holdout_data: RegressionData
-) -> Iterator[Hypothesis]:
-    """Yield the sets with an effect of more numbers in the place of `used` that lose only noise.
-
-    Over a short arc a spring fits as well as an inclination, with another weight.
-    """
-    best = held_out_residual(holdout_data, winner.fit)
-    for hypothesis, (rival,) in hypotheses.replacements(winner, used):
-        other = effect_in(rival)
-        richer = hypothesis.size[0] == winner.size[0] and hypothesis.size[1] > winner.size[1]
-        if not richer or other.free or of_one_law(effect_in(used), other):
-            continue
-        residual = held_out_residual(holdout_data, hypothesis.fit)
-        losses = (
-            loss_in_deviations(hypothesis.fit.residual, winner.fit.residual),
-            loss_in_deviations(residual, best),
-        )
-        if max(losses) <= TRACE.standard_errors and not hypotheses.physical_problem(hypothesis):
-            yield hypothesis
-
-
-def errors_by_alternatives(
-    model: Model, alternatives: Sequence[tuple[Model, str]]
-) -> dict[str, float]:
-    """Return the further standard error of parameters by other models of the records, by name.
-
-    Each alternative, identified as the model is, counts with the same weight: the square of the
-    error is the mean, over the model and them, of the squared shift and of the variance beyond the
-    model's (Buckland, Burnham and Augustin, Biometrics 53, 1997). Parameters of the baseline's term
-    of the law that an alternative leaves out are not compared with it.
-    """
-    compared = [(other.parameters, _law_parameters(model.rig, law)) for other, law in alternatives]
-    errors = {}
-    for name, estimate in model.parameters.items():
-        others = [found[name] for found, out in compared if name in found and name not in out]
-        added_variance = sum(
-            (o.value - estimate.value) ** 2 + max(o.std**2 - estimate.std**2, 0.0)
-            for o in others if o.identified
-        )  # fmt: skip
-        if estimate.identified and added_variance > 0.0:
-            errors[name] = math.sqrt(added_variance / (len(alternatives) + 1))
-    return errors
-
-
-def shape_errors_by_alternatives(
-    rig: Rig, winner: Hypothesis, alternatives: Sequence[Hypothesis]
-) -> dict[str, float]:
-    """Return the further standard error of the winner's shapes by other sets, by name.
-
-    It is the root of the mean square of the shifts, as in `errors_by_alternatives`. Sets without
-    the shape count with none.
-    """
-    others = [fitted_shapes(rig, other.fit) for other in alternatives]
-    errors = {}
-    for name, value in fitted_shapes(rig, winner.fit).items():
-        squares = sum((shapes.get(name, value) - value) ** 2 for shapes in others)
-        if squares > 0.0:
-            errors[name] = math.sqrt(squares / (len(others) + 1))
-    return errors
-
-
-def _law_parameters(rig: Rig, law: str) -> set[str]:
+def law_parameters(rig: Rig, law: str) -> set[str]:
     """Return the parameters of the baseline's term of a law ('': of none)."""
     terms = [term for term in baseline_of(rig) if law and term.name.endswith(law)]
     return {c.parameter for term in terms for c in term.coefficients(rig)}

@@ -15,7 +15,7 @@ from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.engine import trace
 from analysis.trace.judge import held_out, rivals
-from analysis.trace.judge.rivals import errors_by_alternatives
+from analysis.trace.judge.alternatives import errors_by_alternatives, shape_errors_by_alternatives
 from analysis.trace.result import Rival
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.records import Run
@@ -184,7 +184,7 @@ def test_other_sets_widen_the_interval_of_a_shape_too(rig: Rig) -> None:
         return SimpleNamespace(fit=SimpleNamespace(terms=(used,)))
 
     other = leaning(0.029)
-    errors = rivals.shape_errors_by_alternatives(rig, leaning(0.025), [other])
+    errors = shape_errors_by_alternatives(rig, leaning(0.025), [other])
     assert errors == {"inclination": pytest.approx(0.004 / 2**0.5)}
     empty: Any = SimpleNamespace(fit=SimpleNamespace(terms=()))
-    assert rivals.shape_errors_by_alternatives(rig, leaning(0.025), [empty]) == {}
+    assert shape_errors_by_alternatives(rig, leaning(0.025), [empty]) == {}

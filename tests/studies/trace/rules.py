@@ -21,7 +21,7 @@ from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, fitted_model, free_forms, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
-from analysis.trace.judge import gates, held_out, inference, rivals
+from analysis.trace.judge import alternatives, gates, held_out, inference, rivals
 from analysis.trace.search import exchanges, extensions, forward_search, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
@@ -186,7 +186,8 @@ RULES: Final = (
     Rule("rivals", "no other effect counts as tied", ((rivals, "rivals_of", lambda *_: []),)),
     Rule("rivals that matter",
          "a rival with further numbers must remove the price of each, whatever it means",
-         ((rivals, "moved_parameter", lambda *_: None),)),
+         ((alternatives, "moved_parameter", lambda *_: None),
+          (rivals, "moved_parameter", lambda *_: None))),
     Rule("two in place of one", "two effects are no rival of one",
          ((rivals, "tied_pairs", lambda *_: []),)),
     Rule("small effects", "an effect too small to be named widens no interval",
@@ -236,7 +237,7 @@ RULES: Final = (
          ((extensions, "_smaller_sets", lambda *_: []),)),
     Rule("parts of a law", "a breakaway and the level below it are tried one by one",
          tuple((module, "with_parts_beside", lambda *_: iter(()))
-               for module in (extensions, judging, rivals))),
+               for module in (alternatives, extensions, judging))),
     Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
          ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),),
          comparable=False),
