@@ -116,8 +116,7 @@ class Sensor(SignalEffect):
         acceleration = signals.G[:, i] * signals.qdd[:, i] + old_slope * signals.qd[:, i] ** 2
         rate = signals.rate
         s = self.undone(signals.s[:, i], 0, rate, shape)
-        half = 0.55 * rig.joints[i].cylinder.stroke
-        s = np.clip(s, -half, half)
+        s = np.clip(s, *rig.joints[i].sensor_range)
         q, G, slope = linkage.geometry(s)
         sd = self.undone(signals.sd[:, i], 1, rate, shape)
         new["s"][:, i], new["sd"][:, i], new["q"][:, i], new["G"][:, i] = s, sd, q, G

@@ -184,13 +184,23 @@ class Joint(Part):
         """The piston's ends [m]."""
         return -self.cylinder.stroke / 2, self.cylinder.stroke / 2
 
+    @property
+    def sensor_range(self) -> tuple[float, float]:
+        """Positions [m] that a sensor may read: slightly beyond the piston's ends.
+
+        By a twentieth of the stroke, and at most half way to where the pins' triangle is flat.
+        """
+        (low, high), beyond = self.position_range, 0.05 * self.cylinder.stroke
+        a, c, middle = self.linkage.base_pin, self.linkage.arm_pin, self.linkage.mid_length
+        folded, stretched = middle + low - abs(a - c), a + c - middle - high
+        return low - min(beyond, 0.5 * folded), high + min(beyond, 0.5 * stretched)
+
     def geometry(self, position: Array | float) -> tuple[Array, Array, Array]:
         """Return angle q [rad], G = ds/dq [m] and dG/dq [m/rad] at piston displacement s [m].
 
-        A sensor may read slightly beyond the stroke's end: s is limited to 0.55 strokes.
+        s is limited to `sensor_range`.
         """
-        half = 0.55 * self.cylinder.stroke
-        return self.linkage.geometry(np.clip(position, -half, half))
+        return self.linkage.geometry(np.clip(position, *self.sensor_range))
 
 
 class Calibration(Part):

@@ -86,3 +86,24 @@ def test_a_lag_with_a_second_pole_is_undone(rig: Rig, poles: tuple[float, float]
         assert corrected[inner] == pytest.approx(true[inner], abs=5e3)
     alone = error.undone(reading, 0, rate, shape[:1])[inner]
     assert (float(np.abs(alone - true[inner]).max()) > 1.5e4) == (two > 0.0)
+
+
+def test_a_piston_sensor_is_corrected_no_further_than_its_pins_allow(rig: Rig) -> None:
+    """Extended, the cylinder is 1 mm shorter than both pin distances: a gain tried leads beyond."""
+    joint = rig.joints[0]
+    pins, stroke = joint.linkage, joint.cylinder.stroke
+    middle = pins.base_pin + pins.arm_pin - 0.5 * stroke - 1e-3
+    stretched = joint.model_copy(update={"linkage": pins.model_copy(update={"mid_length": middle})})
+    lever = rig.model_copy(update={"joints": (stretched, *rig.joints[1:])})
+    t = np.arange(400) / 1000.0
+    s = 0.49 * stroke * np.sin(2 * np.pi * 3 * t)
+    q = np.column_stack((stretched.geometry(s)[0], np.full(len(t), -1.4)))
+    qd = np.gradient(q, 1e-3, axis=0)
+    signals = signals_of(lever, q, qd, np.gradient(qd, 1e-3, axis=0), np.random.default_rng(0))
+    for name, shape in (("sensor_gain", (1.3, 0.0)), ("sensor_offset", (0.1 * stroke,))):
+        effect = make(name, "joint 1 piston")
+        assert isinstance(effect, Sensor)
+        seen = effect.prepare(lever, signals, shape)
+        assert seen.s[:, 0].max() < 0.5 * stroke + 1e-3
+        for field in ("q", "qd", "qdd", "G", "theta", "V_cap"):
+            assert np.isfinite(getattr(seen, field)).all(), field
