@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.effects.base import Array, Effect
 from analysis.signals.conditioning import Signals
+from analysis.signals.filters import direction
 from analysis.terms.base import (
     CONTRIBUTE,
     SD,
@@ -76,7 +77,8 @@ class AsymmetricViscousFriction(Effect):
         """Return G times the part of s' that goes either way (electric: |q'|)."""
         i = self.joint
         G, v = signals.G[:, i], signals.sd[:, i]
-        parts = (np.abs(v),) if rig.electric else (np.maximum(v, 0.0), np.minimum(v, 0.0))
+        way = direction(v, signals.rate)
+        parts = (v * way,) if rig.electric else (v * (way > 0.0), v * (way <= 0.0))
         columns = {name: G * part for name, part in zip(self._names(rig), parts, strict=True)}
         return {equation("torque", i): columns}
 

@@ -181,6 +181,14 @@ def row_filter(rate: float, cutoff: float) -> FirSmoother:
     return windowed_sinc(rate, cutoff, 0.6 * cutoff)
 
 
+def direction(v: Array, rate: float) -> Array:
+    """Return the sign (n,) of a velocity (n,) without noise above `SIGNALS.direction_cutoff`.
+
+    The mean of |v + noise| exceeds |v|, that of (v + noise) times this sign does not.
+    """
+    return np.asarray(np.sign(row_filter(rate, SIGNALS.direction_cutoff).apply(v)))
+
+
 def row_step(rate: float, cutoff: float) -> int:
     """Return the decimation that keeps every frequency in the row filter's pass band."""
     return max(1, int(rate / (2 * 1.6 * min(cutoff, 0.25 * rate))))
