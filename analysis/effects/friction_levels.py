@@ -39,6 +39,9 @@ DIFFERENCE: Final = 0.1  # of the mean level: with a smaller difference it is no
 LEAST_SHARE: Final = 0.02  # of the other level: below, friction acts in one direction only
 SUM: Final = 1.0  # weight of the rod pressure in the load where each seal has one pressure
 DIFFERENCE_LOAD: Final = -1.0  # the same where the difference presses the piston's seal
+ALIKE: Final = 0.5  # share of the rod's seals where both chambers press alike
+UNLIKE: Final = (0.3, 0.7)  # shares from which a search of it begins
+ONE_CHAMBER: Final = 1e-3  # the same, or its complement, where one chamber presses alone
 
 
 @kernel
@@ -156,7 +159,7 @@ def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
     # The hidden state is w times d over p_S [m], at a constant distance z d.
     if phase == CONTRIBUTE:
         i = int(par[0])
-        v, load = x[SD, i], abs(x[P_CAP, i] + par[6] * x[P_ROD, i])
+        v, load = x[SD, i], abs(par[6] * x[P_CAP, i] + par[7] * x[P_ROD, i])
         if par[2] <= 0.0 or par[5] <= 0.0:
             state, dz[0] = slide(v, z[0], par[2], par[3], par[4], NORMAL)
             out[TORQUE, i] -= par[1] * load * x[G, i] * state
@@ -174,8 +177,10 @@ class PressureDependentFriction(Friction):
 
     k [m^2] is the friction coefficient times the seals' area under pressure. The load is
     p = |p_cap + a p_rod|: the sum where each seal has one chamber's pressure on it (a = 1), the
-    difference where the piston's seal has both (a = -1). Either w [Pa] builds up to it at a contact
-    stiffness that does not depend on it, only on speed (`contact`):
+    difference where the piston's seal has both (a = -1). Where seals of unlike coefficients have
+    one pressure each, p = 2 ((1 - r) p_cap + r p_rod) with the rod's share r of both coefficients
+    (Bonchis et al. 1999). Either w [Pa] builds up to p at a contact stiffness that does not depend
+    on it, only on speed (`contact`):
     dw/ds = (1 + k_s |s'|) (p_S / d) (sign(s') - w / p), d the presliding distance at supply
     pressure, k_s the stiffening; or within a distance d that does not: w = p z, dz/ds =
     (sign(s') - z) / d.
@@ -185,7 +190,7 @@ class PressureDependentFriction(Friction):
     name = "pressure_dependent_friction"
     smallest_coefficients = (5e-6,)  # [m^2]
     stiffens = True
-    shapes_after = 2
+    shapes_after = 3
     variable = "the chamber pressures, with the velocity's sign"
     confounders = ("coulomb_friction", "asymmetric_friction")
     separated_by = (
@@ -198,55 +203,72 @@ class PressureDependentFriction(Friction):
         return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the contact's shapes, the rod pressure's weight and the constant distance."""
+        """Name the contact's shapes, the rod's weight, the constant distance, the rod's share."""
         joint = self.joint + 1
-        return (*super().shape_names(), f"rod_weight_{joint}", f"constant_distance_{joint}")
+        own = (f"rod_weight_{joint}", f"constant_distance_{joint}", f"rod_share_{joint}")
+        return (*super().shape_names(), *own)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the contact's shapes, the rod pressure's weight, and the constant distance.
+        """Return the contact's shapes, the rod's weight, the constant distance, the rod's share.
 
-        A shape without the last two is that of the sum, at a constant stiffness.
+        A shape without the last three is that of the sum, at a constant stiffness.
         """
-        weight, constant = self.shape_names()[-2:]
-        fixed = (
+        weight, constant, share = self.shape_names()[-3:]
+        ends = ONE_CHAMBER, 1.0 - ONE_CHAMBER
+        return (
+            *super().shapes(rig),
             Shape(weight, "1", DIFFERENCE_LOAD, SUM, (DIFFERENCE_LOAD,), detail=True, fixed=True),
             Shape(constant, "1", 1.0, 1.0, (1.0,), detail=True, fixed=True),
+            Shape(share, "", *ends, (ALIKE,), resolution=True, saturates=True, detail=True),
         )
-        return (*super().shapes(rig), *fixed)
 
     def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
-        """Return a contact with memory under the difference of the pressures."""
+        """Return a contact with memory under the difference, and under one chamber's pressure."""
         (distance,) = self.shape_of(rig, ())
-        return ((distance, 0.0, 0.0, DIFFERENCE_LOAD),)
+        contact = (distance, 0.0, 0.0)
+        one_chamber = ((*contact, SUM, 0.0, r) for r in (ONE_CHAMBER, 1.0 - ONE_CHAMBER))
+        return ((*contact, DIFFERENCE_LOAD), *one_chamber)
 
     def detailed_shapes(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the shape with a stiffening where its load is the sum, at constant stiffness."""
-        return (tuple(shape),) if len(shape) > 3 else super().detailed_shapes(rig, shape)
+        """Return the shape with a stiffening, or with a share of the rod's seals, under the sum."""
+        weight, constant, share = self._load_form(shape)
+        if weight != SUM or share != ALIKE:
+            return (tuple(shape),)
+        stiffened = () if len(shape) > 3 else super().detailed_shapes(rig, shape)
+        contact = (*shape, 0.0, 0.0)[:3]
+        return (*stiffened, *((*contact, SUM, constant, unlike) for unlike in UNLIKE))
 
     def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-        """Return the contact without memory or at a constant distance, and the other load."""
+        """Return the contact without memory or at a constant distance, and another load."""
         distance, _, speed = self.contact_of(shape)
         memory = (distance, 0.0, 0.0) if self.remembers(shape) else (0.0, 0.0, speed)
-        weight, constant = self._weight(shape), tuple(shape[4:])
+        weight, constant, share = self._load_form(shape)
         forms: tuple[tuple[float, ...], ...] = ()
         if self.remembers(shape) and not constant:
-            forms = (*super().other_form_starts(rig, shape), (*memory, weight, 1.0))
-        if weight == SUM:
-            forms = (*forms, (*memory, DIFFERENCE_LOAD, *constant))
-        return forms
+            forms = (*super().other_form_starts(rig, shape), (*memory, weight, 1.0, *shape[5:]))
+        if weight == DIFFERENCE_LOAD:
+            return (*forms, (*memory, SUM, constant, ALIKE))
+        return (*forms, (*memory, DIFFERENCE_LOAD, constant)) if share == ALIKE else forms
 
     def coefficients_comparable(self, shape: Sequence[float], other: Sequence[float]) -> bool:
-        """Return whether both shapes weight the rod pressure alike."""
-        return self._weight(shape) == self._weight(other)
+        """Return whether both shapes weight the pressures alike."""
+        one, two = (self._load_form(s) for s in (shape, other))
+        return (one[0], one[2]) == (two[0], two[2])
 
-    def _weight(self, shape: Sequence[float]) -> float:
-        """Return the weight of the rod pressure in the load."""
-        return shape[3] if len(shape) > 3 else SUM
+    def _load_form(self, shape: Sequence[float]) -> tuple[float, float, float]:
+        """Return the rod pressure's weight, 1 for a constant distance, the rod's share."""
+        weight, constant, share = (*shape[3:], *(SUM, 0.0, 0.0)[len(shape[3:]) :])
+        return weight, constant, share or ALIKE
+
+    def _weights(self, shape: Sequence[float]) -> tuple[float, float]:
+        """Return the weights of the cap and the rod pressure in the load."""
+        weight, _, share = self._load_form(shape)
+        return 2.0 * (1.0 - share), 2.0 * share * weight
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         i = self.joint
-        if self.remembers(shape) and not shape[4:]:
+        if self.remembers(shape) and not self._load_form(shape)[1]:
             path = self.deflection(rig, signals, {}, shape)
             level = path * rig.supply.pressure / shape[0]
         else:
@@ -254,16 +276,15 @@ class PressureDependentFriction(Friction):
         return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
 
     def _load(self, signals: Signals, shape: Sequence[float]) -> Array:
-        """Return the load |p_cap + a p_rod| (n,) [Pa]."""
-        i = self.joint
-        weight = self._weight(shape)
-        return np.asarray(np.abs(signals.p_cap[:, i] + weight * signals.p_rod[:, i]))
+        """Return the load (n,) [Pa] of both chamber pressures."""
+        i, (cap, rod) = self.joint, self._weights(shape)
+        return np.asarray(np.abs(cap * signals.p_cap[:, i] + rod * signals.p_rod[:, i]))
 
     def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return w d / p_S (n,) [m], at a constant distance z d."""
-        if shape[4:]:
+        if self._load_form(shape)[1]:
             return super().deflection(rig, signals, values, shape)
         stiffness = rig.supply.pressure / shape[0]
         path = self.path(signals, shape)
@@ -272,13 +293,14 @@ class PressureDependentFriction(Friction):
         )
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), k, distance, stiffening, transition speed, p_S, rod's weight.
+        """Return joint (0-based), k, distance, stiffening, transition speed, p_S, both weights.
 
         At a constant distance 0 for p_S.
         """
-        k, weight = values[f"k_friction_{self.joint + 1}"], self._weight(shape)
-        pressure = 0.0 if shape[4:] else rig.supply.pressure
-        return np.array([self.joint, k, *self.contact_of(shape), pressure, weight])
+        k = values[f"k_friction_{self.joint + 1}"]
+        pressure = 0.0 if self._load_form(shape)[1] else rig.supply.pressure
+        contact, weights = self.contact_of(shape), self._weights(shape)
+        return np.array([self.joint, k, *contact, pressure, *weights])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject negative friction, and more than half of the cylinder's force."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -74,14 +75,16 @@ class BaseInclination(SignalEffect):
         return () if getattr(rig, "prismatic", False) or unknown or rig.gravity == 0 else ("bench",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return alpha [rad], up to 20 degrees either way."""
-        return (Shape("inclination", "rad", -0.35, 0.35, (-0.1, -0.02, 0.02, 0.1), 0.0),)
+        """Return alpha [rad], up to 45 degrees either way."""
+        grid = (-0.4, -0.1, -0.02, 0.02, 0.1, 0.4)
+        return (Shape("inclination", "rad", -STEEPEST, STEEPEST, grid, 0.0),)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Turn the absolute angles."""
         return replace(signals, theta=signals.theta + self.shape_of(rig, shape)[0])
 
 
+STEEPEST: Final = math.pi / 4  # [rad] inclination of a base
 LEAST_REACH: Final = 0.1  # of the joint's range that half its torque must move it: else too stiff
 RESTS: Final = 5  # rest angles to start from, evenly in the joint's range
 PRELOAD: Final = 8.0  # ranges of the joint: a long gas spring changes its force by a tenth over it

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import SUPPLY, Array, Evidence, Shape, SignalEffect
+from analysis.effects.valve import lagged
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     P_CAP,
@@ -208,9 +209,10 @@ class SupplySag(LineDrop):
     (Merritt 1967, chapter 3; the two asymptotes joined as in Churchill and Usagi 1972). Where it
     does not, the pressure of pump or relief valve falls nearly in proportion to the flow. A sudden
     demand is first met by the oil V_supply between sensor and valves, or by an accumulator of equal
-    capacity: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation leaves that out. dp, r_t
-    and V_supply are shapes; a line that no record shows turbulent is laminar throughout, without
-    r_t.
+    capacity: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ). The regulator of a pump (constant_lag)
+    follows with the time constant V_supply / b d dp/dQ of the pump's whole flow, at any flow. The
+    simulation leaves both out. dp, r_t and V_supply are shapes; a line that no record shows
+    turbulent is laminar throughout, without r_t.
     """
 
     mechanism = "supply_curve"
@@ -225,26 +227,39 @@ class SupplySag(LineDrop):
     separated_by = (
         "two amplitudes, one and both joints at once: the drop depends on the whole bench's flow"
     )
-    shape_stems = ("dp_supply", "laminar_share", "V_supply")
+    shape_stems = ("dp_supply", "laminar_share", "V_supply", "constant_lag")
     kernel = _sag
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the drop at the pump's whole flow [Pa], r_t and the volume [m^3]."""
+        """Return the drop at the pump's whole flow [Pa], r_t, the volume [m^3], a constant lag."""
         most = LONGEST * rig.supply.flow * BULK_MODULUS / rig.supply.pressure
         return (
             line_drop("dp_supply", rig, (0.05, 0.2)),
             transition_share("laminar_share", (0.2, 1.2)),
             Shape("V_supply", "m^3", 0.0, most, (0.002 * most, 0.04 * most), resolution=True),
+            Shape("constant_lag", "1", 1.0, 1.0, (1.0,), detail=True, fixed=True),
         )
+
+    def other_form_starts(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the lines of `LineDrop`, and one of constant lag in the place of oil."""
+        starts = super().other_form_starts(rig, shape)
+        if len(shape) > 3:
+            return starts
+        volume = max(shape[2], self.shapes(rig)[2].grid[0])
+        return (*starts, (*shape[:2], volume, 1.0))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Subtract the drop from the supply pressure."""
         dp, share = self.line(rig, shape)
-        volume = self.shape_of(rig, shape)[2]
         turbulent = turbulent_part(dp, share)
         ratio = np.ascontiguousarray(port_flow(rig, signals, self.drawn) / rig.supply.flow)
-        capacity = volume / (bulk_modulus(rig) * rig.supply.flow)
-        drop = _lagged_drop(ratio, 1.0 / signals.rate, turbulent, share, capacity)
+        capacity = self.shape_of(rig, shape)[2] / (bulk_modulus(rig) * rig.supply.flow)
+        if shape[3:]:
+            lag = capacity * drop_and_slope(1.0, turbulent, share)[1]
+            drop = turbulent * ratio * np.cbrt(ratio**3 + share**3)
+            drop = lagged(drop, lag * signals.rate)
+        else:
+            drop = _lagged_drop(ratio, 1.0 / signals.rate, turbulent, share, capacity)
         return replace(signals, p_s=signals.p_s - drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
@@ -287,7 +302,7 @@ class TankPressure(PortEffect):
         """Return both [Pa]; `p_back`, at the whole flow of the pump, may be an extrapolation."""
         p = rig.supply.pressure
         return (
-            Shape("p_tank", "Pa", 0.0, 0.4 * p, (0.02 * p, 0.1 * p), 0.0),
+            Shape("p_tank", "Pa", 0.0, 0.5 * p, (0.02 * p, 0.1 * p), 0.0),
             Shape("p_back", "Pa", 0.0, 0.75 * p, (0.0, 0.05 * p), 0.0),
         )
 

@@ -198,10 +198,11 @@ def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used, undetail
 
 
 def _detail_at_bound(shape: Shape, value: float) -> bool:
-    """Return whether a detail lies at its high bound, or at a low one below 0."""
+    """Return whether a searched detail lies at its high bound, or at a low one below 0."""
     margin = 1e-3 * (shape.high - shape.low)
     low = shape.low + margin if shape.low < 0.0 else -math.inf
-    return shape.detail and not shape.saturates and not low <= value <= shape.high - margin
+    searched = shape.detail and not shape.fixed
+    return searched and not shape.saturates and not low <= value <= shape.high - margin
 
 
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, shown_first: bool) -> ExactFit:

@@ -25,16 +25,16 @@ Array = NDArray[np.float64]
 FLOW = 11.7e-3 / 60  # the pump's [m^3/s]
 P0 = 101_325.0
 NAMES = (
-    "Fc", "Fs", "v_stribeck", "fall", "F_ext", "F_ret", "k_friction", "k_seal", "presliding",
-    "stiffening", "inclination", "k_spring", "rest", "T_offset",
+    "Fc", "Fs", "v_stribeck", "fall", "F_ext", "F_ret", "k_friction", "k_seal", "k_rod",
+    "presliding", "stiffening", "inclination", "k_spring", "rest", "T_offset",
     "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool", "w_tank",
     "c_internal", "c_cap", "c_rod", "dp_supply", "p_tank", "p_back",
     "alpha_air", "V_cap", "V_rod", "m_payload", "hose",
 )  # fmt: skip
 (
-    FC, FS, VS, FALL, FE, FR, KF, KD, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD,
-    ASTERN, NULL, UNDERLAP, TAU, TO_TANK, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD,
-    LOAD, HOSE,
+    FC, FS, VS, FALL, FE, FR, KF, KD, KR, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE,
+    AHEAD, ASTERN, NULL, UNDERLAP, TAU, TO_TANK, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP,
+    V_ROD, LOAD, HOSE,
 ) = range(len(NAMES))  # fmt: skip
 SHAPES = {"presliding": 40e-6, "v_stribeck": 0.03, "fall": 2.0, "rest": -1.35}
 NAMES_1 = ("M2", "Fv2", "W2", "b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2")
@@ -118,6 +118,7 @@ def _friction(v, cap, rod, deflection, e):
         + e[FS] * math.exp(-(abs(v / e[VS]) ** e[FALL]))
         + e[KF] * (cap + rod)
         + e[KD] * abs(cap - rod)
+        + e[KR] * rod
     )
     level += e[FE] if z > 0 else e[FR]
     rate = 0.0 if level == 0.0 else v - abs(v) * deflection / e[DELTA]

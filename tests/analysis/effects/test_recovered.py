@@ -21,6 +21,7 @@ from analysis.terms import baseline, make
 from analysis.terms.base import Array, Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
+from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.search.refinement import refine
 from rig.model.rig import Rig
@@ -193,6 +194,27 @@ def test_edges_to_the_tank_that_open_later_or_earlier_are_found(rig: Rig, furthe
     assert max(left.values()) < 0.1 * len(found.residual)
     fits = free_run_fits(rig, wrong, effect, TRUTH | found.parameters(rig), shape)
     assert min(fits.values()) > 97.0
+
+
+@pytest.mark.parametrize("start", [(1e-4,), (1e-4, 0.0, 0.0, -1.0)], ids=["sum", "difference"])
+def test_a_seal_that_one_chamber_presses_is_found_from_the_load_of_both(
+    rig: Rig, start: tuple[float, ...]
+) -> None:
+    """A rod's seal alone: the sum of the pressures hardly changes, its friction is a level."""
+    wrong, effect = {"k_rod": 2e-5}, make("pressure_dependent_friction", "joint 2")
+    assert isinstance(effect, Effect)
+    run = bench.run(rig, bench.Wrong.of(**wrong), *TRAIN)
+    data = regression_data(rig, tuple(map(Used, baseline())), conditioned_records(rig, [run]))
+    found = refine(data, (*data.terms, Used(effect, start)))
+    shape = dict(zip(effect.shape_names(), found.terms[-1].shape, strict=True))
+    assert shape["rod_share_2"] == pytest.approx(1.0, abs=0.05)
+    values = found.parameters(rig)
+    assert values["k_friction_2"] == pytest.approx(1e-5, rel=0.05)  # of 2 r p_rod
+    without = fit_coefficients(data, data.terms)
+    before, after = (energy_above_noise(data, f.residual)["torque_2"] for f in (without, found))
+    assert after < 0.02 * before
+    fits = free_run_fits(rig, wrong, effect, TRUTH | values, found.terms[-1].shape)
+    assert min(fits.values()) > 94.0
 
 
 def test_sensor_effects_make_the_simulation_comparable(rig: Rig) -> None:

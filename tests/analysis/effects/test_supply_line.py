@@ -183,3 +183,19 @@ def test_an_accumulator_may_be_as_slow_at_a_small_pump_of_low_pressure(
     after = lifting.t - 0.1
     slow = np.where(after < 0.0, 0.0, 0.5 * shape[0] * -np.expm1(-after / lag))
     assert drop == pytest.approx(slow, abs=0.02 * slow.max())
+
+
+def test_a_regulator_follows_with_one_time_constant_at_any_flow(rig: Rig, lifting: Signals) -> None:
+    """The drop of an orifice through a first-order lag, integrated by another route."""
+    volume, share, flow = 1e-3, 1e-3, rig.supply.flow
+    lag = volume / rig.nominal["b"] * 2.0 * DROP / flow  # of dp/dQ at the pump's whole flow
+
+    def rate(t: float, drop: np.ndarray) -> np.ndarray:
+        drawn = 0.35 - 0.25 * np.cos(2 * np.pi * 12 * t)
+        return np.asarray((DROP * drawn**2 - drop) / lag)
+
+    begun = DROP * (0.35 - 0.25) ** 2
+    wanted = solve_ivp(rate, (0.0, lifting.t[-1]), [begun], t_eval=lifting.t, rtol=1e-9, atol=1.0)
+    seen = SupplySag("bench").prepare(rig, lifting, (DROP, share, volume, 1.0))
+    assert lag > 3e-3
+    assert lifting.p_s - seen.p_s == pytest.approx(wanted.y[0], abs=1e-3 * wanted.y[0].max())

@@ -77,6 +77,13 @@ def _size(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(math.log(low), math.log(high))))
 
 
+def _one_of(rng: np.random.Generator, forms: int, further: int) -> int:
+    """Draw one of `forms`, or of `further` ones, which change no other draw of a seed."""
+    form, own = int(rng.integers(forms)), rng.spawn(1)[0]
+    drawn = int(own.integers(forms + further))
+    return drawn if drawn >= forms else form
+
+
 def _contact(rng: np.random.Generator) -> tuple[str, dict[str, float]]:
     """Return the form of dry friction, with its width: a speed [m/s], or a deflection [m]."""
     form = int(rng.integers(4))
@@ -115,9 +122,10 @@ def _stribeck(rng: np.random.Generator, i: int) -> Wrong:
 
 def _by_pressure(rng: np.random.Generator, i: int) -> Wrong:
     word, contact = _contact(rng)
-    k, form = _size(rng, 5e-6, 4e-5), int(rng.integers(2))
+    k, form = _size(rng, 5e-6, 4e-5), _one_of(rng, 2, 3)
     own = {**contact, "by_pressure": k, "pressure_form": form}
-    text = f"{k:.2g} m2 x {('sum', 'difference')[form]}, {word}"
+    load = ("sum", "difference", "cap pressure", "rod pressure", "cap + 0.4 rod pressure")[form]
+    text = f"{k:.2g} m2 x {load}, {word}"
     return Wrong("pressure_dependent_friction", f"joint {i + 1}", text, joint=(i, own))
 
 
@@ -213,10 +221,10 @@ def _external(rng: np.random.Generator, i: int) -> Wrong:
 
 
 def _sag(rng: np.random.Generator, i: int) -> Wrong:
-    form, drop = int(rng.integers(4)), _size(rng, 1e5, 2e6)
+    form, drop = _one_of(rng, 4, 1), _size(rng, 1e5, 2e6)
     lag = _size(rng, 5e-3, 6e-2)
     word = ("orifice", "laminar line", f"line lag {1e3 * lag:.2g} ms",
-            f"accumulator {1e3 * lag:.2g} ms")[form]  # fmt: skip
+            f"accumulator {1e3 * lag:.2g} ms", f"regulator {1e3 * lag:.2g} ms")[form]  # fmt: skip
     return Wrong("supply_sag", "bench", f"{drop / 1e6:.2g} MPa {word}",
                  {"sag": drop, "sag_form": form, "sag_lag": lag})  # fmt: skip
 

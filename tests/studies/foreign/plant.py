@@ -58,9 +58,10 @@ JOINT: Final = (
 ) = range(len(JOINT))  # fmt: skip
 TANH, DAHL, LUGRE, KARNOPP = range(4)
 SHARP, ROUNDED, NOTCH = range(3)
+BOTH_SEALS, DIFFERENCE, CAP_SEAL, ROD_SEAL, UNLIKE_SEALS = range(5)
 BACKLASH, LINKAGE, MAGNET = range(3)
 LAMINAR, TURBULENT = range(2)
-QUADRATIC, LINEAR, LAGGED, ACCUMULATOR = range(4)
+QUADRATIC, LINEAR, LAGGED, ACCUMULATOR, REGULATOR = range(5)
 CONTINUOUS, FIRST_ORDER, SECOND_ORDER = range(3)
 # State: angles, speeds, four pressures, bristles, spools and their speeds, openings behind the
 # spools, supply at the valve, tank line at the valve.
@@ -108,11 +109,23 @@ def breakaway(v: float, j: Array) -> Any:
 
 
 @njit(cache=True)
+def pressing(cap: float, rod: float, form: float) -> float:
+    """Pressure [Pa] that presses the seals: of both chambers, of one, or their difference."""
+    if form == DIFFERENCE:
+        return abs(cap - rod)
+    if form == CAP_SEAL:
+        return cap
+    if form == ROD_SEAL:
+        return rod
+    return cap + (0.4 * rod if form == UNLIKE_SEALS else rod)
+
+
+@njit(cache=True)
 def level(v: float, s: float, cap: float, rod: float, j: Array) -> Any:
     """Sliding friction [N] at speed v: by direction, falling with speed, by pressure, by place."""
     size = j[AHEAD] if v >= 0.0 else j[ASTERN]
     size += breakaway(v, j)
-    size += j[BY_PRESSURE] * (cap + rod if j[PRESSURE_FORM] == 0.0 else abs(cap - rod))
+    size += j[BY_PRESSURE] * pressing(cap, rod, j[PRESSURE_FORM])
     return size * (1.0 + j[TAPER] * s)
 
 
@@ -269,6 +282,8 @@ def rates(  # noqa: PLR0912  one branch an effect's form
             out[AT_VALVE] = (m[SAG] * share - y[AT_VALVE]) / FAST_LINE
         elif m[SAG_FORM] == LAGGED:
             out[AT_VALVE] = (m[SAG] * share - y[AT_VALVE]) / m[SAG_LAG]
+        elif m[SAG_FORM] == REGULATOR:  # a pump that answers late to the drop of an orifice
+            out[AT_VALVE] = (m[SAG] * share * abs(share) - y[AT_VALVE]) / m[SAG_LAG]
         else:  # a gas cushion: stiffer the fuller it is
             full = (m[SUPPLY] - y[AT_VALVE]) / m[SUPPLY]
             out[AT_VALVE] = full * (m[SAG] * share - y[AT_VALVE]) / m[SAG_LAG]
