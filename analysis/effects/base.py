@@ -244,6 +244,12 @@ class Effect(Term):
         """Return (name, where) of effects that no data can separate from it at a shape."""
         return ()
 
+    def inseparable_beside(
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Effect]
+    ) -> tuple[tuple[str, str], ...]:
+        """Return `inseparable`, with those that hold beside the `others` of a set on a rig."""
+        return self.inseparable(shape)
+
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every `where` of this effect on a rig; none without the oil it acts on."""

@@ -16,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import SUPPLY, Array, Evidence, Shape, SignalEffect
+from analysis.effects.base import SUPPLY, Array, Effect, Evidence, Shape, SignalEffect
 from analysis.effects.valve import lagged
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
@@ -175,6 +175,19 @@ class LineDrop(PortEffect):
             f"the largest flow of these records, {plain(ratio * pump, 2)} l/min, it is "
             f"{plain(drop / 1e6, 2)} MPa"
         )
+
+    def inseparable_beside(
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Effect]
+    ) -> tuple[tuple[str, str], ...]:
+        """Return the metering of a single joint's valve, beside the other port's turbulent line.
+
+        An edge in series with such a line has Q = C u sqrt(dp - k Q^2) = C u sqrt(dp) /
+        sqrt(1 + k C^2 u^2): the flow of an edge that opens less and less with the spool.
+        """
+        turbulent = self.line(rig, shape)[1] != LAMINAR
+        both_ports = any(isinstance(other, LineDrop) for other in others)
+        alone = len(rig.joints) == 1 and turbulent and both_ports
+        return (("metering_curve", "joint 1"),) if alone else ()
 
     def extrapolated(
         self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]

@@ -111,7 +111,9 @@ def judge_effects(
         unphysical = hypotheses.physical_problem(winner, used)
         inseparable = [
             Rival(name, effect_of(name, at).place, 1.0, 1.0, True, at)
-            for name, at in effect.inseparable(used.shape)
+            for name, at in effect.inseparable_beside(
+                train_data.rig, used.shape, effects_among(winner.without(used))
+            )
         ]
         removes = removed.share >= TRACE.least_removed and not disturbed
         significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown_size else "")

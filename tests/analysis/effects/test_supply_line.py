@@ -185,6 +185,30 @@ def test_an_accumulator_may_be_as_slow_at_a_small_pump_of_low_pressure(
     assert drop == pytest.approx(slow, abs=0.02 * slow.max())
 
 
+def test_lines_at_both_ports_of_one_valve_have_the_flow_of_an_edge_that_opens_less(
+    rig: Rig,
+) -> None:
+    """The flow through edge and line in series, by a root finder, over the root of the drop."""
+    lone = rig.model_copy(update={"joints": rig.joints[:1]})
+    sag, back = SupplySag("bench"), ReturnLine("bench")
+    turbulent = (DROP, 0.01)
+    assert sag.inseparable_beside(lone, turbulent, [back]) == (("metering_curve", "joint 1"),)
+    assert back.inseparable_beside(lone, turbulent, [sag]) == (("metering_curve", "joint 1"),)
+    assert not sag.inseparable_beside(rig, turbulent, [back])
+    assert not sag.inseparable_beside(lone, (DROP, 0.0), [back])  # laminar throughout
+    assert not sag.inseparable_beside(lone, turbulent, [])
+    gain, k = 6e-7, DROP / rig.supply.flow**2
+
+    def over_root(u: float, drop: float) -> float:
+        series = lambda Q: Q - gain * u * np.sqrt(max(drop - k * Q * Q, 0.0))  # noqa: E731
+        return float(brentq(series, 0.0, np.sqrt(drop / k))) / np.sqrt(drop)
+
+    for u in (0.01, 0.1, 0.5):
+        at = [over_root(u, drop) for drop in (0.5e6, 2e6, 6e6)]
+        assert at == pytest.approx([at[0]] * 3, rel=1e-6)
+    assert over_root(0.5, 2e6) < 0.9 * 50 * over_root(0.01, 2e6)
+
+
 def test_a_regulator_follows_with_one_time_constant_at_any_flow(rig: Rig, lifting: Signals) -> None:
     """The drop of an orifice through a first-order lag, integrated by another route."""
     volume, share, flow = 1e-3, 1e-3, rig.supply.flow

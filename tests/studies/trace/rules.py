@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.friction import Friction
 from analysis.effects.measurement_scale import SensorOffset
+from analysis.effects.supply import LineDrop
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.trace import engine, finding, fitted_model, free_forms, in_motion, judging
@@ -197,7 +198,8 @@ RULES: Final = (
     Rule("free run", "the held-out free run may fail with the effects or be far worse",
          ((held_out, "worse_free_run", lambda *_: ""),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
-         ((SpoolOffset, "inseparable", lambda *_: ()),
+         ((LineDrop, "inseparable_beside", lambda *_: ()),
+          (SpoolOffset, "inseparable", lambda *_: ()),
           (SensorOffset, "inseparable", lambda *_: ()))),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
     Rule("held-out rows choose", "where training rows hold noise alone, they choose alone",
