@@ -37,6 +37,7 @@ from analysis.trace.next_experiment.detection_limits import (
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.notes import (
     evidence_notes,
+    exact_geometry_notes,
     geometry_note,
     not_judged_notes,
     record_condition_notes,
@@ -278,6 +279,7 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
         ),
         *(why for _, why in shared_parameters(winner, model).values()),
         *record_condition_notes(train_data, winner),
+        *exact_geometry_notes(records.rig, finding.named),
         *undetermined_notes(model, baseline, finding.rows.filtering.in_motion),
         *judging_notes,
         *fitted.notes,

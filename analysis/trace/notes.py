@@ -24,6 +24,7 @@ from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.records import Run
+from rig.model.rig import Rig
 from rig.model.units import plain
 
 MOST_NUMBERS: Final = 3  # of a rig file, in a note
@@ -181,6 +182,21 @@ def refitted_notes(
             "motions like the held-out ones"
         )
     return notes
+
+
+def exact_geometry_notes(rig: Rig, named: Sequence[JudgedEffect]) -> list[str]:
+    """State that a wrong number of the rig file may look like a sensor's error, without tolerances.
+
+    A pin 2 mm from where the file has it looked like a piston sensor's offset of 1.9 mm.
+    """
+    errors = [e for e in named if e.mechanism in ("sensor", "chamber_volume")]
+    if rig.electric or rig.uncertain_numbers or not errors:
+        return []
+    names = ", ".join(f"{e.name} at {place_in_words(e.at)}" for e in errors)
+    return [
+        f"{names}: areas, volumes and pin distances of the rig file are taken as exact, and a "
+        "wrong one may look like this; state `tolerances` there to have that tried"
+    ]
 
 
 def geometry_note(geometry: Geometry, named: Sequence[JudgedEffect], explained: bool) -> str:

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 
 from analysis.simulation.model import Estimate
-from analysis.terms import make
 from analysis.trace.clues.formula import surest_formula
 from analysis.trace.judge.gates import form_share
 from analysis.trace.notes import WITHOUT_RESTS
@@ -90,7 +89,9 @@ def _largest_errors(result: Trace) -> str:
     ratios = {e: result.after[e] / floor for e, floor in result.noise_floor.items() if floor > 0}
     largest = sorted(ratios, key=lambda e: -ratios[e])[:2]
     errors = " and ".join(f"{plain(ratios[e], 3)} in {e}" for e in largest)
-    return f"Held-out errors over the noise floor: {errors}."
+    in_noise = all(ratio <= TRACE.noted_ratio for ratio in ratios.values())
+    only_trained = "; what is above it is in other rows (see the notes)" if in_noise else ""
+    return f"Held-out errors over the noise floor: {errors}{only_trained}."
 
 
 def _symmetry(result: Trace) -> str:
@@ -115,15 +116,23 @@ def _effect_in_words(effect: JudgedEffect, rig: Rig) -> str:
 
 
 def numbers_in_words(effect: JudgedEffect, rig: Rig) -> list[str]:
-    """Return an effect's numbers; of a free curve its range instead of values at knots."""
-    values, hidden = [_curve_range(c) for c in effect.curves if effect.free], set[str]()
-    if effect.free:
-        term = make(effect.name, effect.at or effect.where)
-        hidden = {c.parameter for c in term.coefficients(rig)}
+    """Return an effect's numbers; of a free curve its range instead of values at knots.
+
+    Of a shape that may lie anywhere between its bounds only that is stated.
+    """
+    term = effect_of(effect.name, effect.at or effect.where)
+    hidden = {c.parameter for c in term.coefficients(rig)} if effect.free else set()
+    bounds = {s.parameter: (s.low, s.high) for s in term.shapes(rig)}
+    values = [_curve_range(c) for c in effect.curves if effect.free]
     for n, e in effect.parameters.items():
-        if n not in hidden:
-            link = " not determined: " if _undetermined(effect, n) else " = "
-            values.append(f"{n}{link}{quantity(e)}")
+        if n in hidden:
+            continue
+        if not _undetermined(effect, n):
+            values.append(f"{n} = {quantity(e)}")
+        elif n in bounds and e.ci95[0] <= bounds[n][0] and e.ci95[1] >= bounds[n][1]:
+            values.append(f"{n} not determined")
+        else:
+            values.append(f"{n} not determined: {quantity(e)}")
     return values
 
 

@@ -86,6 +86,13 @@ def test_a_number_less_certain_than_its_size_is_not_determined(rig: Rig) -> None
     assert "another note" not in text
 
 
+def test_a_number_that_may_lie_anywhere_between_its_bounds_has_no_interval(rig: Rig) -> None:
+    """The share of the pump's flow at which a line becomes turbulent is 0.001 to 3."""
+    sag = {"dp_supply": (1e6, 1e5, "Pa"), "laminar_share": (1e-3, 72.0, "")}
+    text = told(rig, (effect("supply_sag", "the flow drawn from the supply", sag),))
+    assert "laminar_share not determined)" in text
+
+
 def test_a_small_part_of_a_large_number_is_determined(rig: Rig) -> None:
     wave = {"T_sin_2": (1.5, 0.1, "N*m"), "T_cos_2": (0.01, 0.1, "N*m")}
     text = told(rig, (effect("periodic_disturbance", "time", wave),))
@@ -130,6 +137,7 @@ def test_what_only_held_out_records_keep_is_not_said_to_be_nothing(rig: Rig) -> 
     quiet = {e: 1.15 * floor for e, floor in most.noise_floor.items()}
     unnamed = replace(most, effects=(), after=quiet)
     assert "Held-out errors over the noise floor: 1.15 in " in sentence(unnamed)
+    assert sentence(unnamed).endswith("; what is above it is in other rows (see the notes).")
 
 
 def test_an_error_that_no_effect_lowers_is_no_error_of_a_form(rig: Rig) -> None:
