@@ -70,8 +70,9 @@ def state_folder() -> Path:
     return Path.home() / ".local" / "state" / "bramah"
 
 
-def _folder_name(wire: Wire) -> str:
-    kind, _, address = wire.endpoint.lower().partition("?")[0].partition("://")
+def bench_name(endpoint: str) -> str:
+    """Return the name of the bench at an endpoint, as of a file: equal for the same bench."""
+    kind, _, address = endpoint.lower().partition("?")[0].partition("://")
     for name in _THIS_COMPUTER:
         address = re.sub(rf"^{re.escape(name)}(?=:|$)", LOCALHOST, address)
     return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{address}")
@@ -113,7 +114,7 @@ class BenchState:
 
     def __init__(self, wire: Wire, root: Path | None = None) -> None:
         self.endpoint = wire.endpoint
-        self.folder = (state_folder() if root is None else root) / _folder_name(wire)
+        self.folder = (state_folder() if root is None else root) / bench_name(wire.endpoint)
         self._taken = False
         self._lock: int | None = None
 

@@ -406,11 +406,13 @@ class Monitor(Starts, App[int]):
         self.look = replace(self.look, offset=0)
 
     def act_choose(self) -> None:
-        """Return to the list of runs, if there are several."""
-        if len(self.link.frame.sessions) < 2:
+        """Return to the list of runs, or after the end of one to the only other."""
+        frame = self.link.frame
+        others = [session for session in frame.sessions if session != frame.endpoint]
+        if not others:
             self.remark = "No other run to choose."
         else:
-            self.link.choose(None)
+            self.link.choose(others[0] if frame.over and len(others) == 1 else None)
 
     def act_quit(self) -> None:
         """Close the screen; the run goes on."""

@@ -196,6 +196,7 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
         listed.append(stop_notice(frame, stop, now))
     if frame.over:
         listed.append(_ended(frame))
+        listed += _not_shown(frame)
     elif frame.stage is LinkStage.ATTACHED and (age := frame.age(now)) > QUIET:
         level = "alarm" if age > VERY_OLD else "warn"
         what = "what is shown is old" if snapshot else "nothing received yet"
@@ -273,6 +274,20 @@ def _ended(frame: Frame) -> Notice:
         return Notice("alarm", f"RUN GONE (process {pid} ended without a word): {tail}")
     level = "ended" if snapshot.state == "done" else "warn"
     return Notice(level, f"RUN ENDED, {snapshot.state}: {tail}")
+
+
+def _not_shown(frame: Frame) -> list[Notice]:
+    """Return a line on a run of another bench, which a screen shows only when it is told to."""
+    others = [session for session in frame.sessions if session != frame.endpoint]
+    if not others:
+        return []
+    first = others[0]
+    more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
+    text = (
+        f"NOT SHOWN: a run on {first.rig} (process {first.pid}){more}; "
+        f"c or bramah monitor --rig {first.rig} shows it"
+    )
+    return [Notice("warn", text)]
 
 
 BANDS: Final = {Band.INSIDE: STRONG, Band.NEAR: WARN_TEXT, Band.BEYOND: ALARM}

@@ -363,6 +363,63 @@ async def test_after_the_run_its_last_picture_stays_and_the_next_run_is_joined()
         assert "last picture" not in shown.text
 
 
+async def test_a_trip_stays_shown_while_another_bench_runs_until_the_operator_changes() -> None:
+    # Two benches in the room: the screen has joined the first by itself, and it trips.
+    record = running()
+    record.waiting.append(tripped(followed(snapshot(Bench(), 81))))
+    press = Recorded(other_bench(k) for k in range(1, 41))
+    machine, other = Machine({HERE: record}), endpoint("press", 99)
+    async with glass(machine) as shown:
+        del machine.runs[HERE]
+        machine.runs[other] = press
+        for _ in range(5):
+            await shown.watch(1.0)
+        assert "■ TRIPPED  shinshu-2dof" in shown.lines[0]
+        assert "NOT SHOWN: a run on press (process 99); c or bramah" in shown.sentences
+        await shown.press("space")
+        await shown.answered()
+        assert press.commands == []
+        press.waiting.extend(other_bench(k) for k in range(41, 51))
+        await shown.press("c")
+        await shown.watch(1.0)
+        assert "EXCITING  press" in shown.lines[0]
+        await shown.press("space")
+        await shown.answered()
+        assert press.commands == ["stop"]
+
+
+def other_bench(k: int) -> Snapshot:
+    view = followed(snapshot(Bench(rig="press", joints=1, pid=99), k))
+    return replace(view, wire="modbus-tcp://127.0.0.1:5021")
+
+
+async def test_of_two_runs_that_begin_after_a_trip_the_one_of_the_same_bench_is_joined() -> None:
+    record = running()
+    record.waiting.append(tripped(followed(snapshot(Bench(), 81))))
+    machine = Machine({HERE: record})
+    async with glass(machine) as shown:
+        del machine.runs[HERE]
+        await shown.watch(1.0)
+        machine.runs[endpoint("press", 99)] = Recorded([other_bench(1)])
+        await shown.watch(1.0)
+        machine.runs[endpoint(pid=4712)] = running(1.0, Bench(pid=4712, run="runs/second"))
+        await shown.watch(1.0)
+        assert "EXCITING  shinshu-2dof  second" in shown.lines[0]
+
+
+async def test_a_run_that_the_operator_starts_is_joined_whatever_was_shown() -> None:
+    record = running()
+    record.waiting.append(tripped(followed(snapshot(Bench(), 81))))
+    machine = Machine({HERE: record})
+    async with glass(machine) as shown:
+        del machine.runs[HERE]
+        await shown.watch(1.0)
+        shown.app.link.expect(99)
+        machine.runs[endpoint("press", 99)] = Recorded([other_bench(1)])
+        await shown.watch(1.0)
+        assert "EXCITING  press" in shown.lines[0]
+
+
 async def test_an_idle_screen_draws_nothing() -> None:
     record = running()
     record.waiting.append(replace(followed(snapshot(Bench(), 81)), state="done"))

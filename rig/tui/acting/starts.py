@@ -225,6 +225,8 @@ class Starts(Commands):
         self.look = replace(self.look, offset=0)
 
         def changed(job: VerbJob) -> None:
+            if words[0] in ("run", "manual"):
+                self.link.expect(job.pid)
             self.browsed = replace(self.browsed, job=job)
             if job.code is not None:
                 self.remark = f"{job.words[0]}: {job.ended}"

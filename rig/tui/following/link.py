@@ -16,7 +16,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from rig.bench.latch import BenchState
+from rig.bench.latch import BenchState, bench_name
 from rig.bench.screens.commands import own_command
 from rig.bench.screens.snapshot import PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
@@ -33,6 +33,7 @@ SEARCH_INTERVAL: Final = 0.5  # between two searches for a session while none is
 QUIET: Final = 0.5  # a run silent for this long is stale, and its process is checked [s]
 KEPT_LINES: Final = 2000  # of the event log, and of estimates
 ANSWER_TIME: Final = 1.0  # time limit of a run's answer with its recent history [s]
+FIRST_WORD: Final = 0.5  # longest wait for the first snapshot of a session [s]
 ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
 
 
@@ -134,6 +135,8 @@ class Link:
         self._history = History()
         self._chosen: Endpoint | None = None
         self._choosing = False
+        self._expected = 0
+        self._elsewhere: frozenset[Endpoint] = frozenset()  # sessions of other benches
         self._last_search = -float("inf")
         self._last_window = -float("inf")
         self._dirty = False
@@ -164,6 +167,10 @@ class Link:
     def choose(self, endpoint: Endpoint | None) -> None:
         """Attach to this session; None asks the operator to choose again."""
         self._chosen, self._choosing = endpoint, endpoint is None
+
+    def expect(self, pid: int) -> None:
+        """Attach to the session of a process that the operator has started, once it is there."""
+        self._expected = pid
 
     def stop(
         self, endpoint: Endpoint | None, answered: Callable[[Endpoint | None, bool], None]
@@ -305,12 +312,42 @@ class Link:
                 self._drain()
                 self._detach()
                 self._frame = replace(self._frame, stage=LinkStage.ENDED)
+        elif started := [session for session in live if session.pid == self._expected]:
+            self._attach(started[0])
+        elif self._frame.endpoint is not None:
+            self._join_next_of_bench(live)
         elif len(live) == 1:
             self._attach(live[0])
         elif live:
             self._frame = self._blank(LinkStage.CHOOSING)
         elif self._frame.stage is LinkStage.CHOOSING:
             self._frame = self._blank(LinkStage.WAITING)
+
+    def _join_next_of_bench(self, live: Sequence[Endpoint]) -> None:
+        """Attach to a new session of the bench that is shown, never to one of another bench.
+
+        The keys, the stop among them, act on the bench shown: only the operator may change it.
+        """
+        self._elsewhere &= frozenset(live)
+        for session in live:
+            if session in self._elsewhere:
+                continue
+            source = self._sessions.open(session)
+            first = source.receive(FIRST_WORD)
+            if first is not None and self._of_this_bench(first):
+                self._attach(session, source)
+                self._update(first, self._clock())
+                return
+            source.close()
+            if first is not None:  # else it starts or ends: asked again at the next search
+                self._elsewhere |= {session}
+
+    def _of_this_bench(self, snapshot: Snapshot) -> bool:
+        """Return whether a snapshot is of the bench whose run is shown, by its wire."""
+        shown, endpoint = self._frame.snapshot, self._frame.endpoint
+        if shown is not None and shown.wire and snapshot.wire:
+            return bench_name(snapshot.wire) == bench_name(shown.wire)
+        return endpoint is not None and snapshot.rig.startswith(endpoint.rig)
 
     def _blank(self, stage: LinkStage, endpoint: Endpoint | None = None) -> Frame:
         """Return a frame without a run's data; the log stays."""
@@ -329,10 +366,11 @@ class Link:
             self._update(last, self._clock())
         self._frame = replace(self._frame, window=self._history.window(self.window_seconds))
 
-    def _attach(self, endpoint: Endpoint) -> None:
-        source = self._sessions.open(endpoint)
+    def _attach(self, endpoint: Endpoint, source: Attachment | None = None) -> None:
+        source = source or self._sessions.open(endpoint)
         self._detach()
         self._source = source
+        self._expected, self._elsewhere = 0, frozenset()
         self._history = History()
         self._past_requested = -float("inf")
         self._frame = self._blank(LinkStage.ATTACHED, endpoint)
