@@ -1,4 +1,4 @@
-"""Frames of a CAN bus by python-can: a thread of this module receives, the caller's thread sends.
+"""Frames of a CAN bus by python-can: a thread of this module receives, the callers' threads send.
 
 python-can's periodic sender is not used: its thread ends silently with the first error of the bus,
 and only the device's watchdog would remain.
@@ -112,6 +112,7 @@ class CanPort:
         self._keys = keys
         self._make = make
         self._shared = False
+        self._sending = threading.Lock()  # adapters write a frame in parts
         self._reader: _Reader | None = None
 
     @property
@@ -169,7 +170,8 @@ class CanPort:
         end = time.monotonic() + DRIVER.can_send
         while True:
             try:
-                reader.bus.send(message, timeout=DRIVER.can_send)
+                with self._sending:
+                    reader.bus.send(message, timeout=DRIVER.can_send)
             except _ERRORS as error:
                 if not _is_full(error):
                     raise self._loss(error) from error

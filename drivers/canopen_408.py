@@ -88,7 +88,14 @@ class CanOpenValves:
         keys |= {cia408.HEARTBEAT_ID + n for n in (*self._numbers, settings.host)}
         place = BusPlace.of(settings.bus)
         self._port = CanPort(place, settings.bitrate, None, frozenset(keys), deliver=self._deliver)
+        self._beat = threading.Lock()  # one heartbeat at a time
         self._last_heartbeat = 0.0
+        # So that a call every period sends one in time.
+        period = 1.0 / rig.sample_rate
+        self._interval = max(wire.watchdog / DRIVER.heartbeats - 0.5 * period, 0.0)
+        self._at_zero = True  # whether the newest set points are all zero
+        self._idle_ended = threading.Event()
+        self._idle_loss: str | None = None  # why the bus was lost between two calls
         self._in_control = False  # whether the valves supervise this host's heartbeat
         self._other_host = False  # whether another host's heartbeat was heard
         self._states: list[int] = [ValveState.INIT] * len(rig.joints)
@@ -112,6 +119,11 @@ class CanOpenValves:
         for node in self._nodes:
             self._configure(node, milliseconds)
         self._heartbeat(force=True)
+        self._at_zero, self._idle_loss = True, None
+        self._idle_ended = threading.Event()
+        threading.Thread(
+            target=self._beat_at_zero, args=(self._idle_ended,), name="bramah-valves", daemon=True
+        ).start()
         for number in self._numbers:
             self._network.send_message(0, bytes([1, number]))  # NMT: operational
         self._send(np.zeros(len(self._nodes)), Control.DISABLED)
@@ -149,13 +161,20 @@ class CanOpenValves:
     def write(self, volts: Array) -> None:
         """Put out voltages [V]: set points in ACTIVE, or HOLD where all are zero."""
         self._usable()
+        moving = bool(volts.any())
+        self._at_zero = self._at_zero and not moving
         self._heartbeat()
         hold = Control.DISABLED | Control.HOLD
-        self._send(volts, hold | Control.ACTIVE if volts.any() else hold)
+        self._send(volts, hold | Control.ACTIVE if moving else hold)
+        self._at_zero = not moving
 
-    def close(self) -> None:
-        """Disable the valves if the bus works, and stop their supervision of the heartbeat."""
-        if self._port.is_open and self._in_control:
+    def close(self, *, tripped: bool = False) -> None:
+        """Disable the valves if the bus works, and stop their supervision of the heartbeat.
+
+        After a trip they keep the supervision: each goes to a fault, which refuses every host.
+        """
+        self._idle_ended.set()
+        if self._port.is_open and self._in_control and not tripped:
             with suppress(DeviceError, *self._sdo_errors):
                 self._send(np.zeros(len(self._nodes)), Control.DISABLED)
                 for node in self._nodes:
@@ -320,12 +339,26 @@ class CanOpenValves:
                 self._received.notify_all()
 
     def _heartbeat(self, *, force: bool = False) -> None:
-        # Sent by the thread that serves the outputs, so that a stopped host sends none.
-        now = self._clock()
-        if force or now - self._last_heartbeat > self._wire.watchdog / DRIVER.heartbeats:
-            state = bytes([cia408.OPERATIONAL])
-            self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._settings.host, state))
-            self._last_heartbeat = now
+        with self._beat:
+            now = self._clock()
+            if force or now - self._last_heartbeat > self._interval:
+                state = bytes([cia408.OPERATIONAL])
+                self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._settings.host, state))
+                self._last_heartbeat = now
+
+    def _beat_at_zero(self, ended: threading.Event) -> None:
+        """Send the heartbeat while all set points are zero, whatever else this program does.
+
+        With a set point only the thread that serves the outputs sends it, so that a program that
+        stands still sends none.
+        """
+        try:
+            while not ended.wait(self._wire.watchdog / DRIVER.heartbeats):
+                if self._at_zero:
+                    self._heartbeat()
+        except DeviceError as error:
+            if not ended.is_set():
+                self._idle_loss = str(error)
 
     def _send(self, volts: Array, word: int) -> None:
         for node, volt, joint in zip(self._nodes, volts, self._rig.joints, strict=True):
@@ -347,7 +380,7 @@ class CanOpenValves:
 
     def _usable(self) -> None:
         if not self._port.is_open:
-            raise DeviceLost(f"the bus {self._port.where} is closed")
+            raise DeviceLost(self._idle_loss or f"the bus {self._port.where} is closed")
         if self._port.fault is not None:
             self._port.receive(0.0)
 
@@ -376,6 +409,12 @@ class CanOpen408Driver(PolledDriver):
         info = super().connect()
         self._latch_fault()
         return info
+
+    def close_tripped(self) -> None:
+        """Zero the outputs, then fall silent, so that each valve latches a fault; never raises."""
+        self._make_safe()
+        self._valves.close(tripped=True)
+        self.close()
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; refused while a valve is in a fault."""

@@ -26,6 +26,7 @@ from drivers.base import (
     DeviceInfo,
     DeviceLost,
     Driver,
+    LatchesTrip,
     OutputLaw,
     SampleBlock,
 )
@@ -262,11 +263,31 @@ class Bench:
         """Set the laws of all joints at one tick, bounded by each joint's limits.command.
 
         `restart` starts the waveforms at that tick. Returns the tick; raises ValueError for a wrong
-        number of laws, or for values that are not finite.
+        number of laws, or for values that are not finite, SafetyTrip where the device has tripped.
         """
         bounded = self._outputs.bounded(laws)
         self._obey_requests()
-        return self._outputs.apply(bounded, restart=restart)
+        try:
+            return self._outputs.apply(bounded, restart=restart)
+        except DeviceLost:
+            raise
+        except DeviceError as error:
+            self._trip_as_device(error)
+            raise
+
+    def _trip_as_device(self, error: DeviceError) -> None:
+        """Raise SafetyTrip if the device refused a law because it has tripped meanwhile."""
+        cause = None
+        with suppress(DeviceError):
+            cause = self._driver.trip_cause()
+        if cause is None:
+            return
+        violation = self._timed(self._guard.device_tripped(self.tick))
+        trip = self._latch(violation)
+        trip.add_note(f"device: {cause}")
+        self._note_alarms(violation)
+        self._report(trip)
+        raise trip from error
 
     # Samples
 
@@ -362,6 +383,11 @@ class Bench:
         if self.state.latch(str(self.trip), self.rig, folder):
             self.trip.add_note(
                 f"inspect the bench, then clear the trip with `{reset_command(self.rig)}`"
+            )
+        if not isinstance(self._driver, LatchesTrip):
+            self.trip.add_note(
+                f"latched on this computer only: over wire {self.rig.wire.kind} the device keeps "
+                "no trip, so other computers and users are not refused"
             )
         return self.trip
 

@@ -128,6 +128,47 @@ def test_a_host_that_says_goodbye_leaves_no_fault(at: str) -> None:
     driver.close()
 
 
+def test_a_host_busy_elsewhere_with_outputs_at_zero_loses_no_valve(at: str) -> None:
+    """Between connecting and the first sample the head of the run is written to a slow disk."""
+    driver = host(at, watchdog=0.5)
+    driver.connect()
+    time.sleep(1.5)
+    driver.start()
+    assert not driver.read_block().tripped
+    assert driver.trip_cause() is None
+    driver.close()
+
+
+def test_a_host_that_stands_still_with_outputs_on_leaves_valves_in_fault(at: str) -> None:
+    driver = host(at, watchdog=0.4)
+    driver.connect()
+    driver.start()
+    driver.apply(DRIVING)
+    while driver.read_block().data[-1, 0] < 0.09:
+        pass
+    time.sleep(1.0)  # its threads go on
+    driver.zero_outputs()
+    driver.read_block()
+    assert "valve 1 is in FAULT_DISABLED" in (driver._valves.fault() or "")
+    driver.reset()
+    driver.close()
+
+
+def test_a_trip_of_one_computer_refuses_the_others_until_a_reset(at: str) -> None:
+    first, other = host(at, watchdog=0.4), host(at)
+    first.connect()
+    first.start()
+    first.apply(DRIVING)
+    first.read_block()
+    first.close_tripped()
+    other.connect()
+    assert "valve 1 is in FAULT_DISABLED" in (other.trip_cause() or "")
+    other.reset()
+    other.start()
+    other.apply(DRIVING)
+    other.close()
+
+
 HOST = """
 import sys
 from drivers.base import OutputLaw

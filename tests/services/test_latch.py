@@ -7,12 +7,21 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from drivers.base import DeviceBusy, DeviceInfo, DeviceLost, SampleBlock
+from drivers.base import (
+    OFF,
+    DeviceBusy,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    OutputLaw,
+    SampleBlock,
+)
 from rig.bench.latch import (
     BenchState,
     Holder,
@@ -22,11 +31,12 @@ from rig.bench.latch import (
     tripped_rigs,
 )
 from rig.bench.session import Bench
+from rig.cli.errors import code_and_message
 from rig.model.parse import InputError
 from rig.model.trips import Latched, SafetyTrip
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig
-from rig.runs.runstate import read_events
+from rig.runs.runstate import read_events, read_state
 from tests.services.fake_driver import FakeDriver
 
 RIG = load_rig("shinshu-2dof")
@@ -83,6 +93,46 @@ def test_the_rig_of_a_trip_is_kept_also_where_no_run_is_recorded() -> None:
     reset_bench(own, FakeDriver(own), "sensor 1 replaced")
     assert tripped_rigs() == []
     assert known_rigs() == [described]
+
+
+class HoldsTrip(FakeDriver):
+    def close_tripped(self) -> None:
+        self.close()
+
+
+@pytest.mark.parametrize("kind", [FakeDriver, HoldsTrip])
+def test_a_trip_says_where_no_other_computer_is_refused(kind: type[FakeDriver]) -> None:
+    with pytest.raises(SafetyTrip) as tripped, Bench(RIG, kind(RIG, spoil=too_much)) as bench:
+        bench.exchange()
+    said = "; ".join(tripped.value.__notes__)
+    assert "clear the trip with `bramah reset" in said
+    assert ("latched on this computer only" in said) == (kind is FakeDriver)
+
+
+class ValveFault(FakeDriver):
+    """Valves of which one finds a fault of its own between a block and the next law."""
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
+        self.latched = "valve 1 is in FAULT_DISABLED"
+        raise DeviceError(f"tripped: {self.latched}; find the cause, then reset it")
+
+
+def test_a_device_that_refuses_a_law_since_it_tripped_is_a_trip_and_no_lost_device(
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "monday"
+    driver = ValveFault(RIG)
+    with pytest.raises(SafetyTrip) as tripped, Bench(RIG, driver, Recorder(run, RIG)) as bench:
+        bench.apply([OutputLaw(bias=0.1, limit=1.0)] * 2)
+    code, message = code_and_message(tripped.value)
+    assert code == 3
+    assert "limit 'device watchdog or fault'" in message
+    assert "device: valve 1 is in FAULT_DISABLED" in message
+    assert driver.laws == [OFF, OFF]
+    assert read_state(run) == "tripped"
+    assert any(event["event"] == "trip" for event in read_events(run))
+    with pytest.raises(Latched), Bench(RIG, FakeDriver(RIG)):
+        pytest.fail("a session began")
 
 
 @pytest.mark.parametrize("reason", ["", "  "])
