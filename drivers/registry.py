@@ -46,8 +46,12 @@ def make_driver(wire: Wire, rig: Rig) -> Driver:
 def wire_at(endpoint: str, wire: Wire) -> Wire:
     """Return the wire to an endpoint such as ``modbus-tcp://127.0.0.1:5020``; times as in `wire`.
 
-    Raises InputError for another form, naming the expected one.
+    An endpoint has no form for tables and lists: `wire` itself is returned where it has this
+    endpoint, and its tables and lists are kept where it is of this kind. Raises InputError for
+    another form, naming the expected one.
     """
+    if endpoint == wire.endpoint:
+        return wire
     kinds = wire_kinds()
     url = urlsplit(endpoint)
     if url.scheme not in kinds:
@@ -55,8 +59,10 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
             f"--endpoint {endpoint}: expected KIND://..., the kind one of: {' '.join(kinds)}"
         )
     settings = driver_class(url.scheme).settings
+    own = wire.settings.items() if url.scheme == wire.kind else ()
+    without_form = {key: value for key, value in own if isinstance(value, dict | list)}
     try:
-        return wire.reached_by(url.scheme, settings.of_endpoint(url))
+        return wire.reached_by(url.scheme, {**without_form, **settings.of_endpoint(url)})
     except (ValueError, TypeError) as error:  # TypeError: a key of every wire, such as timeout
         expected = f"the settings of {url.scheme} in the rig file's section `wire`"
         if settings.example:

@@ -9,8 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from drivers import make_driver
+from rig.bench.session import Bench
+from rig.model.trips import SafetyTrip
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
+from rig.tui.jobs import rig_of_run
 from tests.cli.bench import LONG, SHORT, bramah, bramah_here, simulated, started, wait_for
+from tests.drivers.plain_module import WIRE, module_process
+from tests.drivers.test_modbus_map import rig_text
 from tests.services.test_after_zero import commands
 
 RIG = "shinshu-2dof"
@@ -128,6 +136,32 @@ def test_the_command_that_a_trip_names_works_for_a_rig_file_of_any_name(
         unknown = bramah_here("reset", "--rig", "right-arm", "--reason", "again")
         assert unknown.returncode == 2
         assert "right-arm" in unknown.stderr
+
+
+@pytest.mark.parametrize("by", ["message", "rig file", "screen"])
+def test_a_trip_over_a_register_map_is_reset_though_an_endpoint_has_no_map(
+    tmp_path: Path, by: str
+) -> None:
+    run, path = tmp_path / "monday", tmp_path / "plain.yaml"
+    with module_process() as (_, port):
+        text = rig_text(WIRE.format(port=port)).replace(f"name: {RIG}", "name: lab-module")
+        path.write_text(text.replace("pressure: [-0.2 MPa, 9 MPa]", "pressure: [-0.2 MPa, 1 MPa]"))
+        rig = load_rig(path)
+        driver = make_driver(rig.wire, rig)
+        with pytest.raises(SafetyTrip) as tripped, Bench(rig, driver, Recorder(run, rig)) as bench:
+            bench.exchange()
+        notes = " ".join(tripped.value.__notes__)
+        named = re.findall(r"`bramah (reset [^`]*) --reason TEXT`", notes)
+        assert named == [f"reset --rig lab-module --endpoint {rig.wire.endpoint}"]
+        at = ("--endpoint", rig.wire.endpoint)
+        command = {
+            "message": named[0].split(),
+            "rig file": ("reset", "--rig", path, *at),
+            "screen": ("reset", "--rig", rig_of_run(str(run), rig.name), *at),
+        }[by]
+        cleared = bramah_here(*command, "--reason", "sensor looked at")
+    assert cleared.returncode == 0, cleared.stderr
+    assert "cap_pressure_1" in cleared.stdout
 
 
 def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path) -> None:

@@ -61,6 +61,16 @@ def test_the_command_that_resets_a_bench_reaches_that_bench(kind: str) -> None:
     given(place)(_reaches(kind))()
 
 
+def test_what_an_endpoint_has_no_form_for_is_kept_from_the_rig_file() -> None:
+    nodes = wire_at("canopen-408://socketcan/can0", seed_rig().wire)
+    nodes = nodes.reached_by("canopen-408", {**nodes.settings, "nodes": [5, 6]})
+    assert wire_at(nodes.endpoint, nodes) == nodes
+    other = wire_at("canopen-408://socketcan/can1?bitrate=125000", nodes)
+    assert driver_class("canopen-408").settings.of(other).nodes == (5, 6)
+    card = nodes.reached_by("nidaqmx", {"inputs": {}, "outputs": {1: {"channel": "Dev1/ao0"}}})
+    assert wire_at("nidaqmx://Dev1", card) == card
+
+
 def _reaches(kind: str) -> Callable[[str], None]:
     def same(place: str) -> None:
         rig = seed_rig()

@@ -446,10 +446,13 @@ def test_a_key_that_stands_twice_is_refused_with_its_line() -> None:
         rig_of(change=("    piston_1:", "    spool_1:"))
 
 
-def test_it_is_found_by_its_name_and_has_no_endpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_found_by_its_name_and_has_only_its_own_endpoint(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     entry = EntryPoint("modbus-map", "drivers.modbus_map:ModbusMapDriver", registry.GROUP)
     monkeypatch.setattr(registry, "_installed", lambda: EntryPoints([entry]))
     rig = rig_of()
     assert isinstance(make_driver(rig.wire, rig), ModbusMapDriver)
     with pytest.raises(InputError, match="expected the settings of modbus-map in the rig file"):
-        wire_at("modbus-map://127.0.0.1:502", rig.wire)
+        wire_at("modbus-map://127.0.0.1:503", rig.wire)
+    assert wire_at("modbus-map://127.0.0.1:502", rig.wire) == rig.wire

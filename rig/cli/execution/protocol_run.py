@@ -245,26 +245,29 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
 def reset_device(rig: str | None, endpoint: str | None, reason: str) -> str:
     """Clear a bench's latched trip for a person's `reason`; return the cause of the trip.
 
-    `rig` may also be the name in a rig file, as in messages on a trip: this is the rig driven last
-    under that name. The default is the only bench with a stored trip.
+    `rig` may also be the name in a rig file, as in messages on a trip: this is the rig driven under
+    that name at `endpoint`, else the one driven last. The default is the only bench with a stored
+    trip.
     """
     refuse_endpoint_alone(rig, endpoint)
     if rig is None:
         rig = str(only_bench(tripped_rigs(), "no trip is stored on this computer", "tripped"))
+    named = [(path, found.wire.endpoint) for path in known_rigs() if (found := _named(path, rig))]
+    tripped = [path for path, at in named if at == endpoint]
     try:
-        bench, driver = device_of(rig, endpoint)
+        bench, driver = device_of(str(tripped[0]) if tripped else rig, endpoint)
     except InputError:
-        candidates = [path for path in known_rigs() if _is_named(path, rig)]
-        if not candidates:
+        if not named:
             raise
-        latest = max(candidates, key=lambda path: path.stat().st_mtime)
+        latest = max((path for path, _ in named), key=lambda path: path.stat().st_mtime)
         bench, driver = device_of(str(latest), endpoint)
     return reset_bench(bench, driver, reason)
 
 
-def _is_named(path: Path, name: str) -> bool:
-    """Return whether a rig file can be read and its rig has this name."""
+def _named(path: Path, name: str) -> Rig | None:
+    """Return the rig of a file if it can be read and has this name."""
     try:
-        return load_rig(path).name == name
+        rig = load_rig(path)
     except InputError:
-        return False
+        return None
+    return rig if rig.name == name else None
