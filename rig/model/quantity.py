@@ -55,7 +55,11 @@ def _other_dimension(unit: str, si: str) -> UnitError:
 
 
 def map_by_pint(unit: str, si: str) -> tuple[float, float]:
-    """Return (scale, offset) as `unit_map`, for any unit that pint knows; raises UnitError."""
+    """Return (scale, offset) as `unit_map`, for any unit that pint knows; raises UnitError.
+
+    To pint a radian is 1 and a turn 2 pi, so that 1 rad/s would be 1 Hz: an angle per time is
+    divided by 2 pi to become a frequency.
+    """
     registry = _registry()
     text = unit or "dimensionless"
     target = si or "dimensionless"
@@ -66,9 +70,12 @@ def map_by_pint(unit: str, si: str) -> tuple[float, float]:
     try:
         zero = registry.Quantity(0.0, parsed).to(target).magnitude
         unit_size = registry.Quantity(1.0, parsed).to(target).magnitude
+        angles = registry.get_root_units(parsed)[1]._units.get("radian", 0) if si == "Hz" else 0
     except Exception as error:  # of another dimension, or without a conversion
         raise _other_dimension(unit, si) from error
-    return float(unit_size - zero), float(zero)
+    if angles not in (0, 1):
+        raise _other_dimension(unit, si)
+    return float(unit_size - zero) / math.tau**angles, float(zero)
 
 
 def to_si(value: float, unit: str, si: str) -> float:

@@ -25,6 +25,7 @@ _PREFIXES: Final = {
     "G": 1e9,
 }
 _TOKEN: Final = re.compile(r"\s*(\*\*|[*/^()]|[+-]?\d+\.?\d*(?:[eE][+-]?\d+)?|[A-Za-zµ_]+)\s*")
+_ANGLE: Final = re.compile(r"rad|deg")
 _ZERO_CELSIUS: Final = 273.15  # [K]
 _PLAIN_FROM, _PLAIN_BELOW = 1e-3, 1e5  # numbers that are written without exponent
 
@@ -83,6 +84,8 @@ def linear_map(unit: str, si: str) -> tuple[float, float] | None:
     unit, si = unit.strip(), si.strip()
     if si == "degC":
         return {"degC": (1.0, 0.0), "K": (1.0, -_ZERO_CELSIUS)}.get(unit)
+    if si == "Hz" and _ANGLE.search(unit):  # an angle per time: 2 pi of it to a period
+        return None
     source, target = measure(unit), measure(si)
     if source is None or target is None or source.powers != target.powers:
         return None

@@ -64,6 +64,46 @@ def test_the_array_map_agrees_with_the_single_number(value: float, unit: str) ->
     assert parse_quantity(f"{value!r} {unit}", "m") == pytest.approx(scale * value, abs=1e-30)
 
 
+@pytest.mark.parametrize(
+    ("text", "hertz"),
+    [
+        ("60 rpm", 1.0),
+        ("3000 revolution/minute", 50.0),
+        ("1 turn/s", 1.0),
+        ("360 deg/s", 1.0),
+        ("5 rad/s", 0.7957747),
+        ("0.5 krad/s", 79.57747),
+        ("600 1/min", 10.0),
+        ("2 1/s", 2.0),
+    ],
+)
+def test_an_angle_per_time_is_a_frequency_of_its_turns(text: str, hertz: float) -> None:
+    assert parse_quantity(text, "Hz") == pytest.approx(hertz, rel=1e-6)
+
+
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "turn": math.tau, "revolution": math.tau}
+TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "hour": 3600.0}
+
+
+@given(
+    st.floats(1e-6, 1e6),
+    st.sampled_from(sorted(ANGLES)),
+    st.sampled_from(sorted(TIMES)),
+    st.sampled_from(["{0}/{1}", "1/{1}*{0}", "{0}*{1}^-1", "{0} / ({1})"]),
+)
+def test_a_body_that_turns_so_fast_has_that_frequency(
+    number: float, angle: str, time: str, form: str
+) -> None:
+    found = parse_quantity(f"{number!r} {form.format(angle, time)}", "Hz")
+    assert found == pytest.approx(number * ANGLES[angle] / TIMES[time] / math.tau)
+
+
+@pytest.mark.parametrize("text", ["1 rad^2/s", "1 1/(rad*s)", "1 rad"])
+def test_no_frequency_is_refused(text: str) -> None:
+    with pytest.raises(UnitError, match="expected one like 'Hz'"):
+        parse_quantity(text, "Hz")
+
+
 @given(st.text(max_size=60))
 def test_any_text_is_a_quantity_or_a_unit_error(text: str) -> None:
     with contextlib.suppress(UnitError):
