@@ -40,6 +40,18 @@ class DeviceBusy(DeviceError):
     """Another client has control of the device; this one may only zero its outputs."""
 
 
+class PackageMissing(InputError):
+    """The package that a kind of wire needs is not installed on this computer."""
+
+
+@runtime_checkable
+class KnowsSetup(Protocol):
+    """A driver that can tell without its device that a session will fail."""
+
+    def setup_problem(self) -> str | None:
+        """Return the key of section `wire` at fault and what was expected, None if all is there."""
+
+
 @runtime_checkable
 class ReportsDoubts(Protocol):
     """A driver that can name channels whose values suggest a wrong setting."""

@@ -27,6 +27,7 @@ from drivers.base import (
     DeviceInfo,
     DeviceLost,
     OutputLaw,
+    PackageMissing,
     WireSettings,
 )
 from drivers.can_port import BusPlace, BusSettings, CanPort
@@ -73,7 +74,7 @@ class CanOpenValves:
         try:
             self._canopen = importlib.import_module(PACKAGE)
         except ImportError as error:
-            raise InputError(
+            raise PackageMissing(
                 f"wire: kind: {wire.kind} needs the package {PACKAGE}: "
                 "pip install 'bramah[canopen]'"
             ) from error

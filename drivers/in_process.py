@@ -111,6 +111,15 @@ class InProcessDriver:
         name = type(device).__name__
         return DeviceInfo.of(self._rig, name, BLOCK_SAMPLES, virtual_time=True)
 
+    def setup_problem(self) -> str | None:
+        """Return why the object of the wire cannot be imported, None if it can."""
+        if self._make is None:
+            try:
+                self._imported()
+            except DeviceError as error:
+                return str(error)
+        return None
+
     def _imported(self) -> Callable[[Rig], Advancing]:
         module, _, name = self._path.partition(":")
         if not name:

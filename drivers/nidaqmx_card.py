@@ -22,7 +22,7 @@ from urllib.parse import SplitResult
 import numpy as np
 from pydantic import Field
 
-from drivers.base import Array, DeviceLost, WireSettings
+from drivers.base import Array, DeviceLost, PackageMissing, WireSettings
 from drivers.polled import PolledDriver
 from drivers.wire_entries import (
     inputs_by_channel,
@@ -142,7 +142,7 @@ def _package() -> ModuleType:
             importlib.import_module(f"{PACKAGE}.{part}")
         return importlib.import_module(PACKAGE)
     except ImportError as error:
-        raise InputError(
+        raise PackageMissing(
             f"wire: kind: {PACKAGE} needs the package of that name; install {PACKAGE} "
             f"(pip install {PACKAGE}) and NI's own NI-DAQmx driver ({error})"
         ) from error

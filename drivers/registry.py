@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoints, entry_points
 from typing import Final
 from urllib.parse import urlsplit
 
-from drivers.base import Driver
+from drivers.base import Driver, KnowsSetup
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -41,6 +41,17 @@ def make_driver(wire: Wire, rig: Rig) -> Driver:
         return driver_class(wire.kind)(wire, rig)
     except InputError as error:
         raise InputError(f"rig {rig.name!r}: {error}") from error
+
+
+def require_setup(wire: Wire, rig: Rig) -> None:
+    """Raise InputError naming the key of a wire with which no session could begin.
+
+    Contacts no device. Raises PackageMissing for a package that is not installed.
+    """
+    driver = driver_class(wire.kind)(wire, rig)
+    problem = driver.setup_problem() if isinstance(driver, KnowsSetup) else None
+    if problem is not None:
+        raise InputError(problem)
 
 
 def wire_at(endpoint: str, wire: Wire) -> Wire:

@@ -99,6 +99,12 @@ class ReplayDriver:
         name = f"recording {self._path}"
         return DeviceInfo.of(self._rig, name, self._settings.block_samples, virtual_time=not pace)
 
+    def setup_problem(self) -> str | None:
+        """Return that there is no recording, None if there is."""
+        if self._path.is_file():
+            return None
+        return f"wire: run: {self._path}: no such file; expected a run folder, or a records.h5"
+
     def close(self) -> None:
         """Drop the recording; never raises."""
         self._data, self._streaming = None, False

@@ -104,16 +104,22 @@ class SerialStreamDriver(MessageStreamDriver):
 
     def connect(self) -> DeviceInfo:
         """Open the line, check that the device fits the rig, leave its outputs at zero."""
+        if (problem := self.setup_problem()) is not None:
+            raise DeviceError(problem)
+        return super().connect()
+
+    def setup_problem(self) -> str | None:
+        """Return that the line is too slow for the stream, None if it is not."""
         needed = msg.line_rate(
             reg.block_layout(len(self._rig.channels), len(self._rig.joints)), self._rig.sample_rate
         )
-        if self._baud < needed:
-            raise DeviceError(
-                f"{self._baud} baud on {self._link.where} cannot carry "
-                f"{len(self._rig.recorded)} values at {self._rig.sample_rate:g} Hz; "
-                f"{needed:.0f} at least"
-            )
-        return super().connect()
+        if self._baud >= needed:
+            return None
+        return (
+            f"wire: baud: {self._baud} baud on {self._link.where} cannot carry "
+            f"{len(self._rig.recorded)} values at {self._rig.sample_rate:g} Hz; "
+            f"{needed:.0f} at least"
+        )
 
     def _address(self) -> str:
         """Return the port and its speed."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 import re
 import unicodedata
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -84,8 +84,11 @@ def _split(text: str, option: str, example: str) -> re.Match[str]:
     return match
 
 
-def channel_condition(text: str) -> StartCondition:
-    """Read ``oil_temperature > 40 degC``; raises InputError for an unknown channel or unit."""
+def channel_condition(text: str, measured: Sequence[str] = ()) -> StartCondition:
+    """Read ``oil_temperature > 40 degC``; raises InputError for an unknown channel or unit.
+
+    With `measured`, the channels of a bench, also for one that it does not measure.
+    """
     parts = _split(text, "--when", "'oil_temperature > 40 degC'")
     name = parts["name"]
     try:
@@ -97,6 +100,11 @@ def channel_condition(text: str) -> StartCondition:
         bound = to_si(float(parts["number"]), parts["unit"], unit)
     except ValueError as error:
         raise InputError(f"--when {text!r}: {error}") from error
+    if measured and name not in measured:
+        raise InputError(
+            f"--when {text!r}: the bench does not measure {name}; expected one of: "
+            f"{' '.join(measured)}"
+        )
     return StartCondition(name, "", parts["sign"], bound)
 
 

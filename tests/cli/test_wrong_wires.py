@@ -168,6 +168,83 @@ def test_a_wrong_unit_or_register_is_named(
         refused(bramah_here("probe", "--rig", path), LOST, *says)
 
 
+# -- before the night ------------------------------------------------------------------------
+
+ON_MAP = [
+    ("address: 0, type: int16, scale: 0.01 mm", "address: 0, type: int16, scale: 1 kN",
+     "inputs.piston_1.scale"),
+    ("{watchdog_register: 200, milliseconds: 1500}", "none", "zero_by"),
+    ("spool_1: {function: 3, address: 1,", "spool_1: {function: 3, address: 2,",
+     "inputs.cap_pressure_1.address"),
+    ("    2: {address: 101, type: int16, scale: 5 mV}\n", "", "outputs"),
+]  # fmt: skip
+IN_PLACE = [
+    ("{kind: can, bus: socketcan/can0, bitrate: 125000}", "bitrate"),
+    ("{kind: can, bus: socketcan/can0, dbc: nosuch.dbc}", "dbc"),
+    ("{kind: canopen-408, bus: socketcan/can0, nodes: [1, 1]}", "nodes"),
+    ("{kind: canopen-408, bus: socketcan/can0, host: 1}", "nodes"),
+    ("{kind: canopen-408, bus: socketcan/can0, eds: nosuch.eds}", "eds"),
+    ("{kind: nidaqmx, inputs: {}, outputs: {}}", "inputs"),
+    ("{kind: serial, device: /dev/ttyUSB0, baud: 9600}", "baud"),
+    ("{kind: in-process, object: nosuch:thing}", "object"),
+    ("{kind: replay, run: nofolder}", "run"),
+]
+
+
+def refused_alike(path: Path, key: str, queue: Path) -> None:
+    """What a run would refuse at night is refused by every command, with file, line and key."""
+    lines = path.read_text().splitlines()
+    for line in (
+        ("check", "lock-and-excite", "--rig", path),
+        ("probe", "--rig", path),
+        ("run", "lock-and-excite", "--rig", path, "--out", queue / "run"),
+        ("queue", "add", "lock-and-excite", "--rig", path, "--queue", queue / "night.sqlite"),
+    ):
+        said = refused(bramah_here(*line), INPUT, f"{path}:", f"wire: {key}")
+        at = int(said.partition(f"{path}:")[2].partition(":")[0])
+        named = lines[at - 1]
+        assert key.rpartition(".")[2] in named or named.startswith("wire:"), said
+    assert not queue.exists()
+
+
+@pytest.mark.parametrize(("old", "new", "key"), ON_MAP)
+def test_a_register_map_is_refused_before_the_night(
+    tmp_path: Path, old: str, new: str, key: str
+) -> None:
+    with rig_file(tmp_path, 9, (old, new)) as path:
+        refused_alike(path, key, tmp_path / "queue")
+
+
+@pytest.mark.parametrize(("wire", "key"), IN_PLACE)
+def test_a_wire_without_what_it_names_is_refused_before_the_night(
+    tmp_path: Path, wire: str, key: str
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(rig_text(f"wire: {wire}").replace("sample_rate: 100 Hz", "sample_rate: 1 kHz"))
+    refused_alike(path, key, tmp_path / "queue")
+
+
+def test_an_endpoint_at_which_no_session_could_begin_is_not_queued(tmp_path: Path) -> None:
+    night = tmp_path / "queue" / "night.sqlite"
+    line = ("queue", "add", "lock-and-excite", "--rig", RIG, "--queue", night, "--endpoint")
+    for endpoint, key in (
+        ("replay:///nofolder", "run"),
+        ("serial:///dev/ttyUSB0?baud=9600", "baud"),
+    ):
+        refused(bramah_here(*line, endpoint), INPUT, f"rig {RIG!r}: wire: {key}")
+    assert not night.exists()
+
+
+def test_a_condition_on_a_channel_that_the_bench_lacks_is_not_queued(tmp_path: Path) -> None:
+    night = tmp_path / "queue" / "night.sqlite"
+    line = ("queue", "add", "lock-and-excite", "--rig", "boom-1dof", "--queue", night)
+    said = refused(
+        bramah_here(*line, "--when", "cap_pressure_2 > 1 bar"), INPUT, "does not measure"
+    )
+    assert "expected one of: spool_1 piston_1 cap_pressure_1" in said
+    assert not night.exists()
+
+
 # -- the device's own protocol --------------------------------------------------------------
 
 

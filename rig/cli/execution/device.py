@@ -22,18 +22,31 @@ def reached_at(rig: Rig, endpoint: str | None) -> Rig:
     return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
 
 
-def bench_at(name: str, endpoint: str | None) -> Rig:
+def bench_at(name: str, endpoint: str | None, *, on_twin: bool = False) -> Rig:
     """Return a rig that can be driven, with the wire of `endpoint` if given.
 
-    Raises InputError, with file and line, for a wire of the rig file without driver or with wrong
-    settings.
+    Raises InputError, with the rig file's line where its own wire is meant, for one with which no
+    session could begin; a package that the wire needs may be missing where the bench is not driven
+    (`on_twin`).
     """
+    from drivers.base import PackageMissing
+    from drivers.registry import require_setup
+    from rig.model.parse import InputError
     from rig.runs.rigs import load_bench
 
-    bench = load_bench(name)
-    if endpoint is None:
-        _require_wire(name, bench)
-    return reached_at(bench, endpoint)
+    own = load_bench(name)
+    bench = reached_at(own, endpoint)
+    if endpoint is None and not own.wire.settings:  # --endpoint states them
+        return bench
+    try:
+        require_setup(bench.wire, bench)
+    except InputError as error:
+        if on_twin and isinstance(error, PackageMissing):
+            return bench
+        in_file = bench.wire == own.wire
+        where = _place_of(name, str(error)) if in_file else f"rig {bench.name!r}"
+        raise InputError(f"{where}: {error}") from error
+    return bench
 
 
 def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
@@ -69,19 +82,16 @@ def only_bench(rigs: list[Path], none: str, state: str) -> Path:
     raise InputError(f"{len(rigs)} benches are {state}: {places}; name one: --rig RIG")
 
 
-def _require_wire(name: str, rig: Rig) -> None:
-    from drivers.registry import driver_class
-    from rig.model.parse import InputError, load_yaml
+def _place_of(name: str, problem: str) -> str:
+    """Return file and line of the key below `wire` with which a problem's text begins."""
+    from rig.model.parse import load_yaml
     from rig.runs.rigs import rig_text
 
-    try:
-        driver = driver_class(rig.wire.kind)
-        if rig.wire.settings:  # without any, --endpoint states them
-            driver.settings.of(rig.wire)
-    except InputError as error:
-        text, source = rig_text(name)
-        line = load_yaml(text, source)[1].get(("wire",), 1)
-        raise InputError(f"{source}:{line}: {error}") from error
+    text, source = rig_text(name)
+    lines = {tuple(map(str, path)): line for path, line in load_yaml(text, source)[1].items()}
+    keys = ["wire", *problem.removeprefix("wire: ").partition(":")[0].split(".")]
+    known = (lines.get(tuple(keys[:end])) for end in range(len(keys), 0, -1))
+    return f"{source}:{next((line for line in known if line is not None), 1)}"
 
 
 def print_pressure(places: list[str], *, to_stderr: bool = False) -> None:

@@ -46,7 +46,7 @@ def check(
     from rig.cli.text.sheets import check_text
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
-    bench = bench_at(rig, None)
+    bench = bench_at(rig, None, on_twin=True)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
     source = twin_source(bench, model, nominal)
     proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)

@@ -136,6 +136,7 @@ def add(
     Example: bramah queue add lock-and-excite --rig shinshu-2dof --repeats 2 --not-before 22:00
     """
     from protocols.files.library import shipped_names
+    from rig.cli.execution.device import bench_at
     from rig.model.parse import InputError
     from rig.queue.items import DONE, QueueJob, channel_condition
     from rig.runs.rigs import shipped_rigs
@@ -152,8 +153,9 @@ def add(
         raise InputError(
             "--if is a condition on an earlier item: expected --after NUMBER beside it"
         )
+    bench = bench_at(rig, endpoint)
     if when is not None:
-        channel_condition(when)
+        channel_condition(when, bench.channels)
     times = _times(not_before, not_after, when, datetime.now(UTC))
     with _open_queue(queue, create=True) as store:
         title = name or Path(protocol).stem
