@@ -14,6 +14,7 @@ import json
 import logging
 import os
 import re
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -27,6 +28,7 @@ from rig.model.rig import Rig
 from rig.model.trips import Latched, RecordingFailed
 from rig.runs import runstate
 from rig.runs.files import replace_text, sync_to_disk
+from rig.runs.rigs import load_rig
 from rig.runs.store import description_of
 
 log = logging.getLogger(__name__)
@@ -35,6 +37,7 @@ STATE_VARIABLE: Final = "BRAMAH_STATE"
 _TRIP, _RESETS, _SESSION, _LOCK = "trip.json", "resets.jsonl", "session.json", "lock"
 _RIG: Final = "rig.yaml"
 _THIS_COMPUTER = frozenset({"localhost", "[::1]"})
+_LOOPBACK = 127  # first number of the addresses of this computer
 _UNREADABLE: Final = "unknown"
 
 
@@ -71,11 +74,23 @@ def state_folder() -> Path:
 
 
 def bench_name(endpoint: str) -> str:
-    """Return the name of the bench at an endpoint, as of a file: equal for the same bench."""
+    """Return the name of the bench at an endpoint, as of a file: equal for the same bench.
+
+    All names of this computer that need no name server are one: localhost, its own, 127.1.
+    """
     kind, _, address = endpoint.lower().partition("?")[0].partition("://")
-    for name in _THIS_COMPUTER:
-        address = re.sub(rf"^{re.escape(name)}(?=:|$)", LOCALHOST, address)
+    host, colon, port = address.rpartition(":")
+    if _is_this_computer(host if colon and "/" not in port else address):
+        address = f"{LOCALHOST}{colon}{port}" if host else LOCALHOST
     return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{address}")
+
+
+def _is_this_computer(host: str) -> bool:
+    names = (*_THIS_COMPUTER, socket.gethostname().lower())
+    try:
+        return host in names or socket.inet_aton(host)[0] == _LOOPBACK
+    except OSError:  # no number
+        return False
 
 
 def _load_trip(path: Path) -> LatchedTrip:
@@ -98,6 +113,26 @@ def rigs_in_use() -> list[Path]:
     """Return the descriptions of the rigs whose benches other processes of this computer drive."""
     holders = ((path, _holder(path.parent)) for path in known_rigs())
     return [path for path, holder in holders if holder is not None and holder.pid != os.getpid()]
+
+
+def holder_at(wire: Wire) -> Holder | None:
+    """Return the process of this computer that uses a bench, also under another name of its port.
+
+    A link to a device file, as in /dev/serial/by-id, has a latch of its own: it keeps its name
+    where the device file does not.
+    """
+    holder = BenchState(wire).holder()
+    port = _port(wire)
+    if holder is None and port is not None:
+        in_use = ((path, _port(load_rig(path).wire)) for path in rigs_in_use())
+        holder = next((_holder(path.parent) for path, other in in_use if other == port), None)
+    return holder
+
+
+def _port(wire: Wire) -> str | None:
+    """Return the device file of a serial wire without links."""
+    device = wire.settings.get("device")
+    return os.path.realpath(device) if isinstance(device, str) else None
 
 
 def _holder(folder: Path) -> Holder | None:

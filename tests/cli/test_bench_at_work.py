@@ -158,6 +158,20 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
     ended_by(stop, endless, run)
 
 
+def test_stop_by_another_name_of_the_port_ends_the_run(endless: Path, tmp_path: Path) -> None:
+    run, link = tmp_path / "stopped", tmp_path / "ttyBENCH"
+    with simulated("--wire", "modbus-rtu") as (endpoint, _):
+        link.symlink_to(endpoint.removeprefix("modbus-rtu://"))
+        with third_record(endless, run, endpoint) as process:
+            stopped = bramah_here("stop", "--rig", RIG, "--endpoint", f"modbus-rtu://{link}")
+            assert stopped.returncode == 0, stopped.stderr
+            assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
+            assert str(run) in stopped.stderr
+            process.communicate(timeout=LONG)
+        assert process.returncode == 130
+    assert load_run(run).records
+
+
 def test_stop_from_another_computer_ends_the_run(
     endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from drivers.base import (
 from rig.bench.latch import (
     BenchState,
     Holder,
+    bench_name,
     known_rigs,
     reset_bench,
     state_folder,
@@ -171,6 +173,9 @@ def test_a_bench_is_its_endpoint_whatever_the_rig_file_calls_it(tripped: Path) -
     with pytest.raises(Latched), Bench(renamed, FakeDriver(renamed)):
         pytest.fail("a session began")
     here = RIG.wire.reached_by("modbus-tcp", {**RIG.wire.settings, "host": "localhost"})
+    for name in ("127.1", "127.0.1.1", "LocalHost", socket.gethostname()):
+        assert bench_name(f"modbus-map://{name}:5020") == bench_name("modbus-map://127.0.0.1:5020")
+    assert bench_name("modbus-map://12.7.0.1:5020") != bench_name("modbus-map://127.0.0.1:5020")
     assert BenchState(here).read_trip() is not None
     elsewhere = RIG.model_copy(update={"wire": RIG.wire.model_copy(update={"port": 5021})})
     with Bench(elsewhere, FakeDriver(elsewhere)) as bench:

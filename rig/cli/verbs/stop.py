@@ -131,7 +131,7 @@ def _end_run(wire: Wire) -> None:
 
 def _holder(wire: Wire) -> Holder | None:
     """Return the other process of this computer that holds the bench, None if there is none."""
-    from rig.bench.latch import BenchState
+    from rig.bench.latch import holder_at
 
-    holder = BenchState(wire).holder()
+    holder = holder_at(wire)
     return None if holder is None or holder.pid == os.getpid() else holder
