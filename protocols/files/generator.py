@@ -10,14 +10,17 @@ yields steps as objects or as the dictionaries of a file:
             yield {"name": f"size_{n}", "excite": [...]}
 
 All steps are generated before anything is resolved, so that a Python protocol passes the same
-checks.
+checks. What it prints goes to standard error: standard output is for results.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import itertools
-from collections.abc import Mapping
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +47,8 @@ def load_generator(path: Path, values: Mapping[str, Any]) -> Protocol:
         if name not in declared:
             raise InputError(f"{path}: {unknown_parameter(name, declared)}")
     parameters = {**declared, **values}
-    try:
+    with _user_code(path, "steps() raised "):
         drawn = list(itertools.islice(steps(parameters), MOST_STEPS + 1))
-    except Exception as error:
-        raise InputError(f"{path}: steps() raised {type(error).__name__}: {error}") from error
     if len(drawn) > MOST_STEPS:
         raise InputError(f"{path}: steps() yields more than {MOST_STEPS} steps, the most allowed")
     dictionaries = [step for step in drawn if not isinstance(step, StepKind)]
@@ -70,8 +71,18 @@ def _module(path: Path) -> object:
     if spec is None or spec.loader is None or not path.is_file():
         raise InputError(f"{path}: cannot be read as a Python file")
     module = importlib.util.module_from_spec(spec)
-    try:
+    with _user_code(path, ""):
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise InputError(f"{path}: {type(error).__name__}: {error}") from error
     return module
+
+
+@contextmanager
+def _user_code(path: Path, doing: str) -> Iterator[None]:
+    """Run the user's code; raises InputError with the line at which it failed or left."""
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    except (Exception, SystemExit) as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        line = next((f":{f.lineno}" for f in reversed(frames) if f.filename == str(path)), "")
+        raise InputError(f"{path}{line}: {doing}{type(error).__name__}: {error}") from error

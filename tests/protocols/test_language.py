@@ -361,6 +361,32 @@ def test_a_python_protocol_passes_the_same_checks(tmp_path: Path, rig: Rig) -> N
         load(path)
 
 
+@pytest.mark.parametrize("leaves", ["sys.exit(0)", "sys.exit(3)", "raise RuntimeError('no oil')"])
+def test_a_python_protocol_that_leaves_the_program_is_refused_by_its_line(
+    leaves: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "leaving.py"
+    path.write_text(
+        "import sys\nPROTOCOL = {'name': 'leaving', 'joints': 2}\n"
+        f"def steps(parameters):\n    yield {{'hold': '1 s'}}\n    {leaves}\n"
+    )
+    kind = "SystemExit" if "exit" in leaves else "RuntimeError"
+    with pytest.raises(InputError, match=f"{path}:5: steps\\(\\) raised {kind}: "):
+        load(path)
+
+
+def test_what_a_python_protocol_prints_does_not_mix_with_the_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "talking.py"
+    path.write_text(
+        "print('read')\nPROTOCOL = {'name': 'talking', 'joints': 2}\n"
+        "def steps(parameters):\n    print('made')\n    yield {'hold': '1 s'}\n"
+    )
+    load(path)
+    assert capsys.readouterr() == ("", "read\nmade\n")
+
+
 def test_the_schema_knows_every_kind() -> None:
     text = json.dumps(protocol_schema())
     assert all(f'"{key}"' in text for key in STEPS)
