@@ -21,6 +21,7 @@ from rig.tui.recorded_run import RunLog, RunTrace
 
 TABS: Final = ("protocols", "runs", "queue")
 STEPS: Final = re.compile(rb"^steps:", re.MULTILINE)
+SHIPPED_JOINTS: Final = 2  # of the rigs that the shipped `lock-and-excite` is for
 READ_AT_MOST: Final = 1_000_000  # [bytes] of a file that are read to recognise a protocol
 
 
@@ -29,7 +30,7 @@ class BrowserState:
     """Contents of the folder; `trouble` states in one line what cannot be read.
 
     `log` and `trace` are those of the run opened last; `job` is the newest verb started here, for
-    `rig` and `endpoint`.
+    `rig` (of so many `joints`) and `endpoint`.
     """
 
     folder: Path = Path()
@@ -44,6 +45,7 @@ class BrowserState:
     log: RunLog | None = None
     trace: RunTrace | None = None
     rig: str = ""
+    joints: int = SHIPPED_JOINTS
     endpoint: str | None = None
 
     @property

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import re
+import shlex
 import threading
 from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
 
 import pytest
 
 from rig.bench.screens.sockets import Snapshot
 from rig.tui.app import HELP, Monitor, automatic_span, farewell
+from rig.tui.browse import BrowserState
+from tests.cli.bench import bramah_here
 from tests.tui.glass import Glass, Machine, Recorded, endpoint, glass
 from tests.tui.recorded import Bench, followed, past, run, snapshot, stopped, tripped
 
@@ -307,6 +312,21 @@ async def test_without_a_session_it_says_how_to_start_one_and_attaches_when_one_
         await shown.watch(1.0)
         assert "EXCITING" in shown.text
         assert "piston" in shown.text
+
+
+async def test_the_commands_that_an_idle_screen_shows_work_for_its_rig(tmp_path: Path) -> None:
+    mine = tmp_path / "my boom.yaml"
+    mine.write_text((files("rig") / "shipped" / "boom-1dof.yaml").read_text("utf-8"))
+    app = Monitor("boom-1dof", Machine(), browsed=BrowserState(rig=str(mine), joints=1))
+    async with app.run_test(size=(200, 30)) as pilot:
+        await pilot.pause()
+        lines = [strip.text.strip() for strip in app.screen._compositor.render_strips()]
+    plan, run_ = (line for line in lines if line.startswith("bramah "))
+    assert plan == f"bramah plan --rig '{mine}' --out steps.yaml"
+    assert run_ == f"bramah run steps.yaml --rig '{mine}' --out RUN"
+    planned = bramah_here(*shlex.split(plan)[1:], cwd=tmp_path)
+    assert planned.returncode == 0, planned.stderr
+    assert (tmp_path / "steps.yaml").is_file()
 
 
 async def test_a_screen_that_attaches_late_shows_what_the_run_kept() -> None:

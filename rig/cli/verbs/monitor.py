@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -53,8 +54,10 @@ def monitor(
         raise InputError(f"--port {port}: expected with --web only")
 
     # Sessions are listed by the rig's name, not by the name of its file.
-    is_file = rig is not None and rig not in shipped_rigs() and Path(rig).is_file()
-    name = load_rig(rig).name if rig is not None and is_file else rig
+    described = None
+    if rig is not None and (rig in shipped_rigs() or Path(rig).is_file()):
+        described = load_rig(rig)
+    name = described.name if described is not None else rig
     wire = None
     if rig is not None and endpoint is not None:
         from drivers.registry import wire_at
@@ -76,7 +79,10 @@ def monitor(
     from rig.tui.app import main
     from rig.tui.browse import BrowserState
 
-    raise typer.Exit(main(name, BrowserState(folder=runs, rig=rig or "", endpoint=endpoint), wire))
+    browsed = BrowserState(folder=runs, rig=rig or "", endpoint=endpoint)
+    if described is not None:
+        browsed = replace(browsed, joints=len(described.joints))
+    raise typer.Exit(main(name, browsed, wire))
 
 
 def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:

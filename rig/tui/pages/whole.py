@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from rig.tui.browse import SHIPPED_JOINTS
 from rig.tui.drawing.rows import Row, block, box, ends, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.link import LinkStage
@@ -171,13 +173,20 @@ def _keys(view: PlotView, width: int) -> Row:
 
 def waiting(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the page without a run: how to start one."""
-    rig = view.rig or "shinshu-2dof"
+    browsed = view.browsed
+    rig = shlex.quote(browsed.rig or view.rig or "shinshu-2dof")
+    commands = [f"bramah run lock-and-excite --rig {rig} --out RUN"]
+    if browsed.joints != SHIPPED_JOINTS:  # its steps name each joint
+        commands = [
+            f"bramah plan --rig {rig} --out steps.yaml",
+            f"bramah run steps.yaml --rig {rig} --out RUN",
+        ]
     which = f" on rig {view.rig}" if view.rig else ""
     lines = [
         row((f" No protocol is running{which}.", STRONG)),
         row(),
         row(" Start one here: 0 lists protocols and runs; or in another terminal:"),
-        row((f"   bramah run lock-and-excite --rig {rig} --out RUN", "")),
+        *(row((f"   {command}", "")) for command in commands),
         row(),
         row((" This screen attaches as soon as it runs.  q quits.", DIM)),
     ]
