@@ -19,6 +19,7 @@ from protocols.design.candidates import (
     candidates,
     described,
     motion_within,
+    multisine,
     sized,
 )
 from protocols.design.check import Twin, centred
@@ -28,6 +29,7 @@ from protocols.design.settings import DESIGN
 from protocols.engine.centring import Array
 from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
+from protocols.language.waveforms import highest_line
 from protocols.signals.sine import Sine
 from protocols.steps.excite import Step
 from protocols.steps.parts import CLOSED, Excite, Lock
@@ -66,8 +68,9 @@ class GeneratedProtocol:
 def generate(rig: Rig, predictor: Predictor, name: str) -> GeneratedProtocol:
     """Return the smallest set of steps found that determines every parameter of `rig`.
 
-    Raises InputError where no candidate can be run on the rig at all.
+    Raises InputError where no candidate can be run on the rig at all, naming a sample rate too low.
     """
+    _require_rate(rig, multisine(DESIGN.amplitude, 0).f_max)
     pool = _pool(rig, predictor)
     if not pool:
         raise InputError(
@@ -86,6 +89,17 @@ def generate(rig: Rig, predictor: Predictor, name: str) -> GeneratedProtocol:
         steps=steps,
     )
     return GeneratedProtocol(protocol, prove(protocol, rig, predictor))
+
+
+def _require_rate(rig: Rig, hertz: float) -> None:
+    """Raise InputError where a rig is sampled too slowly for steps up to a frequency [Hz]."""
+    allowed = highest_line(rig.sample_rate)
+    if hertz >= allowed:
+        raise InputError(
+            f"rig {rig.name!r}: sample_rate: the steps excite up to {hertz:g} Hz; at "
+            f"{rig.sample_rate:g} Hz they must stay below {allowed:g} Hz. Expected more than "
+            f"{hertz * rig.sample_rate / allowed:g} Hz, or write a protocol of lower frequencies"
+        )
 
 
 def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
@@ -152,6 +166,7 @@ def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
 
     Raises InputError naming a step that exceeds a limit at any amplitude.
     """
+    _require_rate(rig, max(DESIGN.sine_frequencies))
     N = len(rig.joints)
     steps = []
     for frequency in DESIGN.sine_frequencies:

@@ -108,6 +108,15 @@ def test_new_data_for_validation_move_every_joint_alone_and_all_at_once(rig: Rig
     assert parse_model(Protocol, protocol_text(made), "again") == made
 
 
+def test_a_rig_sampled_too_slowly_for_the_steps_is_told_the_rate_they_need(rig: Rig) -> None:
+    slow = rig.model_copy(update={"sample_rate": 50.0})
+    with pytest.raises(InputError, match=r"sample_rate: .* up to 9.5 Hz.* more than 76 Hz"):
+        generate(slow, predictor(), "none")
+    slow = rig.model_copy(update={"sample_rate": 20.0})
+    with pytest.raises(InputError, match=r"sample_rate: .* up to 3 Hz.* more than 24 Hz"):
+        validation(slow, simulate_commands, "none")
+
+
 def test_a_rig_that_bears_no_step_is_refused(rig: Rig) -> None:
     joints = tuple(
         joint.model_copy(update={"limits": joint.limits.model_copy(update={"command": 0.05})})
