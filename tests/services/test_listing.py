@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 from datetime import UTC, datetime, timedelta
@@ -143,6 +144,20 @@ def test_the_index_spares_reading_unchanged_folders_and_follows_every_change(
         rows = db.execute("SELECT name, state, samples FROM run ORDER BY name").fetchall()
     db.close()
     assert rows == [("a", "done", 600), ("b", "aborted", 600), ("e", "done", 600)]
+
+
+def test_a_run_that_can_be_read_again_is_listed_so(tmp_path: Path) -> None:
+    archive = take(tmp_path / "monday") / "records.h5"
+    whole, about = archive.read_bytes(), archive.stat()
+    archive.write_bytes(bytes(len(whole)))  # a disk that returns zeros, until the backup is there
+    os.utime(archive, ns=(about.st_atime_ns, about.st_mtime_ns))
+    (damaged,) = told(tmp_path)
+    assert damaged["records"] == -1
+    assert "not a readable records.h5" in str(damaged["message"])
+    archive.write_bytes(whole)
+    os.utime(archive, ns=(about.st_atime_ns, about.st_mtime_ns))
+    (restored,) = told(tmp_path)
+    assert (restored["records"], restored["message"]) == (2, "")
 
 
 @pytest.mark.parametrize("damage", ["rubbish", "truncated", "lying", "older"])

@@ -1,7 +1,7 @@
 """An index of a folder's runs, so that only changed run folders are read again.
 
 The index is a cache: if it is deleted, damaged or outdated, it is rebuilt from the folders. A run
-in progress is never read from it.
+in progress, or one that cannot be read, is never read from it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rig.runs.store import ARCHIVE, is_run
 log = logging.getLogger(__name__)
 
 INDEX: Final = ".bramah-runs.sqlite"
-_VERSION = 1
+_VERSION = 2
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS run (
     name TEXT PRIMARY KEY, signature TEXT NOT NULL, state TEXT NOT NULL, rig TEXT NOT NULL,
@@ -113,7 +113,9 @@ def _read(db: sqlite3.Connection, folders: list[Path]) -> list[RunSummary]:
             continue
         summary = summarise(folder)
         summaries.append(summary)
-        if summary.state != RUNNING:  # its writer may die without changing a file
+        # The writer of a running one may die without changing a file, and what cannot be read may
+        # become readable: rights and a restored copy change neither size nor time.
+        if summary.state != RUNNING and summary.is_counted:
             changed.append((signature, summary))
     removed = set(stored) - {folder.name for folder in folders}
     if changed or removed:
