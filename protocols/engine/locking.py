@@ -11,13 +11,15 @@ hold it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.base import OFF, OutputLaw
-from protocols.engine.session import Session
+from protocols.engine.session import Array, Session
 from protocols.engine.settings import ENGINE
 from protocols.engine.states import LockFailed, ProtocolAborted
 from protocols.steps.parts import CLOSED, END_MAX, Place
@@ -43,10 +45,16 @@ def placement(session: Session, joint: int, first: int, last: int) -> PlacementR
     """
     piston = session.piston(joint, first, last)
     middle = len(piston) // 2
-    early, late = np.nanmean(piston[:middle]), np.nanmean(piston[middle:])
-    speed = (late - early) / (0.5 * len(piston) / session.rate)
-    command = np.nanmean(session.command(joint, first, last))
-    return PlacementReading(float(np.nanmean(piston)), float(speed), float(command))
+    speed = (_mean(piston[middle:]) - _mean(piston[:middle])) / (
+        0.5 * max(len(piston), 1) / session.rate
+    )
+    return PlacementReading(_mean(piston), speed, _mean(session.command(joint, first, last)))
+
+
+def _mean(samples: Array) -> float:
+    """Return the mean of the samples that were not lost; NaN if all were."""
+    valid = samples[np.isfinite(samples)]
+    return float(np.mean(valid)) if len(valid) else math.nan
 
 
 def position_law(place: Place, target: float, bias: float) -> OutputLaw:
@@ -72,9 +80,13 @@ def move(
     biases = dict.fromkeys(targets, 0.0)
     session.apply({j: position_law(place, s, 0.0) for j, s in targets.items()})
     began, still_since = session.now, session.now
+    ends: dict[int, deque[float]] = {j: deque(maxlen=ENGINE.swing_ends) for j in targets}
     while True:
         first = session.wait(ENGINE.look_seconds)
         readings = {j: placement(session, j, first, session.now) for j in targets}
+        for j in targets:
+            piston = session.piston(j, first, session.now)
+            ends[j] += (float(np.fmin.reduce(piston)), float(np.fmax.reduce(piston)))
         outside = {j for j in targets if not _in_place(readings[j], targets[j], tolerance)}
         if outside:
             still_since = session.now
@@ -95,8 +107,20 @@ def move(
                 f"piston measured at {1e3 * readings[j].piston:.2f} mm "
                 f"(moving {1e3 * readings[j].speed:.2f} mm/s), "
                 f"expected {1e3 * targets[j]:.2f} mm +- {1e3 * tolerance:g} mm; "
-                "is the pump on, and the valve connected the right way round?"
+                f"{_cause(ends[j], targets[j], place, tolerance)}"
             )
+
+
+def _cause(ends: Sequence[float], target: float, place: Place, tolerance: float) -> str:
+    """Return the likely cause of a piston that has not settled, from the ends of its motion."""
+    known = [end for end in ends if math.isfinite(end)]
+    low, high = min(known, default=target), max(known, default=target)
+    if low < target - tolerance and high > target + tolerance:
+        return (
+            f"it swings from {1e3 * low:.2f} to {1e3 * high:.2f} mm about its place: lower "
+            f"place.position_gain, {place.position_gain:g} V/m"
+        )
+    return "is the pump on, and the valve connected the right way round?"
 
 
 def _in_place(reading: PlacementReading, target: float, tolerance: float) -> bool:
@@ -207,7 +231,7 @@ def _is_near(reading: PlacementReading, plan: LockPlan) -> bool:
 def lock_movement(session: Session, held: JointLock, first: int, last: int) -> float:
     """Return the largest movement of a locked piston over ticks [first, last) [m]."""
     moved = np.abs(session.piston(held.joint, first, last) - held.piston)
-    return float(np.nanmax(moved, initial=0.0))
+    return float(np.fmax.reduce(moved, initial=0.0))
 
 
 def verify(session: Session, held: JointLock, step: str, first: int, last: int) -> None:

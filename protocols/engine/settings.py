@@ -19,6 +19,7 @@ class EngineSettings:
     still_speed: float = 1e-3  # [m/s] below this a piston at an end stop counts as at rest
     # One step of a coarse output is about 1 mm/s: the limit cycle of a piston in a loop.
     rocking_speed: float = 3e-3  # [m/s]
+    swing_ends: int = 40  # the lowest and highest positions of the looks before a time-out
     integral_share: float = 0.5  # of the remaining error, removed by one correction
     creep_share: float = 0.25  # of the tolerance, that a closed joint may creep during one record
     guard_share: float = 2.0  # of the tolerance at which the engine gives up a lock: a trip

@@ -124,6 +124,8 @@ def _protocol(
     protocol = validate_model(Protocol, data, lines, source, context, problems)
     places = {("steps", k, *p): at for k, step in enumerate(steps) for p, at in step.places.items()}
     _locate(protocol.steps, source, lines, places, ("steps",), 1)
+    if "place" in protocol.model_fields_set:  # else the default, which all protocols share
+        protocol.place.locate(f"{source}:{lines.get(('place',), 1)}")
     return protocol, [step.data for step in steps]
 
 

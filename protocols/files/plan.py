@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocols.files.schema import Protocol, every_step
 from protocols.language.conditions import Condition, parse_condition, require_known
@@ -23,11 +24,14 @@ from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
 from protocols.steps.warm_up import WarmUpStep
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 TRIAL_SECONDS = 3.0  # drift is judged over about this long, or one period if that is longer
 LOCK_SHARE = 0.25  # of the stroke: a joint that may stand anywhere in it is not locked
 LOCK_DEVIATIONS = 6.0  # of the noise of a position: one sample of 10^9 is farther off
 LONGEST_RECORD = 86400.0  # [s]
+BISECTIONS = 20  # of a gain: to a millionth
+SERIES = 18  # terms of an exponential: to the last digit
 
 
 @dataclass(frozen=True)
@@ -115,21 +119,78 @@ def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) ->
             f"protocol {changed.name!r} is for {changed.joints} joint(s), "
             f"rig {rig.name!r} has {len(rig.joints)}; write one whose steps name each joint"
         )
-    for joint in rig.joints:
-        tolerance, stroke = changed.place.tolerance, joint.cylinder.stroke
-        if changed.place.limit > joint.limits.command:
-            raise InputError(
-                f"protocol {changed.name!r}: place.limit {changed.place.limit:g} V is above "
-                f"the limit of joint {joint.name!r}, command {joint.limits.command:g} V"
-            )
-        if tolerance > LOCK_SHARE * stroke:
-            raise InputError(
-                f"protocol {changed.name!r}: place.tolerance {1e3 * tolerance:g} mm of a stroke of "
-                f"{1e3 * stroke:g} mm counts joint {joint.name!r} as in place nearly anywhere; "
-                f"expected at most {1e3 * LOCK_SHARE * stroke:g} mm"
-            )
+    if problem := _problem_of_place(changed.place, rig):
+        where = f"{changed.place.where}: " if changed.place.where else ""
+        raise InputError(f"{where}protocol {changed.name!r}: place.{problem}")
     sequence = _RigPlanner(rig).nested(changed.steps)
     return Plan(changed, rig.name, rig.sample_rate, sequence)
+
+
+def _problem_of_place(place: Place, rig: Rig) -> str | None:
+    """Return the setting with which pistons cannot be placed, and why; None if there is none."""
+    for number, joint in enumerate(rig.joints):
+        stroke = joint.cylinder.stroke
+        if place.limit > joint.limits.command:
+            return (
+                f"limit {place.limit:g} V is above the limit of joint {joint.name!r}, command "
+                f"{joint.limits.command:g} V"
+            )
+        if place.tolerance > LOCK_SHARE * stroke:
+            return (
+                f"tolerance {1e3 * place.tolerance:g} mm of a stroke of {1e3 * stroke:g} mm counts "
+                f"joint {joint.name!r} as in place nearly anywhere; expected at most "
+                f"{1e3 * LOCK_SHARE * stroke:g} mm"
+            )
+        most = largest_position_gain(rig, number)
+        if place.position_gain > most:
+            return (
+                f"position_gain {place.position_gain:g} V/m makes joint {joint.name!r} oscillate "
+                f"about its place: with its valve and {rig.sample_rate:g} samples a second "
+                f"expected at most {plain(most, 3)} V/m, of oil and load less"
+            )
+    return None
+
+
+def largest_position_gain(rig: Rig, joint: int) -> float:
+    """Return the position gain [V/m] at which a joint's (0-based) loop ceases to settle.
+
+    Of a sampled law before the valve, a lag of second order, and a piston without load that
+    integrates its spool: the loop settles while the eigenvalues of a sample's transition are
+    inside the unit circle. Oil and load leave less. Infinite where the piston's gain is unknown.
+    """
+    try:
+        speed = piston_gain(rig, joint)
+    except InputError:
+        return math.inf
+    valve, period = rig.joints[joint].valve, 1.0 / rig.sample_rate
+    w, damping = 2.0 * math.pi * valve.natural_frequency, valve.damping_ratio
+    # Piston, spool, its rate, and the command that is held for the sample.
+    rates = np.zeros((4, 4))
+    rates[0, 1], rates[1, 2] = speed, 1.0
+    rates[2, 1:] = -(w**2), -2.0 * damping * w, w**2
+    moves = _exponential(rates * period)
+
+    def settles(gain: float) -> bool:
+        loop = moves[:3, :3].copy()
+        loop[:, 0] -= gain * moves[:3, 3]
+        return bool(np.max(np.abs(np.linalg.eigvals(loop))) < 1.0)
+
+    low, high = 0.0, 4.0 / (speed * period)  # twice that of a valve without lag
+    for _ in range(BISECTIONS):
+        gain = 0.5 * (low + high)
+        low, high = (gain, high) if settles(gain) else (low, gain)
+    return low
+
+
+def _exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return e^matrix by its series of a part, squared again and again (scipy loads slowly)."""
+    squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum()), 1.0))))
+    part = matrix / 2.0**squarings
+    term = total = np.eye(len(matrix))
+    for order in range(1, SERIES):
+        term = term @ part / order
+        total = total + term
+    return np.linalg.matrix_power(total, 2**squarings)
 
 
 def override(protocol: Protocol, overrides: Overrides) -> Protocol:

@@ -8,7 +8,7 @@ import pkgutil
 from types import ModuleType
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationInfo
 
 from rig.model.quantity import UnitError, parse_quantity, shown_in_schema
 
@@ -17,6 +17,25 @@ class ProtocolPart(BaseModel):
     """A part of a protocol file; unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class LocatedPart(ProtocolPart):  # noqa: PLW1641 - pydantic hashes frozen models
+    """A part that knows where it is written."""
+
+    _where: str = PrivateAttr(default="")
+
+    @property
+    def where(self) -> str:
+        """Its file and line as `FILE:LINE`, for refusals; empty for a part of no file."""
+        return self._where
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether a part has the same fields, wherever it is written."""
+        return type(self) is type(other) and dict(self) == dict(other)
+
+    def locate(self, where: str) -> None:
+        """Set file and line, which the reader knows once the part is made."""
+        self._where = where
 
 
 def _position_gain(value: Any, info: ValidationInfo) -> Any:

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Protocol
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from protocols.language.conditions import Condition
-from protocols.language.part import ProtocolPart
+from protocols.language.part import LocatedPart
 from protocols.steps.plans import LockPlan, StepPlan
 from rig.model.parts import MAX_NAME
 from rig.model.rig import Rig
@@ -133,7 +133,7 @@ class Question:
     timeout: float
 
 
-class StepKind(ProtocolPart):  # noqa: PLW1641 - pydantic hashes frozen models
+class StepKind(LocatedPart):
     """A step of a protocol; `key` names its kind in a file."""
 
     key: ClassVar[str]
@@ -141,20 +141,6 @@ class StepKind(ProtocolPart):  # noqa: PLW1641 - pydantic hashes frozen models
     nests: ClassVar[bool] = False  # its key `steps` holds steps
 
     name: StepName | None = Field(default=None, description="of its records and log lines")
-    _where: str = PrivateAttr(default="")
-
-    @property
-    def where(self) -> str:
-        """Its file and line as `FILE:LINE`, for refusals; empty for a step of no file."""
-        return self._where
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether a step has the same fields, wherever it is written."""
-        return type(self) is type(other) and dict(self) == dict(other)
-
-    def locate(self, where: str) -> None:
-        """Set file and line, which the reader knows once the step is made."""
-        self._where = where
 
     @abstractmethod
     def plan(self, planner: Planner) -> PlannedStep:

@@ -12,7 +12,7 @@ from typing import Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocols.language.part import PositionGain, ProtocolPart
+from protocols.language.part import LocatedPart, PositionGain, ProtocolPart
 from protocols.signals import Signal
 from rig.model.parameters import MAX_JOINTS
 from rig.model.quantity import Length, Time, Voltage
@@ -23,7 +23,7 @@ END_MAX: Final = "end_max"
 OPEN_LOOP: Final = "open-loop"
 
 
-class Place(ProtocolPart):
+class Place(LocatedPart):
     """Settings for positioning pistons before excitation."""
 
     position_gain: PositionGain = Field(default=12.0, gt=0, description="of the loop [V/m]")

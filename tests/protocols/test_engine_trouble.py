@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import pickle
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from protocols.design.check import NotCentred
 from protocols.engine.engine import run
+from protocols.engine.locking import placement
 from protocols.engine.states import LockFailed, ProtocolAborted
-from protocols.files.plan import Plan, resolve
+from protocols.files.plan import Plan, largest_position_gain, resolve
 from protocols.files.schema import Protocol
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
@@ -110,6 +114,30 @@ def test_a_pump_that_is_off_is_noticed_from_the_place(rig: Rig) -> None:
     bench = LittleBench(rig, [Cylinder(), Cylinder(extend=0.0, retract=0.0, piston=0.01)])
     with pytest.raises(ProtocolAborted, match=r"piston measured at 10\.0. mm .*is the pump on"):
         run(plan_of(rig), rig, bench)
+
+
+def test_a_loop_with_too_much_gain_is_named_by_its_gain(rig: Rig) -> None:
+    """The machine is twice as fast as the rig file says, so that the check let it pass."""
+    slow = rig.model_copy(update={"sample_rate": 50.0})
+    plan = plan_of(slow)
+    place = plan.place.model_copy(update={"position_gain": 500.0})
+    assert largest_position_gain(slow, 1) > place.position_gain
+    plan = replace(plan, protocol=plan.protocol.model_copy(update={"place": place}))
+    fast = Cylinder(extend=0.32, retract=0.32, piston=0.01)
+    with pytest.raises(ProtocolAborted, match=r"it swings from .* lower place.position_gain, 500"):
+        run(plan, slow, LittleBench(slow, [Cylinder(), fast]))
+
+
+def test_samples_lost_while_a_piston_is_placed_are_no_motion(rig: Rig) -> None:
+    """Of a look that arrives with every sample lost, nothing is known and nothing is said."""
+    session = SimpleNamespace(rate=1000.0, piston=lost, command=lost)
+    reading = placement(session, 0, 0, 100)
+    assert math.isnan(reading.piston)
+    assert math.isnan(reading.speed)
+
+
+def lost(joint: int, first: int, last: int) -> np.ndarray:
+    return np.full(last - first, np.nan)
 
 
 def test_a_pump_that_fails_later_is_noticed_from_the_motion(rig: Rig) -> None:

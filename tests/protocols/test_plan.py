@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from protocols.files.library import load, shipped_names
-from protocols.files.plan import Overrides, resolve
+from protocols.files.library import load, read_protocol, shipped_names
+from protocols.files.plan import Overrides, largest_position_gain, piston_gain, resolve
 from protocols.files.schema import Protocol
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
@@ -122,6 +124,11 @@ REFUSED = [
         "hold 1e.09 s",
     ),
     ("joints: 2\n", "joints: 2\nplace: {limit: 5 V}\n", "place.limit 5 V is above.*'boom'"),
+    (
+        "joints: 2\n",
+        "joints: 2\nplace: {position_gain: 100000 V/m}\n",
+        "place.position_gain 100000 V/m makes joint 'boom' oscillate.*at most 393\\d V/m",
+    ),
 ]
 
 
@@ -129,6 +136,58 @@ REFUSED = [
 def test_what_the_rig_does_not_allow_is_refused(old: str, new: str, message: str, rig: Rig) -> None:
     with pytest.raises(InputError, match=message):
         plan_of(TEXT.replace(old, new), rig)
+
+
+def test_what_the_place_cannot_do_is_refused_with_file_and_line(rig: Rig) -> None:
+    text = TEXT.replace("joints: 2\n", "joints: 2\nplace: {limit: 5 V}\n")
+    line = 1 + text.splitlines().index("place: {limit: 5 V}")
+    with pytest.raises(InputError, match=rf"^mine\.yaml:{line}: protocol 'mine': place.limit 5 V"):
+        resolve(read_protocol(text, "mine.yaml"), rig)
+
+
+def with_valve(rig: Rig, rate: float, hertz: float, damping: float) -> Rig:
+    valve = {"natural_frequency": hertz, "damping_ratio": damping}
+    joints = tuple(
+        j.model_copy(update={"valve": j.valve.model_copy(update=valve)}) for j in rig.joints
+    )
+    return rig.model_copy(update={"joints": joints, "sample_rate": rate})
+
+
+@pytest.mark.parametrize(
+    ("rate", "hertz", "damping"),
+    [(50, 100, 0.8), (1000, 100, 0.8), (200, 60, 0.5), (1000, 30, 1.2)],
+)
+def test_a_position_loop_settles_below_its_largest_gain_and_not_above(
+    rate: float, hertz: float, damping: float, rig: Rig
+) -> None:
+    """Against the loop's motion, integrated step by step."""
+    changed = with_valve(rig, rate, hertz, damping)
+    most, speed, w = largest_position_gain(changed, 0), piston_gain(changed, 0), math.tau * hertz
+
+    def left(gain: float) -> float:
+        piston, spool, rush, steps = 1e-3, 0.0, 0.0, math.ceil(40 * w / rate)
+        h = 1.0 / (rate * steps)
+        farthest = 0.0
+        for sample in range(300):
+            command = -gain * piston
+            for _ in range(steps):  # semi-implicit Euler
+                rush += h * (w**2 * (command - spool) - 2.0 * damping * w * rush)
+                spool += h * rush
+                piston += h * speed * spool
+            farthest = max(farthest, abs(piston)) if sample > 250 else farthest
+        return farthest
+
+    assert left(0.85 * most) < 1e-3 < left(1.15 * most)
+
+
+def test_the_largest_gain_of_a_fast_computer_and_of_a_fast_valve_are_the_textbooks(
+    rig: Rig,
+) -> None:
+    fast = with_valve(rig, 1e6, 50.0, 0.7)
+    routh = 2 * 0.7 * math.tau * 50.0  # of s^3/w^2 + 2 damping s^2/w + s + gain speed
+    assert largest_position_gain(fast, 0) * piston_gain(fast, 0) == pytest.approx(routh, rel=1e-2)
+    stiff = with_valve(rig, 100.0, 1e4, 0.7)
+    assert largest_position_gain(stiff, 0) * piston_gain(stiff, 0) == pytest.approx(200, rel=1e-2)
 
 
 def test_a_command_beyond_the_spools_stroke_is_refused(rig: Rig) -> None:
