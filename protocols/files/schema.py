@@ -8,9 +8,9 @@ of a file is made from the same models.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from protocols.language.part import ProtocolPart
 from protocols.steps import AnyStep
@@ -59,6 +59,19 @@ class Retry(ProtocolPart):
     wait: Time = Field(default=5.0, gt=0, description="before each attempt")
 
 
+def _joints_exist(step: StepKind, info: ValidationInfo) -> StepKind:
+    """Refuse a step that names a joint beyond the protocol's `joints`."""
+    joints = info.data.get("joints")  # missing where it was refused itself
+    for part in every_step([step]):
+        absent = [joint for joint in _named_joints(part) if joints and joint > joints]
+        if absent:
+            raise ValueError(
+                f"step {part.name or part.key!r}: joint {min(absent)} does not exist; the protocol "
+                f"says joints: {joints}"
+            )
+    return step
+
+
 class Protocol(ProtocolPart):
     """A whole experiment."""
 
@@ -70,7 +83,7 @@ class Protocol(ProtocolPart):
         default_factory=dict, description="values by name; `$name` stands for one in the steps"
     )
     place: Place = Place()
-    steps: tuple[AnyStep, ...] = Field(min_length=1)
+    steps: tuple[Annotated[AnyStep, AfterValidator(_joints_exist)], ...] = Field(min_length=1)
     on_trip: OnTrip = OnTrip()
     on_error: OnError = OnError()
     retry: Retry | None = None
@@ -111,11 +124,6 @@ class Protocol(ProtocolPart):
             if isinstance(step, LockStep):
                 locked = {part.joint for part in step.lock}
             assigned = _named_joints(step)
-            if assigned - joints:
-                raise ValueError(
-                    f"step {step.name or step.key!r}: joint {min(assigned - joints)} does not "
-                    f"exist; the protocol says joints: {self.joints}"
-                )
             idle = joints - assigned - locked
             if isinstance(step, Step | WarmUpStep) and idle:
                 raise ValueError(

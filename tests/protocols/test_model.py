@@ -60,7 +60,7 @@ REFUSED = [
     ("at: closed", "at: open", "mine.yaml:7: .*'end_min'"),
     ("at: closed", "at: end_min", "mine.yaml:7: .*piston belongs to a lock at 'closed'"),
     ("joint: 1", "joint: 2", "mine.yaml:5: .*joint 2 stands more than once"),
-    ("joint: 1", "joint: 3", "joint 3 does not exist"),
+    ("joint: 1", "joint: 3", "mine.yaml:5: .*joint 3 does not exist.*joints: 2"),
     ("joints: 2", "joints: 3", "joint 3 is neither locked nor excited"),
     (
         "kind: sine",
