@@ -28,7 +28,7 @@ from analysis.trace.in_motion import find, held_out_ratios, joints_with_friction
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import CurveRange
 from analysis.trace.judge.unrepeated import phase_notes, unlocked_lines, unrepeated_notes
-from analysis.trace.judging import Candidates, unstated_noise
+from analysis.trace.judging import Candidates, noise_beside_effects, unstated_noise
 from analysis.trace.next_experiment.detection_limits import (
     absorbed_effects,
     detection_limit_notes,
@@ -222,6 +222,9 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
     finding = searched(prepared)
     if scaled := unstated_noise(prepared.records, finding):
         prepared = replace(prepared, records=scaled[0], rows=scaled[1])
+        finding = searched(prepared)
+    if finer := noise_beside_effects(prepared.records, finding):
+        prepared = replace(prepared, records=finer[0], rows=finer[1])
         finding = searched(prepared)
     if by_geometry := _traced_within_tolerances(records, options, finding, progress):
         return by_geometry

@@ -12,7 +12,8 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.clues.dependence import clues_to
 from analysis.trace.data.candidates import at_start, effect_in
-from analysis.trace.data.noise_floor import STATED
+from analysis.trace.data.conditioned_record import model_rows
+from analysis.trace.data.noise_floor import NEIGHBOURS, STATED, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.data.trace_rows import TraceRuns, trace_rows
@@ -320,6 +321,33 @@ def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, Tra
         return None
     ratio_above_stated = {name: max(1.0, value) for name, value in ratio.items()}
     records = replace(records, noise_ratio=ratio_above_stated)
+    return records, trace_rows(records)
+
+
+def noise_beside_effects(
+    records: TraceRuns, finding: Finding
+) -> tuple[TraceRuns, TraceRows] | None:
+    """Return runs and rows whose noise by neighbouring states is of what the named effects leave.
+
+    Without dry friction the residual jumps with the direction of motion between two such states: a
+    floor was 20 times too large, and a constant force beside the friction was lost in it. None
+    where no equation's noise gets smaller than `DATA.finer_noise` of what it was.
+    """
+    data, fit = finding.rows.train, finding.winner.fit
+    before = {(f.group, f.equation): f.noise for f in data.floors if f.source == NEIGHBOURS}
+    if not before or finding.verdict not in (EXPLAINED, CONFOUNDED):
+        return None
+    rows = [model_rows(data.rig, fit.terms, record) for record in data.records]
+    after = floors(data.rig, fit.terms, data.records, rows, fit.beta)
+    ratios: dict[str, list[float]] = {}
+    for floor in after:
+        noise = before.get((floor.group, floor.equation))
+        if noise is not None and floor.noise < DATA.finer_noise * noise:
+            ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
+    if not ratios:
+        return None
+    finer = {e: float(np.sqrt(np.mean(np.square(values)))) for e, values in ratios.items()}
+    records = replace(records, noise_ratio={**records.noise_ratio, **finer})
     return records, trace_rows(records)
 
 

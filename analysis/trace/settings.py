@@ -234,6 +234,9 @@ class DataSettings:
     multisines of one period 0.5)."""
     nearest_pair_share: float = 0.33
     """Share of the rows whose pairs, the nearest ones, are used (tuned)."""
+    finer_noise: float = 0.5
+    """Largest ratio of the noise by neighbouring states beside named effects to that without them,
+    with which the effects are searched again (tuned)."""
     least_pairs: int = 40
     """Least number of pairs: noise from fewer is uncertain by more than a tenth (arithmetic)."""
     neighbours_asked: int = 64

@@ -92,7 +92,7 @@ def floors(
 
     `others` are floors of other records of the machine: groups without repeats take the ratio of
     measured to stated noise from those and from the groups whose noise was measured. Where neither
-    gives it, `noise_ratio` does, by equation.
+    gives it, `noise_ratio` does, by equation; a noise by neighbouring states is at most that.
     """
     groups: dict[Group, list[int]] = {}
     for index, conditioned in enumerate(members):
@@ -116,7 +116,7 @@ def floors(
     scale = _measured_over_stated([*out, *others], (NEIGHBOURS,))
     scale |= _measured_over_stated([*out, *others], (REPEATS, PERIODS))
     scaled = (_scaled(_without_aperiodic(f, by_repeats), scale, OTHER_STEPS) for f in out)
-    return [_scaled(floor, noise_ratio or {}, UNSTATED) for floor in scaled]
+    return [_by_ratio(floor, noise_ratio or {}) for floor in scaled]
 
 
 def _floor(
@@ -181,6 +181,17 @@ def _scaled(floor: Floor, scale: Mapping[str, float], source: str) -> Floor:
     if floor.source != STATED or floor.equation not in scale:
         return floor
     return floor.unrepeated(floor.stated * scale[floor.equation], source)
+
+
+def _by_ratio(floor: Floor, noise_ratio: Mapping[str, float]) -> Floor:
+    """Return a floor with the ratio to the stated noise where nothing else measures a smaller one.
+
+    Between neighbouring states the residual of a model that lacks an effect changes too.
+    """
+    ratio = noise_ratio.get(floor.equation, np.inf)
+    if floor.source == NEIGHBOURS and ratio * floor.stated < floor.noise:
+        return floor.unrepeated(ratio * floor.stated, NEIGHBOURS)
+    return _scaled(floor, noise_ratio, UNSTATED)
 
 
 def noise_by_neighbours(
