@@ -23,6 +23,7 @@ from analysis.signals.filters import align, channel_filter
 from rig.model.rig import Rig
 
 EQUAL_POLES: Final = 0.25  # of tau^2: two poles of the same time constant
+HALF: Final = 0.1  # [samples] error of half a sample
 MARGIN: Final = 16  # [samples] reach of the interpolation of a shift
 
 
@@ -61,6 +62,20 @@ class TimingError(Sensor):
             return {}
         value, half = self.shape_of(rig, shape)[0], 0.5 / rig.sample_rate
         return {self.shape_names()[0]: (max(value - half, 0.0), value + half)}
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State that a position half a sample late may be a command that is held, and recorded so.
+
+        A command that is recorded at the start of its hold leads its mean by half a sample.
+        """
+        samples = self.shape_of(rig, shape)[0] * rig.sample_rate
+        late = "position" in (self.side, self.shared) and abs(samples - 0.5) < HALF
+        if not late:
+            return ""
+        return (
+            "half a sample late is also what a command makes that is held for a sample and "
+            "recorded at its start; record the current, or the command in the middle of its hold"
+        )
 
     def plotted(self) -> str:
         """Name the rate of the channel's quantity."""

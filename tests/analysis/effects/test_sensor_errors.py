@@ -11,6 +11,7 @@ from scipy.signal import lsim
 from analysis.effects.measurement import Sensor
 from analysis.terms import make
 from rig.model.rig import Rig
+from rig.runs.rigs import load_rig
 from tests.analysis.test_terms import signals_of
 
 
@@ -86,6 +87,15 @@ def test_a_lag_with_a_second_pole_is_undone(rig: Rig, poles: tuple[float, float]
         assert corrected[inner] == pytest.approx(true[inner], abs=5e3)
     alone = error.undone(reading, 0, rate, shape[:1])[inner]
     assert (float(np.abs(alone - true[inner]).max()) > 1.5e4) == (two > 0.0)
+
+
+def test_a_position_half_a_sample_late_may_be_a_held_command() -> None:
+    rig = load_rig("emps")
+    for name in ("channel_delay", "sensor_lag"):
+        effect = make(name, "joint 1 position")
+        assert isinstance(effect, Sensor)
+        assert "held for a sample" in effect.remark(rig, [], (0.49 / rig.sample_rate,))
+        assert effect.remark(rig, [], (2.0 / rig.sample_rate,)) == ""
 
 
 def test_a_piston_sensor_is_corrected_no_further_than_its_pins_allow(rig: Rig) -> None:
