@@ -19,6 +19,7 @@ import numpy as np
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Array, Rows, in_common, record_rows
+from analysis.regression.settings import REGRESSION
 from analysis.signals.filters import Smoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
@@ -26,6 +27,8 @@ from rig.model.parts import AnySensor, converter_step
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
 
+_BANDS = 8  # of the upper half of a spectrum
+_LEAST_SAMPLES = 512  # for 16 frequencies in each band
 _HARMONICS = 50  # of a rounding error as a function of the signal: 99 % of its variance
 
 
@@ -65,12 +68,36 @@ def _rounding_amplitudes(sensor: AnySensor) -> Array:
 
 
 def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
-    """Return the record with noise of the rig file's sensors added, rounding included."""
+    """Return the record with noise of the rig file's sensors added, rounding included.
 
-    def noise(sensor: AnySensor, x: Array) -> Array:
-        return np.asarray(np.sqrt(sensor_variance(sensor)) * rng.standard_normal(len(x)))
+    Where a sensor's samples hold more than `REGRESSION.stated_ratio` times that as white noise
+    (`white_variance`), noise of that size is added. Inputs are left out: what a loop puts out at
+    random is no error of measurement.
+    """
+
+    def noise(name: str, sensor: AnySensor, x: Array) -> Array:
+        variance = sensor_variance(sensor)
+        if ch.kind_of(name)[0] not in (ch.SPOOL, ch.DRIVE):
+            white = white_variance(bridged(x))
+            variance = white if white > REGRESSION.stated_ratio**2 * variance else variance
+        return np.asarray(np.sqrt(variance) * rng.standard_normal(len(x)))
 
     return _with_errors(rig, record, noise)
+
+
+def white_variance(x: Array) -> float:
+    """Return the variance of white noise that samples x (n,) hold at most, by their upper spectrum.
+
+    It is half the sample rate times the smallest of the mean power densities of `_BANDS` bands
+    between half the Nyquist frequency and that frequency (Welch 1967; a Hann window keeps the
+    motion out of them). Noise that a filter has cut off there counts for less.
+    """
+    if len(x) < _LEAST_SAMPLES:
+        return 0.0
+    window = np.hanning(len(x))
+    power = np.abs(np.fft.rfft((x - x.mean()) * window)) ** 2 / np.sum(window**2)
+    bands = np.array_split(power[len(power) // 2 : -1], _BANDS)
+    return float(min(band.mean() for band in bands))
 
 
 def with_added_rounding(
@@ -82,19 +109,21 @@ def with_added_rounding(
     steps shifted at random: a slow signal has slow errors, which no filter removes.
     """
 
-    def error(sensor: AnySensor, x: Array) -> Array:
+    def error(_: str, sensor: AnySensor, x: Array) -> Array:
         shift = rng.uniform() * converter_step(sensor)
         return mean_rounding(sensor, smoother.apply(bridged(x)) + shift)
 
     return _with_errors(rig, record, error)
 
 
-def _with_errors(rig: Rig, record: Record, error: Callable[[AnySensor, Array], Array]) -> Record:
+def _with_errors(
+    rig: Rig, record: Record, error: Callable[[str, AnySensor, Array], Array]
+) -> Record:
     channels = dict(record.channels)
     for name in rig.channels:
         if name in channels:
             x = np.asarray(channels[name], dtype=np.float64)
-            channels[name] = x + error(rig.sensors.of(ch.kind_of(name)[0]), x)
+            channels[name] = x + error(name, rig.sensors.of(ch.kind_of(name)[0]), x)
     return replace(record, channels=channels)
 
 

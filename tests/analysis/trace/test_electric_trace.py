@@ -109,6 +109,22 @@ def test_a_machine_without_them_is_clean() -> None:
     assert result.verdict == CLEAN
 
 
+def test_a_machine_noisier_than_its_data_sheet_is_clean_without_repeats() -> None:
+    """Its records show the white noise of the position, above all motion."""
+    rig, runs = load_rig("emps"), []
+    for seed, wave in ((3, 0.3), (4, 0.23)):
+        rng = np.random.default_rng(seed)
+        reference = moves(rig.sample_rate, 12.0, 0.05, wave)
+        one = record(rig, Carriage(dry=0.0, offset=0.0), reference, rng, "moves")
+        position = one.channels["position_1"]
+        further = np.sqrt(6.0**2 - 1.0) * rig.sensors.position.noise
+        noisy = position + further * rng.standard_normal(one.samples)
+        channels = {**one.channels, "position_1": noisy}
+        runs.append(Run(rig, (replace(one, channels=channels),)))
+    result = trace([runs[0]], [runs[1]], look_ahead=False)
+    assert (result.verdict, result.effects) == (CLEAN, ())
+
+
 def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> None:
     assert AsymmetricFriction.places(load_rig("emps")) == ()
     names = {e.name for e in catalogue(load_rig("emps"))}

@@ -13,7 +13,12 @@ import pytest
 from scipy.signal import lombscargle
 
 from analysis.effects.friction import CoulombFriction
-from analysis.regression.noise import mean_rounding, repeated_rounding, with_added_rounding
+from analysis.regression.noise import (
+    mean_rounding,
+    repeated_rounding,
+    white_variance,
+    with_added_rounding,
+)
 from analysis.signals.filters import row_filter
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
@@ -86,6 +91,17 @@ def test_a_record_whose_rows_are_all_masked_has_the_stated_floor_and_nothing_lef
     for floor in floors(rig, terms, train_data.records, none, train_data.beta):
         assert (floor.total, floor.repeatable, floor.source) == (0.0, 0.0, STATED)
         assert floor.noise > 0.0
+
+
+def test_white_noise_is_measured_beside_a_motion_a_thousand_times_as_large() -> None:
+    rng, t = np.random.default_rng(7), np.arange(4000) / 500.0
+    noise = 2e-5 * rng.standard_normal(len(t))
+    motion = 0.02 * np.sin(2 * np.pi * 0.7 * t) + 1e-3 * np.sin(2 * np.pi * 9.0 * t) + 0.01 * t
+    assert white_variance(motion + noise) == pytest.approx(4e-10, rel=0.25)
+    assert white_variance(motion) < 1e-3 * 4e-10
+    slow = np.convolve(noise, np.ones(5) / 5, mode="same")  # a filter leaves less of it up there
+    assert white_variance(motion + slow) < 0.5 * np.var(slow)
+    assert white_variance(noise[:100]) == 0.0
 
 
 def to_and_fro(turns: int, repeats: int = 1, times: float = 10.0) -> Run:
