@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.effects.base import Effect, ordered
@@ -184,6 +184,13 @@ def _prepared(records: TraceRuns, options: _Options) -> _Prepared:
     return _Prepared(records, rows, as_recorded.train, candidates, baseline.model, notes)
 
 
+def _with_noise_ratio(prepared: _Prepared, ratio: Mapping[str, float]) -> _Prepared:
+    """Return the input of the search with a noise over the stated noise, by equation."""
+    noise_ratio = {**prepared.records.noise_ratio, **ratio}
+    records = replace(prepared.records, noise_ratio=noise_ratio)
+    return replace(prepared, records=records, rows=trace_rows(records))
+
+
 def _with_free_runs(
     prepared: _Prepared, records: TraceRuns, finding: Finding
 ) -> tuple[Finding, FittedModel, tuple[held_out.FreeRunErrors, held_out.FreeRunErrors]]:
@@ -220,12 +227,10 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
         return find(p.records, p.rows, p.candidates, columns)
 
     finding = searched(prepared)
-    if scaled := unstated_noise(prepared.records, finding):
-        prepared = replace(prepared, records=scaled[0], rows=scaled[1])
-        finding = searched(prepared)
-    if finer := noise_beside_effects(prepared.records, finding):
-        prepared = replace(prepared, records=finer[0], rows=finer[1])
-        finding = searched(prepared)
+    for measured in (unstated_noise, noise_beside_effects):
+        if ratio := measured(finding):
+            prepared = _with_noise_ratio(prepared, ratio)
+            finding = searched(prepared)
     if by_geometry := _traced_within_tolerances(records, options, finding, progress):
         return by_geometry
     progress(JUDGED)

@@ -16,7 +16,6 @@ from analysis.trace.data.conditioned_record import model_rows
 from analysis.trace.data.noise_floor import NEIGHBOURS, STATED, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
-from analysis.trace.data.trace_rows import TraceRuns, trace_rows
 from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
@@ -295,11 +294,11 @@ class Judge:
         return after <= SEARCH.further_share * before and within
 
 
-def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, TraceRows] | None:
-    """Return runs and rows whose noise floors are what `finding` leaves, where nothing repeats.
+def unstated_noise(finding: Finding) -> dict[str, float]:
+    """Return what `finding` leaves over the stated noise, by equation, where nothing repeats.
 
     The stated noise may lack what a sensor has at low frequencies. Equations whose noise a step
-    shows keep their floors. None where each has one, where more than `DATA.unstated_ratio` times
+    shows keep their floors. Empty where each has one, where more than `DATA.unstated_ratio` times
     the stated noise is left, where a variable of the records removes a part of that from held-out
     records, or an effect that the gates refuse.
     """
@@ -307,7 +306,7 @@ def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, Tra
     measured = {f.equation for f in data.floors if f.source != STATED}
     refused = any(map(gates.removes, gates.refused_effects(finding.effects)))
     if finding.verdict != UNEXPLAINED or refused:
-        return None
+        return {}
     winner = _with_tied_effects(finding)
     squares: dict[str, list[NDArray[np.float64]]] = {}
     for s in data.segments:  # whitened by the stated noise
@@ -315,28 +314,26 @@ def unstated_noise(records: TraceRuns, finding: Finding) -> tuple[TraceRuns, Tra
             squares.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
     ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in squares.items()}
     if not ratio or max(ratio.values()) > DATA.unstated_ratio:
-        return None
+        return {}
     clues, formulas = clues_to(data, finding.rows.choosing, winner, ())
     if formulas or any(m.share > DATA.unstated_clue for m in clues):
-        return None
-    ratio_above_stated = {name: max(1.0, value) for name, value in ratio.items()}
-    records = replace(records, noise_ratio=ratio_above_stated)
-    return records, trace_rows(records)
+        return {}
+    return {name: max(1.0, value) for name, value in ratio.items()}
 
 
-def noise_beside_effects(
-    records: TraceRuns, finding: Finding
-) -> tuple[TraceRuns, TraceRows] | None:
-    """Return runs and rows whose noise by neighbouring states is of what the named effects leave.
+def noise_beside_effects(finding: Finding) -> dict[str, float]:
+    """Return the noise by neighbouring states of what the named effects leave, over the stated.
+
+    It is given by equation.
 
     Without dry friction the residual jumps with the direction of motion between two such states: a
-    floor was 20 times too large, and a constant force beside the friction was lost in it. None
-    where no equation's noise gets smaller than `DATA.finer_noise` of what it was.
+    floor was 20 times too large, and a constant force beside the friction was lost in it. Equations
+    whose noise does not get smaller than `DATA.finer_noise` of what it was are left out.
     """
     data, fit = finding.rows.train, finding.winner.fit
     before = {(f.group, f.equation): f.noise for f in data.floors if f.source == NEIGHBOURS}
     if not before or finding.verdict not in (EXPLAINED, CONFOUNDED):
-        return None
+        return {}
     rows = [model_rows(data.rig, fit.terms, record) for record in data.records]
     after = floors(data.rig, fit.terms, data.records, rows, fit.beta)
     ratios: dict[str, list[float]] = {}
@@ -344,11 +341,7 @@ def noise_beside_effects(
         noise = before.get((floor.group, floor.equation))
         if noise is not None and floor.noise < DATA.finer_noise * noise:
             ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
-    if not ratios:
-        return None
-    finer = {e: float(np.sqrt(np.mean(np.square(values)))) for e, values in ratios.items()}
-    records = replace(records, noise_ratio={**records.noise_ratio, **finer})
-    return records, trace_rows(records)
+    return {e: float(np.sqrt(np.mean(np.square(values)))) for e, values in ratios.items()}
 
 
 def _with_tied_effects(finding: Finding) -> Hypothesis:
