@@ -81,11 +81,11 @@ class HypothesisSet:
 
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
         """Return a copy with further candidates, which shares the sets fitted so far."""
-        extended = copy.copy(self)
+        extended, data = copy.copy(self), self.train_data
         extended.effects = tuple(effects)
-        extended.compute_columns()
-        extended.columns = [*self.columns, *extended.columns]
-        extended.candidates = self.candidate_columns(self.train_data, extended.columns)
+        further = variant_columns(data, extended.variants_of(data, data.mean_residual))
+        extended.columns = [*self.columns, *further]
+        extended.candidates = self.candidate_columns(data, extended.columns)
         extended.effects = (*self.effects, *effects)
         return extended
 
