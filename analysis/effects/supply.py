@@ -94,6 +94,14 @@ def turbulent_part(dp: float, share: float) -> float:
     return dp / math.cbrt(1.0 + share**3)
 
 
+def line_loss(ratio: Array, turbulent: float, share: float) -> Array:
+    """Return the drop (n,) [Pa] of a line at flows r (n,) over the pump's, `drop_and_slope`'s law.
+
+    It is turbulent_part r (r^3 + r_t^3)^(1/3).
+    """
+    return np.asarray(turbulent * ratio * np.cbrt(ratio**3 + share**3))
+
+
 def largest_flow(rig: Rig, signals: Sequence[Signals], drawn: bool) -> float:
     """Return the records' largest flow [m^3/s] from the supply (`drawn`), or to the tank."""
     return max((float(port_flow(rig, s, drawn).max()) for s in signals), default=0.0)
@@ -269,8 +277,7 @@ class SupplySag(LineDrop):
         capacity = self.shape_of(rig, shape)[2] / (bulk_modulus(rig) * rig.supply.flow)
         if shape[3:]:
             lag = capacity * drop_and_slope(1.0, turbulent, share)[1]
-            drop = turbulent * ratio * np.cbrt(ratio**3 + share**3)
-            drop = lagged(drop, lag * signals.rate)
+            drop = lagged(line_loss(ratio, turbulent, share), lag * signals.rate)
         else:
             drop = _lagged_drop(ratio, 1.0 / signals.rate, turbulent, share, capacity)
         return replace(signals, p_s=signals.p_s - drop)
@@ -382,7 +389,7 @@ class ReturnLine(LineDrop):
         """Raise the tank pressure."""
         dp, share = self.line(rig, shape)
         ratio = port_flow(rig, signals, self.drawn) / rig.supply.flow
-        drop = turbulent_part(dp, share) * ratio * np.cbrt(ratio**3 + share**3)
+        drop = line_loss(ratio, turbulent_part(dp, share), share)
         return replace(signals, p_tank=signals.p_tank + drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
