@@ -46,10 +46,10 @@ class RegressionSettings:
     # A parameter counts as undetermined where noise makes more than this share of its column's
     # information, or where more than this share of it lies in a null direction.
     noise_share: float = 0.1
+    null_share: float = 0.05
     # Ratio of white noise in a record to a sensor's stated noise, from which the former counts:
     # below, chance and the upper end of a motion's spectrum may make the difference.
     stated_ratio: float = 1.5
-    null_share: float = 0.05
     # Samples between rows used for identifiability: neighbouring rows are nearly equal.
     sample_step: int = 5
     # Coefficients of a base parameter: left out below this share of the largest one; written as a

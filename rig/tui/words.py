@@ -277,7 +277,7 @@ def _ended(frame: Frame) -> Notice:
 
 
 def _not_shown(frame: Frame) -> list[Notice]:
-    """Return a line on a run of another bench, which a screen shows only when it is told to."""
+    """Return a line on a run of another bench, which only the operator makes the screen show."""
     others = [session for session in frame.sessions if session != frame.endpoint]
     if not others:
         return []

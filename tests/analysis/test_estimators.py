@@ -85,7 +85,7 @@ def test_ten_times_the_noise_biases_least_squares_and_the_check_says_so(
 def test_the_interval_of_one_repeat_holds_the_bias_that_its_noise_predicts(
     noisy_run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without repeats no instruments show the bias; a file that states less noise hides it not."""
+    """Without repeats no instruments show the bias; a low stated noise does not hide it."""
     once = tuple(r for r in noisy_run.records if r.repeat == 1)
 
     def stating(times: float) -> Identification:

@@ -383,12 +383,17 @@ async def test_after_the_run_its_last_picture_stays_and_the_next_run_is_joined()
         assert "last picture" not in shown.text
 
 
-async def test_a_trip_stays_shown_while_another_bench_runs_until_the_operator_changes() -> None:
-    # Two benches in the room: the screen has joined the first by itself, and it trips.
+def machine_that_trips() -> Machine:
+    """A run whose bench trips as soon as the screen has joined it."""
     record = running()
     record.waiting.append(tripped(followed(snapshot(Bench(), 81))))
+    return Machine({HERE: record})
+
+
+async def test_a_trip_stays_shown_while_another_bench_runs_until_the_operator_changes() -> None:
+    # Two benches in the room: the screen has joined the first by itself, and it trips.
     press = Recorded(other_bench(k) for k in range(1, 41))
-    machine, other = Machine({HERE: record}), endpoint("press", 99)
+    machine, other = machine_that_trips(), endpoint("press", 99)
     async with glass(machine) as shown:
         del machine.runs[HERE]
         machine.runs[other] = press
@@ -414,9 +419,7 @@ def other_bench(k: int) -> Snapshot:
 
 
 async def test_of_two_runs_that_begin_after_a_trip_the_one_of_the_same_bench_is_joined() -> None:
-    record = running()
-    record.waiting.append(tripped(followed(snapshot(Bench(), 81))))
-    machine = Machine({HERE: record})
+    machine = machine_that_trips()
     async with glass(machine) as shown:
         del machine.runs[HERE]
         await shown.watch(1.0)
@@ -428,9 +431,7 @@ async def test_of_two_runs_that_begin_after_a_trip_the_one_of_the_same_bench_is_
 
 
 async def test_a_run_that_the_operator_starts_is_joined_whatever_was_shown() -> None:
-    record = running()
-    record.waiting.append(tripped(followed(snapshot(Bench(), 81))))
-    machine = Machine({HERE: record})
+    machine = machine_that_trips()
     async with glass(machine) as shown:
         del machine.runs[HERE]
         await shown.watch(1.0)
