@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from types import FrameType
-from typing import Final
+from typing import Protocol, TypeVar
+
+from hil_sim.device.device import Device
 
 logger = logging.getLogger(__name__)
 
-PARENT_SECONDS: Final = 0.25  # between two checks of the parent
+Data = TypeVar("Data")  # what a wire carries: bytes, or frames of a bus
 
 
 class EndpointError(Exception):
@@ -39,7 +40,10 @@ class ParentProcess:
     def has_ended(self) -> bool:
         """Whether the process has ended."""
         # A child's parent id is safe from a reused process number.
-        return os.getppid() != self._pid if self._child else not _exists(self._pid)
+        ended = os.getppid() != self._pid if self._child else not _exists(self._pid)
+        if ended:
+            logger.info("process %d, which this server served, has ended", self._pid)
+        return ended
 
 
 def _exists(pid: int) -> bool:
@@ -52,17 +56,13 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def run_until(ended: Sequence[object], parent: int | None, step: Callable[[], None]) -> None:
-    """Call `step` until `ended` is not empty, or process `parent` has ended."""
+def while_served(ended: Sequence[object], parent: int | None) -> Iterator[None]:
+    """Yield until `ended` is not empty, or process `parent` has ended."""
     parent_process = None if parent is None else ParentProcess(parent)
-    next_check = time.monotonic()
     while not ended:
-        step()
-        if parent_process is not None and time.monotonic() > next_check:
-            next_check = time.monotonic() + PARENT_SECONDS
-            if parent_process.has_ended():
-                logger.info("process %d, which this server served, has ended", parent)
-                return
+        yield
+        if parent_process is not None and parent_process.has_ended():
+            return
 
 
 @contextmanager
@@ -83,3 +83,62 @@ def termination_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+class WireEnd(Protocol[Data]):
+    """The device's end of a line, or of a bus behind an adapter."""
+
+    @property
+    def free(self) -> bool:
+        """Whether a host listens and everything has been sent."""
+
+    def receive(self, timeout: float) -> Data | None:
+        """Return what arrives within `timeout` [s]; None when the host has closed the line."""
+
+    def send(self, data: Data, /) -> None:
+        """Send, or buffer what cannot be sent now."""
+
+    def close(self) -> None:
+        """End the wire."""
+
+
+class WireSession(Protocol[Data]):
+    """A host's requests to a device, in the form of one wire."""
+
+    def receive(self, data: Data, /) -> Data:
+        """Execute the requests that `data` completes; return the answers."""
+
+    def push(self) -> Data:
+        """Return the next block if it may be sent without a request, else nothing."""
+
+    def ended(self) -> None:
+        """Handle the end of the connection: no program has the other end of the line open."""
+
+
+def serve_session(
+    end: WireEnd[Data],
+    session: WireSession[Data],
+    device: Device,
+    ended: Sequence[object],
+    parent: int | None = None,
+    lock: AbstractContextManager[object] | None = None,
+) -> None:
+    """Serve a device until `ended` is not empty, or process `parent` has ended; close `end`.
+
+    `lock` is held except while waiting for the host, for other users of the device.
+    """
+    lock = lock or nullcontext()
+    try:
+        for _ in while_served(ended, parent):
+            received = end.receive(device.idle_seconds())
+            with lock:
+                if received is None:
+                    session.ended()
+                elif received:
+                    end.send(session.receive(received))
+                device.poll()
+                while end.free and (block := session.push()):
+                    end.send(block)
+    finally:
+        device.zero()
+        end.close()

@@ -16,7 +16,7 @@ from hil_sim.device.laws import Refused
 from hil_sim.device.register_map import DeviceRegisters
 from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
-from rig.model.wire.frames import FRAME_VERSION, WireFrame
+from rig.model.wire.frames import FRAME_VERSION, FrameDecoder, WireFrame, encode_frame
 from rig.model.wire.registers import BlockHeader, Refusal, Register, Status
 from rig.model.wire.serial_messages import ANSWER, FOR_ANYBODY, WINDOW, Message
 
@@ -211,3 +211,29 @@ class MessageSession:
 def _require_size(payload: bytes, least: int, most: int) -> None:
     if not least <= len(payload) <= most or len(payload) % 2:
         raise Refused(Refusal.NO_SUCH_REGISTER)
+
+
+class SerialSession:
+    """A `MessageSession` with frames of a serial line.
+
+    When the last program closes the port, the device counts its host as lost, as if by DTR.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self._session = MessageSession(device)
+        self._decoder = FrameDecoder()
+
+    def receive(self, data: bytes) -> bytes:
+        """Execute the messages that `data` completes; return the answers."""
+        answers = map(self._session.receive, self._decoder.feed(data))
+        return b"".join(encode_frame(answer) for answer in answers if answer is not None)
+
+    def push(self) -> bytes:
+        """Return the frame of the next block if it may be sent, else nothing."""
+        block = self._session.push()
+        return b"" if block is None else encode_frame(block)
+
+    def ended(self) -> None:
+        """Handle the end of the connection: no program has the other end of the line open."""
+        self._decoder.reset()
+        self._session.ended()

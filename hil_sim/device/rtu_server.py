@@ -1,4 +1,4 @@
-"""The simulated bench on Modbus RTU: a `Device` behind a pseudo-terminal.
+"""The simulated bench on Modbus RTU.
 
 Frames are device address, function, data, CRC-16 (Modbus over Serial Line, section 2.5.1). A frame
 that is damaged or for another address gets no answer, as on a real line.
@@ -6,12 +6,8 @@ that is damaged or for another address gets no answer, as on a real line.
 
 from __future__ import annotations
 
-import asyncio
 import logging
-import os
-import pty
-import tty
-from collections.abc import Callable
+import time
 from typing import Final
 
 from pymodbus.framer.rtu import FramerRTU
@@ -31,60 +27,47 @@ _COUNTED: Final = {16: (6, 9), 23: (10, 13)}
 _BY_FUNCTION: Final = {request.function_code: request for request in REQUESTS}
 
 
-class RtuLine:
-    """A serial line with one device's registers; `endpoint` is its other end.
-
-    It is the device's client: one permanent host, whose end is not detectable.
-    """
+class RtuSession:
+    """The requests of a host on a serial line: it is permanent, its end is not detectable."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
         self._registers = DeviceRegisters(device)
-        self._master, slave = pty.openpty()
-        tty.setraw(slave)
-        self._slave = slave  # held open, so that a host that closes its end does not end the line
-        os.set_blocking(self._master, False)
-        self.endpoint = f"modbus-rtu://{os.ttyname(slave)}"
         self._received = b""
         self._last_byte = 0.0
 
-    def attach(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Answer requests on this event loop."""
-        self._loop = loop
-        loop.add_reader(self._master, self._arrived)
-
-    def close(self) -> None:
-        """End the line."""
-        self._loop.remove_reader(self._master)
-        os.close(self._master)
-        os.close(self._slave)
-
-    def _arrived(self) -> None:
-        data = os.read(self._master, 4096)
-        now = self._loop.time()
+    def receive(self, data: bytes) -> bytes:
+        """Execute the requests that `data` completes; return the answers."""
+        now = time.monotonic()
         if now - self._last_byte > GAP:
             self._received = b""
         self._last_byte = now
         self._received += data
+        answers = b""
         while (length := frame_length(self._received)) is not None:
             if len(self._received) < length:
                 break
             frame, self._received = self._received[:length], self._received[length:]
-            try:
-                self._answer(frame)
-            except OSError as error:
-                logger.error("a request failed: %s", error)
-        self._device.prefetch()
+            answers += self._answer(frame)
+        return answers
 
-    def _answer(self, frame: bytes) -> None:
+    def push(self) -> bytes:
+        """Return nothing: a host asks for every block. Until then the next one is computed."""
+        self._device.prefetch()
+        return b""
+
+    def ended(self) -> None:
+        """Do nothing, as on a line without control signals."""
+
+    def _answer(self, frame: bytes) -> bytes:
         if self._device.restarting:
-            return
+            return b""
         if not checksum_matches(frame):
             logger.debug("a damaged frame of %d bytes is left unanswered", len(frame))
             self._received = b""
-            return
+            return b""
         if frame[0] != ADDRESS:
-            return
+            return b""
         request_class = _BY_FUNCTION.get(frame[1])
         if request_class is None:
             answer: ModbusPDU = ExceptionResponse(frame[1], 1)
@@ -94,9 +77,9 @@ class RtuLine:
             request.decode(frame[2:-2])
             answer = request.response_to(self._registers, self)
         if self._device.restarting:  # since it has begun to answer
-            return
+            return b""
         body = bytes([ADDRESS, answer.function_code]) + answer.encode()
-        os.write(self._master, body + checksum(body))
+        return body + checksum(body)
 
 
 def frame_length(data: bytes) -> int | None:
@@ -120,19 +103,3 @@ def checksum(data: bytes) -> bytes:
 def checksum_matches(frame: bytes) -> bool:
     """Return whether a frame's checksum is correct."""
     return frame[-2:] == checksum(frame[:-2])
-
-
-async def serve_line(
-    stop: asyncio.Event, device: Device, *, on_ready: Callable[[str], None]
-) -> None:
-    """Serve `device` on a new pseudo-terminal until `stop` is set; `on_ready` gets the endpoint."""
-    line = RtuLine(device)
-    line.attach(asyncio.get_running_loop())
-    try:
-        on_ready(line.endpoint)
-        while not stop.is_set():
-            device.poll()
-            await asyncio.sleep(device.idle_seconds())
-    finally:
-        device.zero()
-        line.close()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import signal
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 from pymodbus.constants import ExcCodes
 from pymodbus.exceptions import ModbusIOException
@@ -19,13 +17,22 @@ from pymodbus.transport import ModbusProtocol
 
 from hil_sim.device.device import Device
 from hil_sim.device.laws import LawTable
-from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, cannot_listen
+from hil_sim.device.lifetime import (
+    WireEnd,
+    WireSession,
+    cannot_listen,
+    serve_session,
+    termination_signals,
+    while_served,
+)
+from hil_sim.device.message_session import SerialSession
 from hil_sim.device.pdu import REQUESTS, Request
+from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.register_map import DeviceRegisters
-from hil_sim.device.rtu_server import serve_line
-from hil_sim.device.serial_server import serve_serial
+from hil_sim.device.rtu_server import RtuSession
 from hil_sim.faults.device import DeviceFault
 from hil_sim.plant.interface import PlantInterface
+from rig.model.parts import LOCALHOST
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
 
@@ -42,6 +49,7 @@ SLCAN: Final = "can-slcan"
 VALVES: Final = "canopen-408"  # always in real time: the host is the sample clock
 WIRES: Final = (TCP, RTU, SERIAL, CAN, SLCAN, VALVES)
 BITRATE: Final = 1_000_000  # of the simulated bus by default
+ACCEPT_SECONDS: Final = 0.01  # for connections that have begun: they are closed, not reset
 
 
 class _Connection(ServerRequestHandler):
@@ -137,34 +145,57 @@ class BenchServer(ModbusTcpServer):
         return f"modbus-tcp://{host}:{port}"
 
 
-async def serve_until(
-    stop: asyncio.Event,
+async def serve_tcp(
     device: Device,
-    *,
     host: str,
     port: int,
     on_ready: Callable[[str], None],
+    ended: Sequence[object],
+    parent: int | None = None,
 ) -> None:
-    """Serve `device` behind Modbus TCP until `stop` is set; `on_ready` gets the endpoint.
+    """Serve a device behind Modbus TCP until `ended` is not empty, or process `parent` has ended.
 
-    Raises EndpointError.
+    `on_ready` gets the endpoint. Raises EndpointError.
     """
     server = BenchServer(device, host, port)
     await server.serve_forever(background=True)
     try:
         on_ready(server.endpoint)
-        while not stop.is_set():
+        for _ in while_served(ended, parent):
             device.poll()
             await asyncio.sleep(device.idle_seconds())
     finally:
         device.zero()
+        await asyncio.sleep(ACCEPT_SECONDS)
         await server.shutdown()  # type: ignore[no-untyped-call]
+
+
+def open_wire(
+    device: Device,
+    wire: str,
+    host: str = LOCALHOST,
+    port: int = 0,
+    layout: CanLayout | None = None,
+    bitrate: int = BITRATE,
+) -> tuple[str, WireEnd[Any], WireSession[Any]]:
+    """Return endpoint, device's end and session of a wire without Modbus TCP; as `serve`."""
+    if wire in (RTU, SERIAL):
+        line = PtyLine()
+        session = RtuSession(device) if wire == RTU else SerialSession(device)
+        return f"{wire}://{line.name}", line, session
+    # Half a second of imports that no other wire needs.
+    from hil_sim.device.can import adapters, server  # noqa: PLC0415
+
+    adapter = (
+        adapters.SlcanLine(bitrate) if wire == SLCAN else adapters.SocketcandServer(host, port)
+    )
+    return adapter.endpoint, adapter, server.CanSession(device, layout)
 
 
 def serve(
     rig: Rig,
     plant: PlantInterface,
-    host: str = "127.0.0.1",
+    host: str = LOCALHOST,
     port: int = 0,
     *,
     realtime: bool = False,
@@ -185,73 +216,28 @@ def serve(
     ticks compile, `warm_up` a spare one before. `faults` are those of the device's electronics.
     Raises EndpointError when the address cannot be listened on.
     """
-
-    def device() -> Device:
-        return Device(rig, plant, realtime=realtime, faults=faults)
-
-    if wire == SERIAL:
-        serve_serial(device(), on_ready, parent)
-        return
     if wire == VALVES:
-        from hil_sim.device.can import adapters, valve_bench  # noqa: PLC0415 - as below
+        from hil_sim.device.can import adapters, valve_bench  # noqa: PLC0415 - as in `open_wire`
 
         bus = adapters.SocketcandServer(host, port)
         valve_bench.serve_valves(rig, plant, bus, on_ready, parent)
         return
-    if wire in (CAN, SLCAN):
-        # Half a second of imports that no other wire needs.
-        from hil_sim.device.can import adapters, server  # noqa: PLC0415
-
-        adapter = (
-            adapters.SlcanLine(bitrate) if wire == SLCAN else adapters.SocketcandServer(host, port)
-        )
-        server.serve_can(device(), adapter, layout, on_ready, parent)
-        return
     # The library logs frames only; errors of use are raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
-
-    async def on_wire(stop: asyncio.Event, device: Device) -> None:
-        if wire == RTU:
-            await serve_line(stop, device, on_ready=on_ready)
-        else:
-            await serve_until(stop, device, host=host, port=port, on_ready=on_ready)
-
-    asyncio.run(_serve(on_wire, device(), parent))
+    device = Device(rig, plant, realtime=realtime, faults=faults)
+    with termination_signals() as ended:
+        if wire == TCP:
+            asyncio.run(serve_tcp(device, host, port, on_ready, ended, parent))
+            return
+        endpoint, end, session = open_wire(device, wire, host, port, layout, bitrate)
+        on_ready(endpoint)
+        serve_session(end, session, device, ended, parent)
 
 
 def warm_up(rig: Rig, spare: PlantInterface) -> None:
     """Run one block on a spare plant, to compile everything in advance."""
     table = LawTable(rig)
     spare.advance(reg.block_layout(len(rig.channels), len(rig.joints)).samples, table.active)
-
-
-async def _serve(
-    on_wire: Callable[[asyncio.Event, Device], Awaitable[None]],
-    device: Device,
-    parent: int | None,
-) -> None:
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        # Only a main thread has signals; elsewhere the caller ends its process.
-        with suppress(RuntimeError, ValueError, NotImplementedError):
-            loop.add_signal_handler(number, stop.set)
-    watch = None if parent is None else loop.create_task(_end_with(parent, stop))
-    try:
-        await on_wire(stop, device)
-    finally:
-        if watch is not None:
-            watch.cancel()
-
-
-async def _end_with(parent: int, stop: asyncio.Event) -> None:
-    """Set `stop` when process `parent` has ended."""
-    parent_process = ParentProcess(parent)
-    while not stop.is_set():
-        if parent_process.has_ended():
-            logger.info("process %d, which this server served, has ended", parent)
-            stop.set()
-        await asyncio.sleep(PARENT_SECONDS)
 
 
 def _abort(connection: ModbusProtocol) -> None:

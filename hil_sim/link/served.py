@@ -6,18 +6,13 @@ import asyncio
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from hil_sim.device.device import Device
-from hil_sim.device.lifetime import EndpointError
-from hil_sim.device.pty_line import PtyLine
-from hil_sim.device.rtu_server import serve_line
-from hil_sim.device.serial_server import serve_port
-from hil_sim.device.server import BITRATE, CAN, RTU, SERIAL, SLCAN, TCP, serve_until
+from hil_sim.device.lifetime import EndpointError, WireEnd, serve_session
+from hil_sim.device.server import CAN, RTU, SERIAL, SLCAN, TCP, open_wire, serve_tcp
 from hil_sim.link.wires import faulty_link
-
-if TYPE_CHECKING:
-    from hil_sim.device.can.adapters import Adapter
+from rig.model.parts import LOCALHOST
 
 Answer = TypeVar("Answer")
 SERVED: Final = (TCP, RTU, SERIAL, CAN, SLCAN)  # wires with a device and a faulty link here
@@ -45,7 +40,7 @@ class ServedDevice:
         self._lock = threading.Lock()
         self._ended: list[bool] = []
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._adapter: Adapter | None = None
+        self._end: WireEnd[Any] | None = None
         self._endpoint: Future[str] = Future()
         self._thread = threading.Thread(target=self._serve_or_report, args=(wire,), daemon=True)
         self._thread.start()
@@ -55,7 +50,7 @@ class ServedDevice:
     @property
     def deserted(self) -> bool:
         """Whether no program has the bus open; a node detects this by its watchdog only."""
-        return self._adapter is not None and not self._adapter.attended
+        return not getattr(self._end, "attended", True)
 
     def inside(self, call: Callable[[], Answer]) -> Answer:
         """Make a call between the device's actions for its host."""
@@ -78,8 +73,6 @@ class ServedDevice:
         """End link, server and thread."""
         self.link.close()
         self._ended.append(True)
-        if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(_SECONDS)
 
     def __enter__(self) -> Self:
@@ -90,48 +83,17 @@ class ServedDevice:
 
     def _serve_or_report(self, wire: str) -> None:
         try:
-            if wire == SERIAL:
-                self._serve_port()
-            elif wire in (CAN, SLCAN):
-                self._serve_bus(wire)
-            else:
-                asyncio.run(self._serve(wire))
+            if wire == TCP:
+                asyncio.run(self._serve())
+                return
+            endpoint, self._end, session = open_wire(self.device, wire)
+            self._endpoint.set_result(endpoint)
+            serve_session(self._end, session, self.device, self._ended, lock=self._lock)
         except Exception as error:
             if self._endpoint.done():
                 raise
             self._endpoint.set_exception(error)
 
-    def _serve_port(self) -> None:
-        line = PtyLine()
-        self._endpoint.set_result(f"{SERIAL}://{line.name}")
-        try:
-            serve_port(line, self.device, self._ended, lock=self._lock)
-        finally:
-            self.device.zero()
-            line.close()
-
-    def _serve_bus(self, wire: str) -> None:
-        # Half a second of imports that no other wire needs.
-        from hil_sim.device.can import adapters, server  # noqa: PLC0415
-
-        adapter = (
-            adapters.SlcanLine(BITRATE)
-            if wire == SLCAN
-            else adapters.SocketcandServer("127.0.0.1", 0)
-        )
-        layout = server.layout_of(self.device.rig)
-        self._adapter = adapter
-        self._endpoint.set_result(adapter.endpoint)
-        try:
-            server.run_device(adapter, self.device, layout, self._ended, lock=self._lock)
-        finally:
-            self.device.zero()
-            adapter.close()
-
-    async def _serve(self, wire: str) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        ready = self._endpoint.set_result
-        if wire == RTU:
-            await serve_line(self._stop, self.device, on_ready=ready)
-        else:
-            await serve_until(self._stop, self.device, host="127.0.0.1", port=0, on_ready=ready)
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        await serve_tcp(self.device, LOCALHOST, 0, self._endpoint.set_result, self._ended)

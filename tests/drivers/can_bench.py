@@ -15,8 +15,9 @@ from drivers import message_stream
 from drivers.can_stream import CanStreamDriver
 from drivers.conformance import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from hil_sim.device.can.adapters import SocketcandServer
-from hil_sim.device.can.server import layout_of, run_device
+from hil_sim.device.can.server import CanSession
 from hil_sim.device.device import Device
+from hil_sim.device.lifetime import serve_session
 from rig.model import channels as ch
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -176,11 +177,10 @@ class CanDevice(SpoiledAdapter):
             self.now += STEP
         return super().receive(timeout)
 
-    def close(self) -> None:
-        """End the server and its thread."""
+    def end(self) -> None:
+        """End the server, which closes its adapter, and its thread."""
         self._ended.append(1)
         self._thread.join(60)
-        super().close()
 
 
 def drop_all(server: SocketcandServer) -> None:
@@ -202,7 +202,7 @@ def _can(faults: tuple[str, ...]) -> Iterator[DeviceUnderTest]:
     server = SocketcandServer("127.0.0.1", 0)
 
     def serve(end: Any, device: Device, ended: list[int]) -> None:
-        run_device(end, device, layout_of(device.rig), ended)
+        serve_session(end, CanSession(device), device, ended)
 
     # A program that left without a goodbye is gone for the watchdog only.
     served = CanDevice(server, serve, lambda: not server._clients)
@@ -232,7 +232,7 @@ def _can(faults: tuple[str, ...]) -> Iterator[DeviceUnderTest]:
                 saturate=served.saturate,
             )
     finally:
-        served.close()
+        served.end()
 
 
 def can_subject(names: Sequence[str] = CanDevice.FAULTS) -> Subject:

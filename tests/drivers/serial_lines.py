@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 
 from drivers.base import DeviceLost
 from hil_sim.device.device import Device
+from hil_sim.device.message_session import SerialSession
 from hil_sim.device.pty_line import PtyLine
-from hil_sim.device.serial_server import SerialSession
 from tests.drivers.wires import ROOT
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 

@@ -91,7 +91,7 @@ class Loop:
 
     def send(self, frame: CanFrame) -> None:
         self.lines.append(said("->", frame))
-        answers = self.session.receive(frame)
+        answers = self.session.receive([frame])
         while block := self.session.push():
             answers += block
         self.lines += [said("<-", answer) for answer in answers]

@@ -25,8 +25,9 @@ from drivers.can_stream import CanSettings, CanStreamDriver
 from drivers.registry import make_driver, wire_at
 from drivers.settings import DRIVER
 from hil_sim.device.can.adapters import SocketcandServer
-from hil_sim.device.can.server import layout_of, run_device
+from hil_sim.device.can.server import CanSession, layout_of
 from hil_sim.device.device import Device
+from hil_sim.device.lifetime import serve_session
 from rig.cli.main import run as command
 from rig.model.parse import InputError
 from rig.model.parts import Wire
@@ -195,7 +196,8 @@ def node(rig: Rig, layout: CanLayout, name: str) -> Iterator[str]:
     """The integrator as a node of python-can's virtual bus; gives the endpoint."""
     adapter = BusNode(f"virtual/{name}")
     device, ended = Device(rig, IntegratorPlant(rig), realtime=False), []
-    thread = threading.Thread(target=run_device, args=(adapter, device, layout, ended))
+    session = CanSession(device, layout)
+    thread = threading.Thread(target=serve_session, args=(adapter, session, device, ended))
     thread.start()
     try:
         yield adapter.endpoint

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import sys
 
-from hil_sim.device.device import Device
-from hil_sim.device.serial_server import serve_serial
+from hil_sim.device.server import SERIAL, serve
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 
 def main() -> None:
     """Serve the plant, print the endpoint first."""
     rig = seed_rig()
-    serve_serial(
-        Device(rig, IntegratorPlant(rig), realtime=sys.argv[1] == "realtime"),
+    serve(
+        rig,
+        IntegratorPlant(rig),
+        wire=SERIAL,
+        realtime=sys.argv[1] == "realtime",
         on_ready=lambda endpoint: print(endpoint, flush=True),  # noqa: T201
         parent=int(sys.argv[2]) if len(sys.argv) > 2 else None,
     )

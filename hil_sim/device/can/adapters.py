@@ -14,7 +14,7 @@ import time
 from contextlib import suppress
 from typing import Final, Protocol
 
-from hil_sim.device.lifetime import cannot_listen
+from hil_sim.device.lifetime import WireEnd, cannot_listen
 from hil_sim.device.pty_line import PtyLine
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.can_layout import CLASSIC_BYTES, FD_SIZES
@@ -38,7 +38,7 @@ _CLASSIC_RATES = {
 }
 
 
-class Adapter(Protocol):
+class Adapter(WireEnd[list[CanFrame]], Protocol):
     """The bench's connection to the bus."""
 
     @property
@@ -46,21 +46,11 @@ class Adapter(Protocol):
         """The endpoint for programs: ``can://...``."""
 
     @property
-    def free(self) -> bool:
-        """Whether a program listens and everything has been sent."""
-
-    @property
     def attended(self) -> bool:
         """Whether a program has the bus open."""
 
     def receive(self, timeout: float) -> list[CanFrame]:
         """Return the frames that arrive within `timeout` [s], at once if there are any."""
-
-    def send(self, frames: list[CanFrame]) -> None:
-        """Send frames in their order."""
-
-    def close(self) -> None:
-        """End the adapter."""
 
 
 class _Client:

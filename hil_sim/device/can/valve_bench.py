@@ -17,7 +17,7 @@ import numpy as np
 
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.laws import OFF
-from hil_sim.device.lifetime import run_until, termination_signals
+from hil_sim.device.lifetime import termination_signals, while_served
 from hil_sim.plant.interface import Law, PlantInterface
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -193,6 +193,7 @@ def serve_valves(
     try:
         with termination_signals() as ended:
             on_ready(adapter.endpoint.replace("can://", "canopen-408://", 1))
-            run_until(ended, parent, lambda: bench.poll(POLL_SECONDS))
+            for _ in while_served(ended, parent):
+                bench.poll(POLL_SECONDS)
     finally:
         adapter.close()

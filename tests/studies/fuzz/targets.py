@@ -23,7 +23,7 @@ from drivers.modbus_frames import (
     tcp_frame,
 )
 from hil_sim.device.device import Device
-from hil_sim.device.serial_server import SerialSession
+from hil_sim.device.message_session import SerialSession
 from hil_sim.link.wires import WIRES
 from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, parse_scenario
