@@ -84,8 +84,8 @@ class PlantEffect(Part):
     `places` are the forms of place where it can be. `drawn_at` is where a random scenario puts it:
     ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); `sizes` are the ranges
     [SI] of its keys, drawn log-uniformly; keys in `signed` have a random sign. `forms` are the
-    values of its key `form`: different physics of the same cause, the first by default. Random
-    scenarios draw only classes with `drawn`: a further one would change the scenario of every seed.
+    values of its key `form`: different physics of the same cause. Random scenarios draw only
+    classes with `drawn`: a further one would change the scenario of every seed.
     """
 
     places: ClassVar[tuple[str, ...]] = ("joint",)
@@ -95,6 +95,11 @@ class PlantEffect(Part):
     signed: ClassVar[tuple[str, ...]] = ()
     forms: ClassVar[tuple[str, ...]] = ()
     name: str
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        if "form" in cls.model_fields:
+            cls.forms = get_args(cls.model_fields["form"].annotation)
 
     @classmethod
     def effect_name(cls) -> str:
@@ -133,6 +138,21 @@ class PlantEffect(Part):
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         raise NotImplementedError
+
+
+class JointEffect(PlantEffect):
+    """An effect on one joint."""
+
+    drawn_at = "joint"
+    where: str
+
+
+class BenchEffect(PlantEffect):
+    """An effect on the whole bench."""
+
+    places = ("bench",)
+    drawn_at = "bench"
+    where: str = "bench"
 
 
 def set_relief(t: Tables, override: float) -> None:

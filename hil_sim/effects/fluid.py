@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from hil_sim.effects.base import PlantEffect, Tables, in_unit, set_relief
+from hil_sim.effects.base import BenchEffect, JointEffect, Tables, in_unit, set_relief
 from rig.model.quantity import Flow, Length, Pressure, Ratio, Time, Volume
 
 Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
@@ -15,14 +15,12 @@ Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
 ACCUMULATOR = 5e-3  # volume of oil as soft as the accumulator [m^3]
 
 
-class InternalLeakage(PlantEffect):
+class InternalLeakage(JointEffect):
     """Leakage past the piston, cap to rod; in a bore worn around its middle, only there."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"conductance": (5e-13, 3e-12)}
 
     name: Literal["internal_leakage"]
-    where: str
     conductance: Conductance = Field(gt=0)
     worn: Length | None = Field(default=None, gt=0, description="half length of the wear [m]")
 
@@ -31,7 +29,7 @@ class InternalLeakage(PlantEffect):
         t.joints["leak_length"][self.joint] = self.worn or math.inf
 
 
-class ExternalLeakage(PlantEffect):
+class ExternalLeakage(JointEffect):
     """Leakage from one chamber, or both, to tank."""
 
     drawn_at = "chamber"
@@ -39,7 +37,6 @@ class ExternalLeakage(PlantEffect):
 
     places = ("joint", "chamber")
     name: Literal["external_leakage"]
-    where: str
     conductance: Conductance = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
@@ -47,16 +44,12 @@ class ExternalLeakage(PlantEffect):
             t.joints[f"leak_{chamber}"][self.joint] += self.conductance
 
 
-class SupplySag(PlantEffect):
+class SupplySag(BenchEffect):
     """A weak supply: less pump flow, a larger override of the relief valve, a line drop."""
 
-    drawn_at = "bench"
     sizes: ClassVar = {"line_drop": (0.3e6, 1e6)}
 
-    places = ("bench",)
-    forms = ("turbulent", "laminar", "accumulator")
     name: Literal["supply_sag"]
-    where: str = "bench"
     flow: Flow | None = Field(default=None, gt=0, description="flow that the pump delivers")
     override: Pressure | None = Field(default=None, gt=0, description="relief, cracking to full")
     line_drop: Pressure | None = Field(
@@ -88,15 +81,12 @@ class SupplySag(PlantEffect):
                 t.bench["manifold_volume"] = ACCUMULATOR
 
 
-class TankPressure(PlantEffect):
+class TankPressure(BenchEffect):
     """Return pressure: a constant part and one proportional to the square of the returned flow."""
 
-    drawn_at = "bench"
     sizes: ClassVar = {"pressure": (0.1e6, 0.4e6)}
 
-    places = ("bench",)
     name: Literal["tank_pressure"]
-    where: str = "bench"
     pressure: Pressure = Field(ge=0)
     back_pressure: Pressure = Field(default=0.0, ge=0, description="more at the rig's pump flow")
     lag: Time = Field(default=5e-3, ge=5e-4)
@@ -107,16 +97,12 @@ class TankPressure(PlantEffect):
         t.bench["tank_lag"] = self.lag
 
 
-class EntrainedAir(PlantEffect):
+class EntrainedAir(BenchEffect):
     """Free air, a share by volume at atmospheric pressure; it dissolves over `dissolution`."""
 
-    drawn_at = "bench"
     sizes: ClassVar = {"fraction": (3e-3, 3e-2)}
 
-    places = ("bench",)
-    forms = ("isothermal", "polytropic", "undissolved")
     name: Literal["entrained_air"]
-    where: str = "bench"
     fraction: Ratio = Field(gt=0, lt=0.2)
     dissolution: Pressure = Field(default=10e6, gt=0)
     form: Literal["isothermal", "polytropic", "undissolved"] = "isothermal"
@@ -127,7 +113,7 @@ class EntrainedAir(PlantEffect):
         t.bench["air_exponent"] = 1.4 if self.form == "polytropic" else 1.0
 
 
-class DeadVolume(PlantEffect):
+class DeadVolume(JointEffect):
     """Oil between valve and chamber in addition to the rig file's volume."""
 
     drawn_at = "chamber"
@@ -135,26 +121,21 @@ class DeadVolume(PlantEffect):
 
     places = ("chamber",)
     name: Literal["dead_volume"]
-    where: str
     volume: Volume = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
         t.joints[f"{self.chamber}_volume"][self.joint] += self.volume
 
 
-class ReturnLine(PlantEffect):
+class ReturnLine(BenchEffect):
     """A return line with a drop: none at rest, `drop` at the rig's pump flow.
 
     ``turbulent`` with the flow's square, ``laminar`` in proportion, ``filter`` half of each.
     """
 
-    drawn_at = "bench"
     sizes: ClassVar = {"drop": (0.4e6, 1.5e6)}
 
-    places = ("bench",)
-    forms = ("turbulent", "laminar", "filter")
     name: Literal["return_line"]
-    where: str = "bench"
     drop: Pressure = Field(gt=0)
     lag: Time = Field(default=1e-3, ge=5e-4)
     form: Literal["turbulent", "laminar", "filter"] = "turbulent"

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from hil_sim.effects.base import PlantEffect, Tables, in_unit
+from hil_sim.effects.base import JointEffect, Tables, in_unit
 from rig.model.quantity import Length, Speed
 
 Drag = Annotated[float, in_unit("N*s/m")]
@@ -17,15 +17,13 @@ PerLength = Annotated[float, in_unit("m^-1")]
 BRISTLE_LIMIT = 8e3
 
 
-class _Friction(PlantEffect):
+class _Friction(JointEffect):
     """Dry friction in one of four forms.
 
     ``bristle`` (LuGre, with micro-damping), ``dahl`` (bristles without damping), and two without
     memory, smooth over the speed `width`: ``tanh`` and ``root``, v / sqrt(v^2 + width^2).
     """
 
-    forms = ("bristle", "dahl", "tanh", "root")
-    where: str
     form: Literal["bristle", "dahl", "tanh", "root"] = "bristle"
     presliding: Length = Field(default=40e-6, gt=0, description="bristle deflection at slip [m]")
     width: Speed = Field(default=1e-3, gt=0, description="of tanh and root [m/s]")
@@ -49,7 +47,6 @@ class _Friction(PlantEffect):
 class CoulombFriction(_Friction):
     """Dry friction of the cylinder's seals; in a tapered bore it grows along the stroke."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"force": (20.0, 120.0)}
 
     name: Literal["coulomb_friction"]
@@ -66,7 +63,6 @@ class CoulombFriction(_Friction):
 class StribeckFriction(_Friction):
     """Breakaway force above Coulomb's that falls off over `speed`."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"force": (40.0, 120.0), "speed": (0.01, 0.04)}
 
     name: Literal["stribeck_friction"]
@@ -82,7 +78,6 @@ class StribeckFriction(_Friction):
 class AsymmetricFriction(_Friction):
     """Dry friction that differs with direction."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"extending": (40.0, 120.0), "retracting": (5.0, 20.0)}
 
     name: Literal["asymmetric_friction"]
@@ -104,7 +99,6 @@ class AsymmetricFriction(_Friction):
 class PressureDependentFriction(_Friction):
     """Dry friction proportional to the seals' pressures: coefficient (p_cap + p_rod)."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"coefficient": (6e-6, 3e-5)}
 
     name: Literal["pressure_dependent_friction"]
@@ -115,18 +109,15 @@ class PressureDependentFriction(_Friction):
         self.add_contact(t, self.coefficient * t.rig.supply.pressure)
 
 
-class AsymmetricViscousFriction(PlantEffect):
+class AsymmetricViscousFriction(JointEffect):
     """Viscous friction in addition to the joint's that differs with direction.
 
     ``seal`` acts at the piston, ``bearing`` at the joint (by the same slopes at mid-stroke),
     ``thinning`` at the piston with a film that thins with shear: c v / (1 + |v| / 0.5 m/s).
     """
 
-    drawn_at = "joint"
     sizes: ClassVar = {"extending": (150.0, 500.0), "retracting": (20.0, 60.0)}
-    forms = ("seal", "bearing", "thinning")
     name: Literal["asymmetric_viscous_friction"]
-    where: str
     extending: Drag = Field(ge=0)
     retracting: Drag = Field(ge=0)
     form: Literal["seal", "bearing", "thinning"] = "seal"

@@ -12,6 +12,7 @@ from rig.model.quantity import Ratio, Time
 
 
 class _Sensor(PlantEffect):
+    drawn_at = "pressure"
     channel: str
 
     @field_validator("channel")
@@ -25,7 +26,6 @@ class _Sensor(PlantEffect):
 class ChannelDelay(_Sensor):
     """The channel is delayed by `time` in addition to the rig file's delay."""
 
-    drawn_at = "pressure"
     sizes: ClassVar = {"time": (1e-3, 6e-3)}
 
     name: Literal["channel_delay"]
@@ -38,7 +38,6 @@ class ChannelDelay(_Sensor):
 class SensorGain(_Sensor):
     """The channel reads the true value times `gain`."""
 
-    drawn_at = "pressure"
     sizes: ClassVar = {"gain": (1.01, 1.08)}
 
     name: Literal["sensor_gain"]
@@ -51,7 +50,6 @@ class SensorGain(_Sensor):
 class SensorOffset(_Sensor):
     """The channel reads `offset` too much, in its own unit."""
 
-    drawn_at = "pressure"
     sizes: ClassVar = {"offset": (0.03e6, 0.2e6)}
     signed = ("offset",)
 
@@ -77,9 +75,7 @@ class SensorLag(_Sensor):
     ``pole`` is one, ``poles`` are two equal ones of half of it each.
     """
 
-    drawn_at = "pressure"
     sizes: ClassVar = {"time": (1e-3, 6e-3)}
-    forms = ("pole", "poles")
     name: Literal["sensor_lag"]
     time: Time = Field(ge=2e-4, le=0.2)
     form: Literal["pole", "poles"] = "pole"
@@ -97,10 +93,8 @@ class SensorCrosstalk(_Sensor):
     constant of a second.
     """
 
-    drawn_at = "pressure"
     sizes: ClassVar = {"share": (0.01, 0.06)}
     signed = ("share",)
-    forms = ("wire", "coupling")
     name: Literal["sensor_crosstalk"]
     share: Ratio = Field(ge=-0.5, le=0.5)
     other: str | None = None

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from hil_sim.effects.base import PlantEffect, Tables, in_unit
+from hil_sim.effects.base import BenchEffect, JointEffect, Tables, in_unit
 from rig.model.quantity import Angle, Frequency
 
 Torque = Annotated[float, in_unit("N*m")]
@@ -16,31 +16,25 @@ Mass = Annotated[float, in_unit("kg")]
 SpringRate = Annotated[float, in_unit("N*m/rad")]
 
 
-class BaseInclination(PlantEffect):
+class BaseInclination(BenchEffect):
     """The base tilts about the joints' axis; positive adds to the first angle."""
 
-    drawn_at = "bench"
     sizes: ClassVar = {"angle": (0.017, 0.07)}
     signed = ("angle",)
 
-    places = ("bench",)
     name: Literal["base_inclination"]
-    where: str = "bench"
     angle: Angle
 
     def apply(self, t: Tables) -> None:
         t.bench["sin_slope"], t.bench["cos_slope"] = math.sin(self.angle), math.cos(self.angle)
 
 
-class Payload(PlantEffect):
+class Payload(BenchEffect):
     """A mass at the tip of the last link."""
 
-    drawn_at = "bench"
     sizes: ClassVar = {"mass": (0.5, 6.5)}
 
-    places = ("bench",)
     name: Literal["payload"]
-    where: str = "bench"
     mass: Mass = Field(gt=0)
 
     def apply(self, t: Tables) -> None:
@@ -50,14 +44,12 @@ class Payload(PlantEffect):
         t.joints["weight"] += self.mass * t.rig.gravity * lengths
 
 
-class JointSpring(PlantEffect):
+class JointSpring(JointEffect):
     """A hose that pulls the joint back to `rest` (default: mid-stroke), hardening [1/rad^2]."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"stiffness": (30.0, 150.0)}
 
     name: Literal["joint_spring"]
-    where: str
     stiffness: SpringRate = Field(gt=0)
     rest: Angle | None = None
     hardening: Annotated[float, in_unit("rad^-2")] = Field(default=0.25, ge=0)
@@ -71,32 +63,27 @@ class JointSpring(PlantEffect):
         t.joints["spring_hardening"][self.joint] = self.hardening
 
 
-class TorqueOffset(PlantEffect):
+class TorqueOffset(JointEffect):
     """A constant torque [N m], positive in the direction of a growing joint angle."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"torque": (3.0, 15.0)}
     signed = ("torque",)
 
     name: Literal["torque_offset"]
-    where: str
     torque: Torque
 
     def apply(self, t: Tables) -> None:
         t.joints["torque_offset"][self.joint] += self.torque
 
 
-class PeriodicDisturbance(PlantEffect):
+class PeriodicDisturbance(JointEffect):
     """A torque of one frequency that begins with the joint's excitation.
 
     ``sine``, ``triangle``, or ``pulses``: a sine raised to its fifth power.
     """
 
-    drawn_at = "joint"
     sizes: ClassVar = {"torque": (1.0, 6.0), "frequency": (2.0, 12.0)}
-    forms = ("sine", "triangle", "pulses")
     name: Literal["periodic_disturbance"]
-    where: str
     torque: Torque = Field(gt=0)
     frequency: Frequency = Field(gt=0, le=200)
     form: Literal["sine", "triangle", "pulses"] = "sine"

@@ -6,19 +6,16 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from hil_sim.effects.base import PlantEffect, Tables
+from hil_sim.effects.base import BenchEffect, JointEffect, Tables
 from rig.model.quantity import Pressure, Time, Voltage
 
 
-class ValveDeadband(PlantEffect):
+class ValveDeadband(JointEffect):
     """Overlapped spool: dead band `width` for u > 0, `astern` (default: `width`) for u < 0 [V]."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"width": (4e-3, 20e-3)}
 
-    forms = ("round", "sharp", "notch")
     name: Literal["valve_deadband"]
-    where: str
     width: Voltage = Field(gt=0, description="of the spool's LVDT [V]")
     astern: Voltage | None = Field(default=None, gt=0)
     rounding: Voltage | None = Field(default=None, gt=0, description="default: a fifth of width")
@@ -33,15 +30,12 @@ class ValveDeadband(PlantEffect):
             t.joints["notch"][self.joint] = 2.0 * self.width
 
 
-class UnderlapLeakage(PlantEffect):
+class UnderlapLeakage(JointEffect):
     """Underlapped spool: within `width` [V] of null all edges are open, also pump to tank."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"width": (4e-3, 15e-3)}
 
-    forms = ("round", "sharp", "notch")
     name: Literal["underlap_leakage"]
-    where: str
     width: Voltage = Field(gt=0)
     rounding: Voltage | None = Field(default=None, gt=0, description="default: half of width")
     form: Literal["round", "sharp", "notch"] = "round"
@@ -55,21 +49,17 @@ class UnderlapLeakage(PlantEffect):
             t.joints["notch"][self.joint] = self.width
 
 
-class LaminarOrifice(PlantEffect):
+class LaminarOrifice(BenchEffect):
     """Metering edges that are laminar below a pressure drop of `transition`, at every valve.
 
     ``smooth``: the edges of the plant with a larger transition. ``cubic``: nothing is lost above
     it. ``tanh``: a flow coefficient that rises with the Reynolds number.
     """
 
-    drawn_at = "bench"
     sizes: ClassVar = {"transition": (0.3e6, 1.5e6)}
 
     drawn = False
-    places = ("bench",)
-    forms = ("smooth", "cubic", "tanh")
     name: Literal["laminar_orifice"]
-    where: str = "bench"
     transition: Pressure = Field(gt=0)
     form: Literal["smooth", "cubic", "tanh"] = "smooth"
 
@@ -78,47 +68,40 @@ class LaminarOrifice(PlantEffect):
         t.bench["laminar_form"] = self.forms.index(self.form)
 
 
-class SpoolOffset(PlantEffect):
+class SpoolOffset(JointEffect):
     """The edges' null lies at this LVDT voltage."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"voltage": (2e-3, 10e-3)}
     signed = ("voltage",)
 
     name: Literal["spool_offset"]
-    where: str
     voltage: Voltage
 
     def apply(self, t: Tables) -> None:
         t.joints["null"][self.joint] += self.voltage
 
 
-class SpoolLag(PlantEffect):
+class SpoolLag(JointEffect):
     """The metered opening follows the LVDT with this time constant."""
 
-    drawn_at = "joint"
     sizes: ClassVar = {"time": (1e-3, 5e-3)}
 
     name: Literal["spool_lag"]
-    where: str
     time: Time = Field(ge=2e-4)
 
     def apply(self, t: Tables) -> None:
         t.joints["opening_rate"][self.joint] = 1.0 / self.time
 
 
-class SpoolHysteresis(PlantEffect):
+class SpoolHysteresis(JointEffect):
     """The metered opening follows the LVDT with play of this width, half of it either way.
 
     ``backlash`` is the play itself; ``friction`` a dry contact whose force grows with the travel
     since the last reversal, over a third of the width (no corner).
     """
 
-    drawn_at = "joint"
     sizes: ClassVar = {"width": (1e-3, 4e-3)}
-    forms = ("backlash", "friction")
     name: Literal["spool_hysteresis"]
-    where: str
     width: Voltage = Field(gt=0)
     form: Literal["backlash", "friction"] = "backlash"
 
