@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
-from urllib.parse import SplitResult
+from urllib.parse import SplitResult, parse_qsl
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,13 +199,17 @@ class WireSettings(Part):
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
         """Return the settings of an endpoint such as ``modbus-tcp://127.0.0.1:5020``.
 
-        By default KIND://VALUE of the one setting that a rig file must state. Raises ValueError
-        where it does not have the form of `example`, or where no single setting must be stated.
+        By default KIND://VALUE?KEY=VALUE of the one setting that a rig file must state, and others.
+        Raises ValueError where it does not have the form of `example`, or where no single setting
+        must be stated.
         """
         needed = [name for name, field in cls.model_fields.items() if field.is_required()]
+        value = url.netloc + url.path  # serial://COM3 has no path
         if len(needed) != 1:
             raise ValueError("no single setting names the device")
-        return {needed[0]: url.netloc + url.path}
+        if not value:
+            raise ValueError(f"no {needed[0]}")
+        return {needed[0]: value, **dict(parse_qsl(url.query))}
 
     example: ClassVar[str] = ""
 

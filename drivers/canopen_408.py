@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Unpack
 
 import numpy as np
 from pydantic import Field
@@ -31,7 +31,7 @@ from drivers.base import (
     WireSettings,
 )
 from drivers.can_port import BusPlace, BusSettings, CanPort
-from drivers.polled import PolledDriver
+from drivers.polled import Pacing, PolledDriver
 from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -387,23 +387,13 @@ class CanOpenValves:
 
 
 class CanOpen408Driver(PolledDriver):
-    """`drivers.base.Driver` of valves of CiA 408; a valve's own fault is a latched trip.
-
-    `clock` [s] and `sleep` [s] pace samples and heartbeat; they may be replaced in tests.
-    """
+    """`drivers.base.Driver` of valves of CiA 408; a valve's own fault is a latched trip."""
 
     settings: ClassVar[type[WireSettings]] = ValveBusSettings
 
-    def __init__(
-        self,
-        wire: Wire,
-        rig: Rig,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._valves = CanOpenValves(wire, rig, clock)
-        super().__init__(wire, rig, self._valves, clock=clock, sleep=sleep)
+    def __init__(self, wire: Wire, rig: Rig, **pacing: Unpack[Pacing]) -> None:
+        self._valves = CanOpenValves(wire, rig, pacing.get("clock", time.monotonic))
+        super().__init__(wire, rig, self._valves, **pacing)
 
     def connect(self) -> DeviceInfo:
         """Open the bus, zero the outputs; a fault in a valve stays until `reset`."""

@@ -8,13 +8,11 @@ number is dropped; after any timeout the connection ends.
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar, Final, Literal
-from urllib.parse import SplitResult
+from typing import Any, ClassVar, Final, Literal, Unpack
 
 import numpy as np
 from pydantic import Field
@@ -23,7 +21,7 @@ from drivers.base import Array, DeviceError, DeviceLost, WireSettings
 from drivers.bench_protocol import DeviceRefused
 from drivers.modbus_frames import READ_HOLDING
 from drivers.modbus_transport import TcpConnection, registers_in_words
-from drivers.polled import PolledDriver
+from drivers.polled import Pacing, PolledDriver
 from drivers.register_types import (
     RegisterType,
     WordOrder,
@@ -66,11 +64,6 @@ class MapSettings(WireSettings):
     outputs: dict[int, Any]
     zero_by: dict[str, Any] | Literal["none"] = _NO_WATCHDOG
     accept_no_watchdog: bool = False
-
-    @classmethod
-    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Raise ValueError: an endpoint has no register map."""
-        raise ValueError(f"no register map in {url.geturl()}")
 
 
 class _NumberEntry(Part):
@@ -381,14 +374,7 @@ class ModbusMapDriver(PolledDriver):
 
     settings: ClassVar[type[WireSettings]] = MapSettings
 
-    def __init__(
-        self,
-        wire: Wire,
-        rig: Rig,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, wire: Wire, rig: Rig, **pacing: Unpack[Pacing]) -> None:
         settings = MapSettings.of(wire)
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         ranges = [sensor.range for sensor in sensors]
@@ -398,8 +384,7 @@ class ModbusMapDriver(PolledDriver):
             rig,
             self._module,
             accept_no_watchdog=settings.accept_no_watchdog,
-            clock=clock,
-            sleep=sleep,
+            **pacing,
         )
 
     def doubts(self) -> Mapping[str, str]:

@@ -193,10 +193,11 @@ class ModbusTcpDriver:
             words = reg.float_words(values)
         self._control(reg.LAWS.address, words, f"laws {list(laws)}")
         flag = reg.APPLY_AND_RESTART if restart else reg.APPLY
+        apply = write_and_read_request(
+            reg.CONTROL_APPLY.address, [flag], reg.STATUS_APPLY_TICK.address, 2
+        )
         try:
-            answer = self._link.write_and_read(
-                reg.CONTROL_APPLY.address, [flag], reg.STATUS_APPLY_TICK.address, 2
-            )
+            answer = self._link.registers(apply, 2)
         except DeviceRefused as refused:
             raise self._with_reason(refused, "apply") from refused
         tick = int.from_bytes(answer, "big")

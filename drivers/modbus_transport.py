@@ -19,7 +19,6 @@ from drivers.modbus_frames import (
     read_request,
     read_tcp_frame,
     tcp_frame,
-    write_and_read_request,
     write_request,
 )
 
@@ -93,10 +92,6 @@ class ModbusConnection(ABC):
                 f"the device at {self.where} confirmed another write than that of "
                 f"{registers_in_words(address, len(words))}"
             )
-
-    def write_and_read(self, write_at: int, words: list[int], read_at: int, count: int) -> bytes:
-        """Write, then read, in one transaction (function 23)."""
-        return self.registers(write_and_read_request(write_at, words, read_at, count), count)
 
     def registers(self, request: bytes, count: int, limit: float | None = None) -> bytes:
         """Return the `count` registers for which a request (a PDU) asks, within `limit` [s]."""

@@ -11,19 +11,17 @@ from __future__ import annotations
 
 import importlib
 import logging
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, ClassVar, Final, Literal
-from urllib.parse import SplitResult
+from typing import Any, ClassVar, Final, Literal, Unpack
 
 import numpy as np
 from pydantic import Field
 
 from drivers.base import Array, DeviceLost, PackageMissing, WireSettings
-from drivers.polled import PolledDriver
+from drivers.polled import Pacing, PolledDriver
 from drivers.wire_entries import (
     inputs_by_channel,
     offset_of,
@@ -50,11 +48,6 @@ class CardSettings(WireSettings):
     outputs: dict[int, Any]
     zero_by: dict[str, Any] | Literal["none"] = _NO_WATCHDOG
     accept_no_watchdog: bool = False
-
-    @classmethod
-    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Raise ValueError: an endpoint does not describe channels."""
-        raise ValueError(f"no channels in {url.geturl()}")
 
 
 class CardInput(Part):
@@ -238,20 +231,12 @@ class NidaqmxDriver(PolledDriver):
 
     settings: ClassVar[type[WireSettings]] = CardSettings
 
-    def __init__(
-        self,
-        wire: Wire,
-        rig: Rig,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, wire: Wire, rig: Rig, **pacing: Unpack[Pacing]) -> None:
         settings = CardSettings.of(wire)
         super().__init__(
             wire,
             rig,
             NidaqmxCard(wiring(settings, rig), wire.timeout),
             accept_no_watchdog=settings.accept_no_watchdog,
-            clock=clock,
-            sleep=sleep,
+            **pacing,
         )

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import ClassVar, Protocol, TypedDict, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,13 @@ class Timing:
     late: int = 0
     missing: int = 0
     worst: float = 0.0
+
+
+class Pacing(TypedDict, total=False):
+    """The clock [s] and the wait [s] of a host that paces samples, to be replaced in tests."""
+
+    clock: Callable[[], float]
+    sleep: Callable[[float], None]
 
 
 class PolledDriver:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
-from urllib.parse import SplitResult, parse_qsl
+from collections.abc import Callable
+from typing import ClassVar
 
 from pydantic import Field
 
@@ -26,14 +25,6 @@ class SerialSettings(WireSettings):
 
     device: str = Field(min_length=1, description="the port: /dev/ttyUSB0, COM3")
     baud: int = Field(default=921_600, ge=1200, le=20_000_000, description="[bit/s]")
-
-    @classmethod
-    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
-        """Return device and speed; raises ValueError where the device is missing."""
-        device = url.netloc + url.path  # serial://COM3 has no path
-        if not device:
-            raise ValueError("no device")
-        return {"device": device, **dict(parse_qsl(url.query))}
 
 
 class SerialLine:
