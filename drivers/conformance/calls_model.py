@@ -123,8 +123,7 @@ class DeviceModel:
 
     def cut(self) -> None:
         """End the link, then check that calls report it and the outputs are zero."""
-        assert self.trial.bench.cut is not None
-        self.trial.bench.cut()
+        self.trial.cut()
         if self.trial.bench.silence is not None:
             self.trial.bench.silence()
             self.trial.zero_at_device("after the end of the link")
@@ -135,8 +134,7 @@ class DeviceModel:
 
     def silence(self) -> None:
         """Wait longer than the watchdog's time."""
-        assert self.trial.bench.silence is not None
-        self.trial.bench.silence()
+        self.trial.silence()
         self.trial.zero_at_device("after a silence longer than the watchdog")
         self.close()
 

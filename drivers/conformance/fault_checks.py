@@ -15,10 +15,7 @@ def _driven(trial: Trial) -> tuple[Watched, Playing, SampleBlock]:
     """Return a driver that plays a waveform, the law it follows, and its last block."""
     driver, wave = trial.ready(), trial.wave(251, seed=5)
     driver.upload(0, wave)
-    laws = trial.law(gain=1.0)
-    tick = driver.apply(laws, restart=True)
-    playing = trial.playing(laws, {0: wave}, tick)
-    trial.until_law(driver, playing, tick, 1)
+    playing = trial.restarted(driver, trial.law(gain=1.0), {0: wave}, 1)
     return driver, playing, driver.read_block()
 
 

@@ -22,9 +22,7 @@ def waveform_is_played(trial: Trial) -> None:
     driver, wave = trial.ready(), trial.wave()
     driver.upload(0, wave)
     driver.read(2)
-    laws = trial.law(gain=0.5, bias=0.1 * trial.volts)
-    tick = driver.apply(laws, restart=True)
-    trial.until_law(driver, trial.playing(laws, {0: wave}, tick), tick, _BLOCKS)
+    trial.restarted(driver, trial.law(gain=0.5, bias=0.1 * trial.volts), {0: wave}, _BLOCKS)
 
 
 @check()
@@ -32,11 +30,9 @@ def long_waveform_is_played(trial: Trial) -> None:
     """A waveform of 3001 samples is put out whole and begins again after its last sample."""
     driver, wave = trial.ready(), trial.wave(_LONG, seed=2)
     driver.upload(0, wave)
-    laws = trial.law(gain=1.0)
     rows = len(driver.read_block().data)
-    tick = driver.apply(laws, restart=True)
-    playing = trial.playing(laws, {0: wave}, tick)
-    trial.until_law(driver, playing, tick, math.ceil((_LONG + 60) / rows))
+    count = math.ceil((_LONG + 60) / rows)
+    trial.restarted(driver, trial.law(gain=1.0), {0: wave}, count)
 
 
 @check()
@@ -45,12 +41,10 @@ def phase_is_kept_without_restart(trial: Trial) -> None:
     driver, wave = trial.ready(), trial.wave()
     driver.upload(0, wave)
     first, second = trial.law(gain=1.0), trial.law(gain=0.5)
-    origin = driver.apply(first, restart=True)
-    trial.until_law(driver, trial.playing(first, {0: wave}, origin), origin, 3)
+    origin = trial.restarted(driver, first, {0: wave}, 3).origin
     tick = driver.apply(second)
     trial.until_law(driver, trial.playing(second, {0: wave}, origin), tick, 3)
-    tick = driver.apply(second, restart=True)
-    trial.until_law(driver, trial.playing(second, {0: wave}, tick), tick, 3)
+    trial.restarted(driver, second, {0: wave}, 3)
 
 
 @check()
@@ -59,8 +53,7 @@ def start_restarts_waveform(trial: Trial) -> None:
     driver, wave = trial.ready(), trial.wave()
     driver.upload(0, wave)
     laws = trial.law(gain=1.0)
-    origin = driver.apply(laws, restart=True)
-    trial.until_law(driver, trial.playing(laws, {0: wave}, origin), origin, 3)
+    trial.restarted(driver, laws, {0: wave}, 3)
     driver.start()
     block = driver.read_block()
     require(block.sequence == 0, f"the stream begins with block {block.sequence}")
@@ -73,12 +66,10 @@ def upload_waits_for_apply(trial: Trial) -> None:
     driver, wave, other = trial.ready(), trial.wave(), trial.wave(seed=3)
     driver.upload(0, wave)
     laws = trial.law(gain=1.0)
-    origin = driver.apply(laws, restart=True)
-    trial.until_law(driver, trial.playing(laws, {0: wave}, origin), origin, 2)
+    playing = trial.restarted(driver, laws, {0: wave})
     driver.upload(0, other)
-    trial.until_law(driver, trial.playing(laws, {0: wave}, origin), origin, 2)
-    tick = driver.apply(laws, restart=True)
-    trial.until_law(driver, trial.playing(laws, {0: other}, tick), tick, 2)
+    trial.until_law(driver, playing, playing.origin, 2)
+    trial.restarted(driver, laws, {0: other})
 
 
 @check(TWO_JOINTS)
@@ -89,12 +80,9 @@ def joints_are_separate(trial: Trial) -> None:
     for joint, wave in waves.items():
         driver.upload(joint, wave)
     laws = [OutputLaw(gain=0.9 - 0.1 * j, limit=trial.volts) for j in range(trial.joints)]
-    tick = driver.apply(laws, restart=True)
-    trial.until_law(driver, trial.playing(laws, waves, tick), tick, 4)
+    trial.restarted(driver, laws, waves, 4)
     for joint in range(trial.joints):
-        law = trial.law(joint, gain=0.5, bias=0.1 * trial.volts)
-        tick = driver.apply(law, restart=True)
-        trial.until_law(driver, trial.playing(law, waves, tick), tick, 2)
+        trial.restarted(driver, trial.law(joint, gain=0.5, bias=0.1 * trial.volts), waves)
 
 
 @check()
@@ -179,9 +167,7 @@ def impossible_waveforms_refused(trial: Trial) -> None:
         ("a waveform of joint 0", -1, np.zeros(3)),
     ):
         trial.refused(what, lambda joint=joint, bad=bad: driver.upload(joint, bad))  # type: ignore[misc]
-    laws = trial.law(gain=1.0)
-    tick = driver.apply(laws, restart=True)
-    trial.until_law(driver, trial.playing(laws, {0: wave}, tick), tick, 2)
+    trial.restarted(driver, trial.law(gain=1.0), {0: wave})
 
 
 @check()
@@ -233,8 +219,7 @@ def session_again_has_no_laws(trial: Trial) -> None:
     trial.connected(driver)
     driver.start()
     trial.zero_in_stream(driver, "in a new session")
-    tick = driver.apply(trial.off(), restart=True)
-    trial.until_law(driver, trial.playing(trial.off()), tick, 2)
+    trial.restarted(driver, trial.off(), {})
 
 
 @check()

@@ -155,16 +155,6 @@ def _driven(trial: Trial) -> Watched:
     return driver
 
 
-def _cut(trial: Trial) -> None:
-    assert trial.bench.cut is not None
-    trial.bench.cut()
-
-
-def _fall_silent(trial: Trial) -> None:
-    assert trial.bench.silence is not None
-    trial.bench.silence()
-
-
 @check()
 def zero_after_connect(trial: Trial) -> None:
     """`connect` leaves the outputs at zero, also after a session that ended with outputs on."""
@@ -199,7 +189,7 @@ def close_leaves_zero(trial: Trial) -> None:
 def lost_host_zeroes(trial: Trial) -> None:
     """The end of the host's link zeroes the outputs, at once or by the watchdog."""
     driver = _driven(trial)
-    _cut(trial)
+    trial.cut()
     if trial.bench.silence is not None:
         trial.bench.silence()
     trial.zero_at_device("after the end of the link")
@@ -210,7 +200,7 @@ def lost_host_zeroes(trial: Trial) -> None:
 def silent_host_zeroes(trial: Trial) -> None:
     """A host silent for longer than the watchdog allows finds the outputs at zero."""
     _driven(trial)
-    _fall_silent(trial)
+    trial.silence()
     trial.zero_at_device("after a silence longer than the watchdog")
 
 
@@ -218,7 +208,7 @@ def silent_host_zeroes(trial: Trial) -> None:
 def zero_after_lost_link(trial: Trial) -> None:
     """`zero_outputs` works in a session whose link has ended, if the device can be reached."""
     driver = _driven(trial)
-    _cut(trial)
+    trial.cut()
     try:
         patiently(driver.zero_outputs)
     except DeviceError as error:
@@ -231,7 +221,7 @@ def cut_link_is_lost(trial: Trial) -> None:
     """`read_block` over a link that has ended raises DeviceLost, and never an old block."""
     driver = trial.ready()
     driver.read(2)
-    _cut(trial)
+    trial.cut()
     loss = loss_raised_by(driver.read_block)
     require(loss, "three calls of read_block after the end of the link raised no DeviceLost")
 
@@ -254,7 +244,7 @@ def silent_device_is_lost(trial: Trial) -> None:
 def trip_is_reported(trial: Trial) -> None:
     """A tripped device reports it in `trip_cause` and marks its blocks."""
     driver = _driven(trial)
-    _fall_silent(trial)
+    trial.silence()
     require(driver.trip_cause() is not None, "trip_cause is None after a trip")
     driver.start()
     require(driver.read_block().tripped, "a block of a tripped device is not marked")
@@ -264,7 +254,7 @@ def trip_is_reported(trial: Trial) -> None:
 def trip_latches(trial: Trial) -> None:
     """After a trip laws that drive are refused, through `start` and `connect`, until `reset`."""
     driver = _driven(trial)
-    _fall_silent(trial)
+    trial.silence()
     trial.refused("a driving law after a trip", lambda: driver.apply(trial.driving()))
     driver.apply(trial.off())
     driver.start()
@@ -285,7 +275,7 @@ def trip_latches(trial: Trial) -> None:
 def reset_drives_nothing(trial: Trial) -> None:
     """`reset` in the session that tripped leaves the outputs at zero until a law is applied."""
     driver = _driven(trial)
-    _fall_silent(trial)
+    trial.silence()
     driver.reset()
     trial.zero_at_device("after reset")
     driver.start()

@@ -112,6 +112,16 @@ class Trial:
         assert self.bench.spoil is not None
         self.bench.spoil(fault)
 
+    def cut(self) -> None:
+        """End the link as the death of the host's process does."""
+        assert self.bench.cut is not None
+        self.bench.cut()
+
+    def silence(self) -> None:
+        """Wait longer than the watchdog's time, without a message of the host."""
+        assert self.bench.silence is not None
+        self.bench.silence()
+
     def end(self) -> None:
         """Close every driver, the wire healthy again; raises nothing but NotConforming."""
         if self.bench.spoil is not None:
@@ -206,6 +216,15 @@ class Trial:
             if followed == count:
                 return
         raise NotConforming(f"no block at or after tick {first}, from which the laws act")
+
+    def restarted(
+        self, driver: Watched, laws: Sequence[OutputLaw], waves: dict[int, Array], count: int = 2
+    ) -> Playing:
+        """Apply laws with restart, require that `count` blocks follow them; return what plays."""
+        tick = driver.apply(laws, restart=True)
+        playing = self.playing(laws, waves, tick)
+        self.until_law(driver, playing, tick, count)
+        return playing
 
 
 def patiently(call: Callable[[], object]) -> None:
