@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocols.files.schema import Protocol, every_step
 from protocols.language.conditions import Condition, parse_condition, require_known
@@ -22,6 +21,7 @@ from protocols.steps.lock import LockStep
 from protocols.steps.parts import CLOSED, END_MAX, Excite, Lock, Place
 from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
 from protocols.steps.warm_up import WarmUpStep
+from rig.model.exponential import exponential
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.model.units import plain
@@ -31,7 +31,6 @@ LOCK_SHARE = 0.25  # of the stroke: a joint that may stand anywhere in it is not
 LOCK_DEVIATIONS = 6.0  # of the noise of a position: one sample of 10^9 is farther off
 LONGEST_RECORD = 86400.0  # [s]
 BISECTIONS = 20  # of a gain: to a millionth
-SERIES = 18  # terms of an exponential: to the last digit
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def largest_position_gain(rig: Rig, joint: int) -> float:
     rates = np.zeros((4, 4))
     rates[0, 1], rates[1, 2] = speed, 1.0
     rates[2, 1:] = -(w**2), -2.0 * damping * w, w**2
-    moves = _exponential(rates * period)
+    moves = exponential(rates * period)
 
     def settles(gain: float) -> bool:
         loop = moves[:3, :3].copy()
@@ -180,17 +179,6 @@ def largest_position_gain(rig: Rig, joint: int) -> float:
         gain = 0.5 * (low + high)
         low, high = (gain, high) if settles(gain) else (low, gain)
     return low
-
-
-def _exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return e^matrix by its series of a part, squared again and again (scipy loads slowly)."""
-    squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum()), 1.0))))
-    part = matrix / 2.0**squarings
-    term = total = np.eye(len(matrix))
-    for order in range(1, SERIES):
-        term = term @ part / order
-        total = total + term
-    return np.linalg.matrix_power(total, 2**squarings)
 
 
 def override(protocol: Protocol, overrides: Overrides) -> Protocol:

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.model.exponential import exponential
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-# Of the series of the matrix exponential: exact to rounding for small w dt.
-_SQUARINGS, _TERMS = 10, 8
 _AT_ONCE: Final = 128  # samples
 
 
@@ -32,7 +31,7 @@ class ExpectedSpool:
             w = 2.0 * math.pi * valve.natural_frequency
             damping = 2.0 * valve.damping_ratio * w
             system = np.array([[0.0, 1.0, 0.0], [-w * w, -damping, w * w], [0.0, 0.0, 0.0]])
-            self._maps.append(_maps(_exponential(system / rig.sample_rate)[:2]))
+            self._maps.append(_maps(exponential(system / rig.sample_rate)[:2]))
         self.forget()
 
     def forget(self) -> None:
@@ -70,15 +69,3 @@ def _maps(step: Array) -> Array:
         maps[k + 1] = step[:, :2] @ maps[k]
         maps[k + 1, :, 2 + k] = step[:, 2]
     return maps
-
-
-def _exponential(matrix: Array) -> Array:
-    """Return exp(matrix) by scaling and squaring, because scipy loads slowly."""
-    small = matrix / 2.0**_SQUARINGS
-    term = total = np.eye(len(matrix))
-    for n in range(1, _TERMS):
-        term = term @ small / n
-        total = total + term
-    for _ in range(_SQUARINGS):
-        total = total @ total
-    return total
