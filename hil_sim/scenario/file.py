@@ -16,7 +16,6 @@ forms here are the simulator's own (LuGre, rounded edges, lagging supply), finer
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -27,7 +26,7 @@ from hil_sim.faults import AnyFault
 from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
 from rig.model.parameters import parameter_unit
-from rig.model.parse import InputError, parse_model
+from rig.model.parse import InputError, parse_model, shipped_files
 from rig.model.parts import Part
 from rig.model.quantity import Ratio
 from rig.model.rig import Rig
@@ -76,15 +75,13 @@ def _unit_of(name: str) -> str:
 
 def shipped_scenarios() -> tuple[str, ...]:
     """Return the names of the shipped scenarios."""
-    folder = resources.files("hil_sim") / "scenarios"
-    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
+    return tuple(shipped_files("hil_sim", "scenarios"))
 
 
 def load_shipped(name: str) -> Scenario:
     """Return a shipped scenario."""
-    source = f"{name}.yaml"
-    path = resources.files("hil_sim") / "scenarios" / source
-    return parse_scenario(path.read_text(encoding="utf-8"), source)
+    text = shipped_files("hil_sim", "scenarios")[name].read_text(encoding="utf-8")
+    return parse_scenario(text, f"{name}.yaml")
 
 
 def parse_scenario(text: str, source: str) -> Scenario:

@@ -7,14 +7,13 @@ own `nominal` values. None of this is sent over a wire.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
 from hil_sim.effects.base import in_unit, with_units
 from rig.model.parameters import parameter_names, parameter_unit
-from rig.model.parse import InputError, parse_model
+from rig.model.parse import InputError, parse_model, shipped_files
 from rig.model.parts import Part
 from rig.model.quantity import Pressure, Ratio, Volume
 from rig.model.rig import Rig
@@ -56,8 +55,8 @@ class TrueMachine(Part):
 
 def machine_text(name: str) -> str | None:
     """Return the machine file shipped for the rig called `name`, None where there is none."""
-    path = resources.files("hil_sim") / "machines" / f"{name}.yaml"
-    return path.read_text(encoding="utf-8") if path.is_file() else None
+    file = shipped_files("hil_sim", "machines").get(name)
+    return None if file is None else file.read_text(encoding="utf-8")
 
 
 def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> TrueMachine:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from protocols.files.expansion import (
 )
 from protocols.files.schema import INCOMPLETE, VERSION, Protocol, later_version
 from protocols.steps.base import StepKind
-from rig.model.parse import InputError, Problem, load_yaml, validate_model
+from rig.model.parse import InputError, Problem, load_yaml, shipped_files, validate_model
 from rig.model.parse import Path as Keys
 
 _PLACEHOLDER = RawStep({"mark": "in place of steps that could not be read"}, {})
@@ -27,8 +26,7 @@ _PLACEHOLDER = RawStep({"mark": "in place of steps that could not be read"}, {})
 
 def shipped_names() -> tuple[str, ...]:
     """Return the names of the shipped protocols."""
-    folder = resources.files("protocols") / "shipped"
-    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
+    return tuple(shipped_files("protocols", "shipped"))
 
 
 def load(name: str | Path, values: Mapping[str, Any] | None = None) -> Protocol:
@@ -67,9 +65,9 @@ def parsed_values(settings: Sequence[str]) -> dict[str, Any]:
 
 def _text(name: str, folder: Path | None) -> tuple[str, str, Path | None]:
     """Return a protocol's text, its displayed name, and the folder of its relative paths."""
-    if name in shipped_names():
-        text = (resources.files("protocols") / "shipped" / f"{name}.yaml").read_text("utf-8")
-        return text, f"{name}.yaml", None
+    shipped = shipped_files("protocols", "shipped")
+    if name in shipped:
+        return shipped[name].read_text("utf-8"), f"{name}.yaml", None
     path = Path(name) if folder is None else folder / name
     try:
         return path.read_text("utf-8"), str(path), path.parent
@@ -78,7 +76,7 @@ def _text(name: str, folder: Path | None) -> tuple[str, str, Path | None]:
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror or error}); "
-            f"shipped protocols are: {' '.join(shipped_names())}"
+            f"shipped protocols are: {' '.join(shipped)}"
         ) from error
 
 

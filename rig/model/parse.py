@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib import resources
+from importlib.resources.abc import Traversable
 from textwrap import shorten
 from typing import Any, Final, TypeVar
 
@@ -240,6 +242,13 @@ def _cut(text: str) -> str:
     """Return a text in one line of FOUND_AT_MOST characters, cut between words if it has any."""
     cut = shorten(text, FOUND_AT_MOST)
     return cut if cut != "[...]" else f"{text[: FOUND_AT_MOST - 6]} [...]"
+
+
+def shipped_files(package: str, folder: str) -> dict[str, Traversable]:
+    """Return the YAML files that a package ships in a folder, by name and in its order."""
+    files = resources.files(package).joinpath(folder).iterdir()
+    named = {file.name[:-5]: file for file in files if file.name.endswith(".yaml")}
+    return {name: named[name] for name in sorted(named)}
 
 
 def parse_model(model: type[Model], text: str, source: str) -> Model:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from importlib import resources
 from pathlib import Path
 
-from rig.model.parse import InputError, parse_model
+from rig.model.parse import InputError, parse_model, shipped_files
 from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.store import parse_header
@@ -18,8 +17,7 @@ _RESOLVED = re.compile(r"^format:", re.MULTILINE)  # key of a run.yaml that no r
 
 def shipped_rigs() -> tuple[str, ...]:
     """Return the names of the shipped rigs."""
-    entries = resources.files("rig").joinpath("shipped").iterdir()
-    return tuple(sorted(e.name.removesuffix(".yaml") for e in entries if e.name.endswith(".yaml")))
+    return tuple(shipped_files("rig", "shipped"))
 
 
 def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple[str, str]:
@@ -31,18 +29,16 @@ def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple
     if not isinstance(name_or_path, str | Path):
         raise InputError(f"expected the name or the file of a rig, found {name_or_path!r:.60}")
     text = os.fspath(name_or_path)
-    names = shipped_rigs()
-    if text in names:
-        entry = resources.files("rig").joinpath("shipped", f"{text}.yaml")
-        return entry.read_text(encoding="utf-8"), f"{text}.yaml (shipped)"
+    shipped = shipped_files("rig", "shipped")
+    if text in shipped:
+        return shipped[text].read_text(encoding="utf-8"), f"{text}.yaml (shipped)"
     path = Path(text).expanduser()
     if relative_to is not None:
         path = relative_to / path
     try:
         return read_text(path, _WHAT), str(path)
     except InputError as error:
-        shipped = ", ".join(names)
-        raise InputError(f"{error}, or the name of a shipped rig: {shipped}") from error
+        raise InputError(f"{error}, or the name of a shipped rig: {', '.join(shipped)}") from error
 
 
 def load_bench(name: str | Path) -> Rig:

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,6 @@ from protocols.engine import engine
 from protocols.engine.run_inputs import RunInputs
 from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
-from protocols.files.library import shipped_names
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import known_rigs, reset_bench, tripped_rigs
 from rig.bench.screens.snapshot import PlanLine
@@ -32,7 +30,7 @@ from rig.cli.proof.proofs import proved
 from rig.cli.proof.twin_choice import twin_source
 from rig.cli.text.output import Countdown, Say, clock_text, is_terminal
 from rig.cli.text.sheets import plan_text
-from rig.model.parse import InputError
+from rig.model.parse import InputError, shipped_files
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig, rig_text
@@ -167,9 +165,9 @@ def _file(text: str, source: str) -> dict[str, str]:
 
 
 def _protocol_text(name: str) -> tuple[str, str]:
-    if name in shipped_names():
-        entry = resources.files("protocols") / "shipped" / f"{name}.yaml"
-        return entry.read_text("utf-8"), f"{name}.yaml (shipped)"
+    shipped = shipped_files("protocols", "shipped")
+    if name in shipped:
+        return shipped[name].read_text("utf-8"), f"{name}.yaml (shipped)"
     path = Path(name).absolute()
     return path.read_text("utf-8"), str(path)
 
