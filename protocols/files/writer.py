@@ -11,38 +11,18 @@ from protocols.files.schema import Protocol
 
 # Unit written after each quantity, and its number per SI unit.
 _UNITS: Mapping[str, tuple[str, float]] = {
-    "position_gain": ("V/m", 1.0),
-    "limit": ("V", 1.0),
-    "push": ("V", 1.0),
-    "tolerance": ("mm", 1e3),
-    "timeout": ("s", 1.0),
-    "piston": ("mm", 1e3),
-    "frequency": ("Hz", 1.0),
-    "base_frequency": ("Hz", 1.0),
-    "f_min": ("Hz", 1.0),
-    "f_max": ("Hz", 1.0),
-    "amplitude": ("V", 1.0),
-    "travel": ("mm", 1e3),
-    "record": ("s", 1.0),
-    "wait": ("s", 1.0),
-    "hold": ("s", 1.0),
-    "pause": ("s", 1.0),
-    "rise": ("s", 1.0),
-    "width": ("s", 1.0),
-    "rest": ("s", 1.0),
-    "edge": ("s", 1.0),
-    "period": ("s", 1.0),
-    "amplitudes": ("V", 1.0),
-    "phases": ("rad", 1.0),
-    "drift": ("mm", 1e3),
-    "offset": ("mm", 1e3),
-    "centre": ("mm", 1e3),
-    "duration": ("s", 1.0),
-    "ramp": ("s", 1.0),
-    "settle": ("s", 1.0),
+    key: (unit, scale)
+    for unit, scale, keys in (
+        ("V/m", 1.0, "position_gain"),
+        ("V", 1.0, "limit push amplitude amplitudes"),
+        ("mm", 1e3, "tolerance piston travel drift offset centre"),
+        ("Hz", 1.0, "frequency base_frequency f_min f_max"),
+        ("rad", 1.0, "phases"),
+        ("s", 1.0, "timeout record wait hold pause rise width rest edge period duration"),
+        ("s", 1.0, "ramp settle"),
+    )
+    for key in keys.split()
 }
-
-
 _DIGITS: Mapping[str, int] = {"amplitudes": 5, "phases": 5}  # significant; others: 12
 
 
