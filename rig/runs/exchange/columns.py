@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,7 @@ def _read_csv(path: Path, wanted: list[str], needed: list[str]) -> dict[str, Arr
     body = [lines[i] for i in rows]
     if delimiter != "," and not any("." in line for line in body[:50]):
         body = [line.replace(",", ".") for line in body]  # the file has decimal commas
-    _refuse_ragged(path, body, rows, names, delimiter)
-    values = _numbers(path, body, rows, names, chosen, delimiter)
+    values = _CsvTable(path, names, delimiter, body, rows).numbers(chosen)
     return {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(chosen)}
 
 
@@ -82,70 +82,66 @@ def _split(line: str, delimiter: str) -> list[str]:
     return next(csv.reader(io.StringIO(line), delimiter=delimiter, skipinitialspace=True), [])
 
 
-def _refuse_ragged(
-    path: Path, body: Sequence[str], rows: Sequence[int], names: Sequence[str], delimiter: str
-) -> None:
-    for line, row in zip(body, rows, strict=True):
-        cells = line.count(delimiter) + 1
-        if cells != len(names) and len(_split(line, delimiter)) != len(names):
-            raise InputError(
-                f"{path}:{row + 1}: row {row + 1} has {len(_split(line, delimiter))} cells, "
-                f"the header has {len(names)}"
+@dataclass(frozen=True)
+class _CsvTable:
+    """The lines with numbers of a CSV file; `rows` are their numbers in the file, from 0."""
+
+    path: Path
+    names: Sequence[str]
+    delimiter: str
+    body: Sequence[str]
+    rows: Sequence[int]
+
+    def numbers(self, chosen: Sequence[str]) -> Array:
+        """Return the chosen columns, shape (lines, columns)."""
+        self._refuse_ragged()
+        columns = [self.names.index(name) for name in chosen]
+        try:
+            values = np.loadtxt(
+                self.body,
+                delimiter=self.delimiter,
+                usecols=columns,
+                ndmin=2,
+                comments=None,
+                quotechar='"',
             )
+        except ValueError as error:
+            raise self._bad_cell(columns, str(error)) from error
+        if not np.isfinite(values).all():
+            k, column = (int(at) for at in np.argwhere(~np.isfinite(values))[0])
+            found = f"found {values[k, column]}, expected a finite number"
+            raise self._error_in(self.rows[k], chosen[column], found)
+        return np.asarray(values, dtype=np.float64)
 
-
-def _numbers(
-    path: Path,
-    body: Sequence[str],
-    rows: Sequence[int],
-    names: Sequence[str],
-    chosen: Sequence[str],
-    delimiter: str,
-) -> Array:
-    columns = [names.index(name) for name in chosen]
-    try:
-        values = np.loadtxt(
-            body, delimiter=delimiter, usecols=columns, ndmin=2, comments=None, quotechar='"'
-        )
-    except ValueError as error:
-        raise _bad_cell(path, body, rows, names, columns, delimiter, str(error)) from error
-    if not np.isfinite(values).all():
-        row, column = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
-        raise _not_finite(path, chosen[column], rows[row] + 1, values[row, column])
-    return np.asarray(values, dtype=np.float64)
-
-
-def _not_finite(path: Path, column: str, row: int, value: float) -> InputError:
-    return InputError(
-        f"{path}:{row}: column {column!r}, row {row}: found {value}, expected a finite number"
-    )
-
-
-def _bad_cell(
-    path: Path,
-    body: Sequence[str],
-    rows: Sequence[int],
-    names: Sequence[str],
-    columns: Sequence[int],
-    delimiter: str,
-    reason: str,
-) -> InputError:
-    """Return the error of the first cell that is not a number; slow, for invalid files only."""
-    for line, row in zip(body, rows, strict=True):
-        cells = _split(line, delimiter)
-        for column in columns:
-            cell = cells[column].strip()
-            try:
-                float(cell)
-            except ValueError:
-                found = f"found {cell[:40]!r}" if cell else "the cell is empty"
-                return InputError(
-                    f"{path}:{row + 1}: column {names[column]!r}, row {row + 1}: {found}, "
-                    "expected a number"
+    def _refuse_ragged(self) -> None:
+        for line, row in zip(self.body, self.rows, strict=True):
+            if line.count(self.delimiter) + 1 == len(self.names):
+                continue
+            cells = len(_split(line, self.delimiter))
+            if cells != len(self.names):
+                raise InputError(
+                    f"{self.path}:{row + 1}: row {row + 1} has {cells} cells, "
+                    f"the header has {len(self.names)}"
                 )
-    return InputError(f"{path}: cannot be read as numbers: {reason}")
+
+    def _bad_cell(self, columns: Sequence[int], reason: str) -> InputError:
+        """Return the error of the first cell that is not a number; slow, for invalid files only."""
+        for line, row in zip(self.body, self.rows, strict=True):
+            cells = _split(line, self.delimiter)
+            for column in columns:
+                cell = cells[column].strip()
+                try:
+                    float(cell)
+                except ValueError:
+                    found = f"found {cell[:40]!r}" if cell else "the cell is empty"
+                    return self._error_in(row, self.names[column], f"{found}, expected a number")
+        return InputError(f"{self.path}: cannot be read as numbers: {reason}")
+
+    def _error_in(self, row: int, column: str, text: str) -> InputError:
+        return InputError(f"{self.path}:{row + 1}: column {column!r}, row {row + 1}: {text}")
 
 
+# MAT
 # MAT
 
 

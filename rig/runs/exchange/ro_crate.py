@@ -39,6 +39,10 @@ def _ref(identifier: str) -> Entity:
     return {"@id": identifier}
 
 
+def _entity(identifier: str, kind: str | list[str], name: str, **properties: Any) -> Entity:
+    return {"@id": identifier, "@type": kind, "name": name, **properties}
+
+
 def _digest(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -72,40 +76,36 @@ def describe(
     name = Path(head.source).resolve().name
     variables = _variables(head, header)
     licence_id = licence or "#no-licence"
-    root: Entity = {
-        "@id": "./",
-        "@type": "Dataset",
-        "name": f"Run {name} on {header.rig.name}",
-        "description": _description(head, header),
-        "datePublished": datetime.now(UTC).date().isoformat(),
-        "dateCreated": header.created,
-        "license": _ref(licence_id),
-        "creator": _ref("#operator"),
-        "conformsTo": _ref(PROFILE),
-        "hasPart": [_ref(part) for part in names],
-        "mentions": _ref("#run"),
-        "variableMeasured": [_ref(variable["@id"]) for variable in variables],
-    }
+    root = _entity(
+        "./",
+        "Dataset",
+        f"Run {name} on {header.rig.name}",
+        description=_description(head, header),
+        datePublished=datetime.now(UTC).date().isoformat(),
+        dateCreated=header.created,
+        license=_ref(licence_id),
+        creator=_ref("#operator"),
+        conformsTo=_ref(PROFILE),
+        hasPart=[_ref(part) for part in names],
+        mentions=_ref("#run"),
+        variableMeasured=[_ref(variable["@id"]) for variable in variables],
+    )
+    of_crate = {"conformsTo": _ref(CRATE), "about": _ref("./")}
     graph: list[Entity] = [
-        {
-            "@id": CRATE_METADATA,
-            "@type": "CreativeWork",
-            "conformsTo": _ref(CRATE),
-            "about": _ref("./"),
-        },
+        {"@id": CRATE_METADATA, "@type": "CreativeWork", **of_crate},
         root,
         *(_file(folder / part) for part in names),
         _action(folder, head, header, names),
-        {"@id": "#operator", "@type": "Person", "name": header.operator or "unknown"},
-        {
-            "@id": licence_id,
-            "@type": "CreativeWork",
-            "name": "Licence of the data" if licence else "No licence was given",
-            "description": licence or "The exporting person named no licence: ask them.",
-        },
+        _entity("#operator", "Person", header.operator or "unknown"),
+        _entity(
+            licence_id,
+            "CreativeWork",
+            "Licence of the data" if licence else "No licence was given",
+            description=licence or "The exporting person named no licence: ask them.",
+        ),
         _instrument(header),
         *_software(header.versions),
-        {"@id": PROFILE, "@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"},
+        _entity(PROFILE, "CreativeWork", "Process Run Crate", version="0.5"),
         *variables,
         *_calibrations(header),
     ]
@@ -123,34 +123,33 @@ def _description(head: RunHead, header: Header) -> str:
 
 def _file(path: Path) -> Entity:
     kind, about = _FILES[path.name]
-    return {
-        "@id": path.name,
-        "@type": "File",
-        "name": path.name,
-        "description": about,
-        "encodingFormat": kind,
-        "contentSize": str(path.stat().st_size),
-        "sha256": _digest(path),
-    }
+    return _entity(
+        path.name,
+        "File",
+        path.name,
+        description=about,
+        encodingFormat=kind,
+        contentSize=str(path.stat().st_size),
+        sha256=_digest(path),
+    )
 
 
 def _action(folder: Path, head: RunHead, header: Header, names: list[str]) -> Entity:
     events = read_events(folder)
     failed = head.state != DONE
-    action: Entity = {
-        "@id": "#run",
-        "@type": "CreateAction",
-        "name": header.provenance.get("command") or f"Run on {header.rig.name}",
-        "startTime": header.created,
-        "endTime": str(events[-1].get("time", header.created)) if events else header.created,
-        "agent": _ref("#operator"),
-        "instrument": _ref("#bramah"),
-        "object": [_ref(HEADER), _ref("#rig")],
-        "result": [_ref(name) for name in names if name in (ARCHIVE, EVENTS)],
-        "actionStatus": _ref(
-            f"http://schema.org/{'FailedActionStatus' if failed else 'CompletedActionStatus'}"
-        ),
-    }
+    status = "FailedActionStatus" if failed else "CompletedActionStatus"
+    action = _entity(
+        "#run",
+        "CreateAction",
+        header.provenance.get("command") or f"Run on {header.rig.name}",
+        startTime=header.created,
+        endTime=str(events[-1].get("time", header.created)) if events else header.created,
+        agent=_ref("#operator"),
+        instrument=_ref("#bramah"),
+        object=[_ref(HEADER), _ref("#rig")],
+        result=[_ref(name) for name in names if name in (ARCHIVE, EVENTS)],
+        actionStatus=_ref(f"http://schema.org/{status}"),
+    )
     if failed:
         ends = [e for e in events if e.get("event") in ("trip", "end", "recovered")]
         message = str(ends[-1].get("message", "")) if ends else ""
@@ -159,31 +158,25 @@ def _action(folder: Path, head: RunHead, header: Header, names: list[str]) -> En
 
 
 def _instrument(header: Header) -> Entity:
-    return {
-        "@id": "#rig",
-        "@type": ["IndividualProduct", "Thing"],
-        "name": header.rig.name,
-        "description": f"Test bench with {len(header.rig.joints)} joint(s); device: "
-        f"{header.device or 'unknown'}; computer: {header.host or 'unknown'}",
-    }
+    description = (
+        f"Test bench with {len(header.rig.joints)} joint(s); device: {header.device or 'unknown'}; "
+        f"computer: {header.host or 'unknown'}"
+    )
+    kinds = ["IndividualProduct", "Thing"]
+    return _entity("#rig", kinds, header.rig.name, description=description)
 
 
 def _software(versions: Mapping[str, str]) -> list[Entity]:
-    main: Entity = {
-        "@id": "#bramah",
-        "@type": "SoftwareApplication",
-        "name": "bramah",
-        "version": versions.get("bramah", "unknown"),
-        "softwareRequirements": [_ref(f"#{n}") for n in versions if n not in ("bramah", "commit")],
+    others = {
+        name: version for name, version in versions.items() if name not in ("bramah", "commit")
     }
+    kind = "SoftwareApplication"
+    needs = [_ref(f"#{name}") for name in others]
+    version = versions.get("bramah", "unknown")
+    main = _entity("#bramah", kind, "bramah", version=version, softwareRequirements=needs)
     if "commit" in versions:
         main["identifier"] = versions["commit"]
-    others = [
-        {"@id": f"#{name}", "@type": "SoftwareApplication", "name": name, "version": version}
-        for name, version in versions.items()
-        if name not in ("bramah", "commit")
-    ]
-    return [main, *others]
+    return [main, *(_entity(f"#{name}", kind, name, version=v) for name, v in others.items())]
 
 
 def _variables(head: RunHead, header: Header) -> list[Entity]:
@@ -191,12 +184,7 @@ def _variables(head: RunHead, header: Header) -> list[Entity]:
     variables = []
     for name in names:
         unit = header.rig.unit_of(name)
-        variable: Entity = {
-            "@id": f"#channel-{name}",
-            "@type": "PropertyValue",
-            "name": name,
-            "unitText": unit or "1",
-        }
+        variable = _entity(f"#channel-{name}", "PropertyValue", name, unitText=unit or "1")
         if unit in _UNIT_CODES:
             variable["unitCode"] = _UNIT_CODES[unit]
         if name in _calibrated(header):
@@ -210,22 +198,24 @@ def _calibrated(header: Header) -> Mapping[str, Any]:
 
 
 def _calibrations(header: Header) -> list[Entity]:
-    return [
-        {
-            "@id": f"#calibration-{name}",
-            "@type": "CreateAction",
-            "name": f"Calibration of {name}",
-            "endTime": calibration.date.isoformat(),
-            "object": _ref(f"#sensor-{name}"),
-            "description": calibration.certificate or "no certificate was named",
-        }
-        for name, calibration in _calibrated(header).items()
-    ] + [
-        {
-            "@id": f"#sensor-{name}",
-            "@type": "IndividualProduct",
-            "name": f"Sensor of {name}",
-            "serialNumber": calibration.serial,
-        }
-        for name, calibration in _calibrated(header).items()
+    calibrations = _calibrated(header).items()
+    acts = [
+        _entity(
+            f"#calibration-{name}",
+            "CreateAction",
+            f"Calibration of {name}",
+            endTime=calibration.date.isoformat(),
+            object=_ref(f"#sensor-{name}"),
+            description=calibration.certificate or "no certificate was named",
+        )
+        for name, calibration in calibrations
+    ]
+    return acts + [
+        _entity(
+            f"#sensor-{name}",
+            "IndividualProduct",
+            f"Sensor of {name}",
+            serialNumber=calibration.serial,
+        )
+        for name, calibration in calibrations
     ]
