@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import convolve
+from scipy.signal import convolve, lfilter
 
 from analysis.signals import filters as d
 from analysis.signals.convolution import convolved, decimated, same_convolved
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.model.spectra import noise_power, power_spectrum
 from tests.studies.estimators import other_filters
 from tests.studies.estimators.differentiation import markdown, table
 
@@ -95,6 +96,18 @@ def test_alignment_moves_a_signal_by_fractions_of_a_sample(shift: float) -> None
     x = np.sin(2 * np.pi * 0.02 * n + 0.1)
     wanted = np.sin(2 * np.pi * 0.02 * (n + shift) + 0.1)
     assert np.abs(d.align(x, shift) - wanted)[60:-60].max() < 1e-4
+
+
+@pytest.mark.parametrize("corner", [np.inf, 20.0])
+def test_noise_is_measured_in_the_octave_where_it_is_strongest(corner: float) -> None:
+    """White noise, and noise behind a pole; the motion is a thousand times as large."""
+    rate, pole = 500.0, np.exp(-2 * np.pi * corner / 500.0)
+    white = 1e-5 * np.random.default_rng(4).standard_normal(20_000)
+    noise = lfilter([1 - pole], [1, -pole], white)  # of gain 1 at low frequencies
+    motion = 0.01 * np.sin(2 * np.pi * 1.3 * np.arange(20_000) / rate)
+    power = noise_power(*power_spectrum(motion + noise, rate), 15.0)
+    at_octave = 1.0 / (1.0 + (21.0 / corner) ** 2)  # of the pole, at the octave's middle
+    assert power == pytest.approx(1e-10 * at_octave, rel=0.12)
 
 
 def test_a_record_shorter_than_the_filter_is_refused() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from analysis.regression.rows import default_filtering
 from analysis.regression.settings import REGRESSION
@@ -108,13 +109,15 @@ def test_records_that_are_analysed_together_pass_alike_filters(rig: Rig, tmp_pat
     )
 
 
+@pytest.mark.parametrize("corner", [np.inf, 100.0, 20.0])
 @pytest.mark.parametrize("times", [1.0, 30.0])
-def test_noise_of_the_sensor_is_no_motion(rig: Rig, times: float) -> None:
-    """Differentiated, the noise of a quiet record has more power than its motion."""
+def test_noise_of_the_sensor_is_no_motion(rig: Rig, times: float, corner: float) -> None:
+    """Differentiated, a quiet record's noise, white or filtered, has more power than its motion."""
     channels = moved(rig, 0.3, 1.3)
-    noise = times * rig.sensors.piston.noise
-    added = noise * np.random.default_rng(5).standard_normal(len(channels["piston_1"]))
-    noisy = {**channels, "piston_1": channels["piston_1"] + added}
+    white = np.random.default_rng(5).standard_normal(len(channels["piston_1"]))
+    pole = np.exp(-2 * np.pi * corner / RATE)
+    noise = lfilter([np.sqrt(1 - pole**2)], [1, -pole], white) * rig.sensors.piston.noise
+    noisy = {**channels, "piston_1": channels["piston_1"] + times * noise}
     assert motion_bandwidth(rig, (2,), noisy, RATE) == pytest.approx(1.3, abs=0.2)
 
 

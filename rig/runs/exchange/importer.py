@@ -15,6 +15,7 @@ from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import BANDWIDTH, bridged, common_bandwidth
 from rig.model.rig import Rig
+from rig.model.spectra import noise_power, power_spectrum
 from rig.runs import archive, store
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.dead_sensors import silent_sensors
@@ -166,14 +167,9 @@ def motion_bandwidth(
 
 
 def _bandwidth(position: Array, rate: float) -> float:
-    """Return the bandwidth [Hz] of a position (n,), by a periodogram with Hann's window.
-
-    Lines that noise may cause do not count. White noise is measured in the upper half of the
-    spectrum, where its power is exponentially distributed about the mean, median / ln 2.
-    """
-    power = np.abs(np.fft.rfft((position - np.mean(position)) * np.hanning(len(position)))) ** 2
-    f = np.fft.rfftfreq(len(position), 1.0 / rate)
-    noise = float(np.median(power[f > 0.25 * rate])) / np.log(2.0)
+    """Return the bandwidth [Hz] of a position (n,); lines that noise may cause do not count."""
+    f, power = power_spectrum(position, rate)
+    noise = noise_power(f, power, EXCHANGE.highest_bandwidth)
     inside = f <= EXCHANGE.highest_bandwidth
     seen = np.where(power > EXCHANGE.above_noise * noise, power, 0.0)[inside]
     if not seen.any():

@@ -25,7 +25,7 @@ class ExchangeSettings:
     # that states one.
     velocity_share: float = 0.998
     above_noise: float = 10.0
-    highest_bandwidth: float = 30.0
+    highest_bandwidth: float = 15.0
     bandwidth_seconds: float = 6.0
 
     # Clipped, stuck and constant sensors.
