@@ -60,10 +60,6 @@ from analysis.trace.settings import TRACE
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
-# Other estimators replace columns where noise in them matters; the trace compares residuals of
-# least squares only, before and after alike.
-ESTIMATOR = "ls"
-
 
 @dataclass(frozen=True)
 class FittedModel:
@@ -212,7 +208,7 @@ def identified(
     terms: Sequence[Used],
     changed: Callable[[Filtering], Filtering] = lambda filtering: filtering,
 ) -> Identification:
-    """Return a model's identified parameters.
+    """Return a model's parameters as `bramah identify` estimates them.
 
     Temperature and spool path are left out of `terms`: the estimator fits them itself. `changed`
     returns the filters of a record in place of the default ones.
@@ -223,7 +219,7 @@ def identified(
     def filtering(record: Record) -> Filtering:
         return changed(default_filtering(record))
 
-    return coupled(runs, fitted_terms, filtering, estimator=ESTIMATOR)
+    return coupled(runs, fitted_terms, filtering)
 
 
 def _with_further_errors(effect: JudgedEffect, *errors: Mapping[str, float]) -> JudgedEffect:

@@ -24,6 +24,7 @@ from analysis.regression import noise
 from analysis.regression.solve import MOSTLY_NOISE, Solution, solve
 from analysis.terms import baseline
 from analysis.terms.base import Used
+from analysis.trace.engine import trace
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from tests.analysis import small_bench as bench
@@ -101,6 +102,14 @@ def test_the_interval_of_one_repeat_holds_the_bias_that_its_noise_predicts(
     before, after = none.estimates["M2"], found.estimates["M2"]
     added = np.sqrt(after.std**2 - before.std**2)
     assert added / after.value == pytest.approx(0.01 * float(said), rel=0.05)
+
+
+def test_a_trace_states_the_parameters_of_identify(noisy_run: Run, both_run: Run) -> None:
+    """Both tables of one user's records, whose noise biases least squares."""
+    alone = identify([noisy_run])
+    assert alone.model.provenance["estimator"] == "iv"
+    traced = trace([noisy_run], [both_run], effects=[], free_forms=False, look_ahead=False)
+    assert traced.model_before.parameters["M2"].value == alone.estimates["M2"].value
 
 
 def test_repeats_of_unequal_length_without_a_period_are_as_good_as_others(noisy_run: Run) -> None:
