@@ -26,6 +26,7 @@ from rig.model import channels as ch
 from rig.model.parts import AnySensor, converter_step
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
+from rig.model.spectra import power_spectrum
 
 _BANDS = 8  # of the upper half of a spectrum
 _LEAST_SAMPLES = 512  # for 16 frequencies in each band
@@ -89,13 +90,12 @@ def white_variance(x: Array) -> float:
     """Return the variance of white noise that samples x (n,) hold at most, by their upper spectrum.
 
     It is half the sample rate times the smallest of the mean power densities of `_BANDS` bands
-    between half the Nyquist frequency and that frequency (Welch 1967; a Hann window keeps the
-    motion out of them). Noise that a filter has cut off there counts for less.
+    between half the Nyquist frequency and that frequency. Noise that a filter has cut off there
+    counts for less.
     """
     if len(x) < _LEAST_SAMPLES:
         return 0.0
-    window = np.hanning(len(x))
-    power = np.abs(np.fft.rfft((x - x.mean()) * window)) ** 2 / np.sum(window**2)
+    _, power = power_spectrum(x, 1.0)
     bands = np.array_split(power[len(power) // 2 : -1], _BANDS)
     return float(min(band.mean() for band in bands))
 

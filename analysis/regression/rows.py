@@ -22,6 +22,7 @@ from analysis.signals.convolution import decimated
 from analysis.signals.filters import (
     FirSmoother,
     Smoother,
+    band_filter,
     butterworth,
     channel_filter,
     moving_average,
@@ -113,14 +114,25 @@ def mean_rows(repeats: Sequence[Mapping[str, Rows]]) -> dict[str, Rows]:
 
 def default_filtering(record: Record) -> Filtering:
     """Return the default filters, adapted to the record's excitation."""
-    rate, cutoff = record.sample_rate, REGRESSION.row_cutoff
-    if record.period and record.lines:
-        cutoff = lines_cutoff(record)
-    elif ch.channel(ch.POSITION, 1) in record.channels:
-        cutoff = REGRESSION.row_cutoff_electric
-    elif record.bandwidth is not None:
-        cutoff = _cutoff(record.bandwidth, REGRESSION.slow_bandwidth, cutoff)
+    rate, cutoff = record.sample_rate, rows_cutoff(record)
     return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
+
+
+def filtering_above_rows(record: Record, filtering: Filtering) -> Filtering:
+    """Return filters of rows that pass the octave above the default filter of rows."""
+    rows = band_filter(record.sample_rate, REGRESSION.octave_above * rows_cutoff(record))
+    return replace(filtering, rows=rows)
+
+
+def rows_cutoff(record: Record) -> float:
+    """Return the cutoff [Hz] of the default filter of rows, adapted to the record's excitation."""
+    if record.period and record.lines:
+        return lines_cutoff(record)
+    if ch.channel(ch.POSITION, 1) in record.channels:
+        return REGRESSION.row_cutoff_electric
+    if record.bandwidth is not None:
+        return _cutoff(record.bandwidth, REGRESSION.slow_bandwidth, REGRESSION.row_cutoff)
+    return REGRESSION.row_cutoff
 
 
 def lines_cutoff(record: Record) -> float:

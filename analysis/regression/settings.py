@@ -50,6 +50,9 @@ class RegressionSettings:
     # Ratio of white noise in a record to a sensor's stated noise, from which the former counts:
     # below, chance and the upper end of a motion's spectrum may make the difference.
     stated_ratio: float = 1.5
+    # Lower end of the octave in which rows show their noise, over the row filter's cutoff: that
+    # filter stops there.
+    octave_above: float = 1.6
     # Samples between rows used for identifiability: neighbouring rows are nearly equal.
     sample_step: int = 5
     # Coefficients of a base parameter: left out below this share of the largest one; written as a

@@ -181,6 +181,18 @@ def row_filter(rate: float, cutoff: float) -> FirSmoother:
     return windowed_sinc(rate, cutoff, 0.6 * cutoff)
 
 
+def band_filter(rate: float, cutoff: float) -> FirSmoother:
+    """Return a filter of whole rows that passes about an octave above `cutoff` [Hz].
+
+    It is the difference of the low-passes of twice `cutoff` and of `cutoff`.
+    """
+    low, wide = row_filter(rate, cutoff), row_filter(rate, 2.0 * cutoff)
+    pad = low.reach - wide.reach
+    return FirSmoother(
+        f"octave above {cutoff:g} Hz", np.pad(wide.taps, ((0, 0), (pad, pad))) - low.taps
+    )
+
+
 def direction(v: Array, rate: float) -> Array:
     """Return the sign (n,) of a velocity (n,) without noise above `SIGNALS.direction_cutoff`.
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
-from analysis.trace.clues.dependence import clues_to
+from analysis.trace.clues.dependence import BY_BALANCE, clues_to
 from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.conditioned_record import model_rows
-from analysis.trace.data.noise_floor import NEIGHBOURS, STATED, floors
+from analysis.trace.data.noise_floor import ABOVE, NEIGHBOURS, STATED, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
@@ -30,6 +30,8 @@ from analysis.trace.search.forward_search import search
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH
+
+Array = NDArray[np.float64]
 
 ONLY_HELD_OUT_MISSED = (
     "the training records are met to within the noise, the held-out ones are not: train on "
@@ -297,28 +299,36 @@ class Judge:
 def unstated_noise(finding: Finding) -> dict[str, float]:
     """Return what `finding` leaves over the stated noise, by equation, where nothing repeats.
 
-    The stated noise may lack what a sensor has at low frequencies. Equations whose noise a step
-    shows keep their floors. Empty where each has one, where more than `DATA.unstated_ratio` times
-    the stated noise is left, where a variable of the records removes a part of that from held-out
-    records, or an effect that the gates refuse.
+    Equations whose noise a step shows by repeats, periods or neighbouring states keep their floors.
+    Empty where each has one, where more than `DATA.unstated_ratio` floors is left, where a variable
+    of the records removes a part of that from held-out records, or an effect that the gates refuse.
     """
     data = finding.rows.train
-    measured = {f.equation for f in data.floors if f.source != STATED}
+    measured = {f.equation for f in data.floors if f.source not in (STATED, ABOVE)}
     refused = any(map(gates.removes, gates.refused_effects(finding.effects)))
     if finding.verdict != UNEXPLAINED or refused:
         return {}
     winner = _with_tied_effects(finding)
-    squares: dict[str, list[NDArray[np.float64]]] = {}
-    for s in data.segments:  # whitened by the stated noise
+    over_stated = {(f.group, f.equation): f.noise / f.stated for f in data.floors}
+    left: dict[str, list[Array]] = {}
+    stated: dict[str, list[Array]] = {}
+    for s in data.segments:
         if s.equation not in measured:
-            squares.setdefault(s.equation, []).append(winner.fit.residual[s.where] ** 2)
-    ratio = {e: float(np.sqrt(np.mean(np.concatenate(parts)))) for e, parts in squares.items()}
-    if not ratio or max(ratio.values()) > DATA.unstated_ratio:
+            residual = winner.fit.residual[s.where]
+            left.setdefault(s.equation, []).append(residual)
+            stated.setdefault(s.equation, []).append(residual * over_stated[s.group, s.equation])
+    if not left or max(map(_rms, left.values())) > DATA.unstated_ratio:
         return {}
     clues, formulas = clues_to(data, finding.rows.choosing, winner, ())
-    if formulas or any(m.share > DATA.unstated_clue for m in clues):
+    # Noise of a variable that the balance gives is in the residual as it is in the variable.
+    causes = [clue for clue in clues if not clue.words.endswith(BY_BALANCE)]
+    if formulas or any(clue.share > DATA.unstated_clue for clue in causes):
         return {}
-    return {name: max(1.0, value) for name, value in ratio.items()}
+    return {name: max(1.0, _rms(parts)) for name, parts in stated.items()}
+
+
+def _rms(parts: Sequence[Array]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def noise_beside_effects(finding: Finding) -> dict[str, float]:

@@ -12,7 +12,14 @@ from analysis.effects.free_flows import BulkModulusCurve
 from analysis.effects.free_forces import FrictionCurve, PositionForce
 from analysis.simulation.model import Model
 from analysis.terms.base import Used, equation
-from analysis.trace.data.noise_floor import NEIGHBOURS, OTHER_STEPS, PERIODS, STATED, UNSTATED
+from analysis.trace.data.noise_floor import (
+    ABOVE,
+    NEIGHBOURS,
+    OTHER_STEPS,
+    PERIODS,
+    STATED,
+    UNSTATED,
+)
 from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.data.trace_rows import WHY_MASKED
 from analysis.trace.finding import Remainder
@@ -45,6 +52,13 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
             f"one repeat of {single} and no whole periods to compare: the noise floor is "
             "the rig file's stated sensor noise; noise above that value would be taken "
             "for model error, so the evidence for every name is weaker"
+        )
+    if single := steps(ABOVE, train_data):
+        most = max(train_data.floors, key=lambda f: f.noise / f.stated)
+        out.append(
+            f"one repeat of {single} and no whole periods to compare: the noise floor is what the "
+            f"octave above the rows' frequencies holds, {plain(most.noise / most.stated, 2)} times "
+            f"the stated sensor noise in {most.equation}; a repeat would measure it"
         )
     if steps(UNSTATED, train_data):
         most = max(train_data.floors, key=lambda f: f.noise / f.stated)

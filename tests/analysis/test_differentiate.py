@@ -98,6 +98,14 @@ def test_alignment_moves_a_signal_by_fractions_of_a_sample(shift: float) -> None
     assert np.abs(d.align(x, shift) - wanted)[60:-60].max() < 1e-4
 
 
+def test_the_octave_above_a_frequency_is_passed_and_nothing_else() -> None:
+    taps = d.band_filter(1000.0, 20.0).taps[0]
+    frequency = np.fft.rfftfreq(1 << 14, 1e-3)
+    gain = np.abs(np.fft.rfft(taps, 1 << 14))
+    assert gain[(frequency > 33.0) & (frequency < 39.0)] == pytest.approx(1.0, abs=1e-3)
+    assert gain[(frequency < 19.0) | (frequency > 65.0)] == pytest.approx(0.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("corner", [np.inf, 20.0])
 def test_noise_is_measured_in_the_octave_where_it_is_strongest(corner: float) -> None:
     """White noise, and noise behind a pole; the motion is a thousand times as large."""

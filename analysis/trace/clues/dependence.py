@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 
 # Variables that the equation's balance makes follow any missing term: they do not show the cause.
 FOLLOW_BY_BALANCE = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
+BY_BALANCE = " by balance"  # ends the words of a clue of that kind
 
 
 def clues_to(
@@ -133,7 +134,7 @@ def _dependence_of(
     name: str, factor: str, share: float, equation: str, independence: float
 ) -> Dependence:  # fmt: skip
     if not factor:
-        words = f"{name} by balance" if independence == CLUES.by_balance_weight else ""
+        words = name + BY_BALANCE if independence == CLUES.by_balance_weight else ""
         return Dependence(name, share, equation, words=words)
     by = factors(equation)[factor]
     if not name:

@@ -7,8 +7,9 @@ there are no periods either, but the motion comes back to states x where it was 
  noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
 (a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
 rig's stated sensor noise, propagated to the same rows, is used, times the ratio of measured to
-stated noise in other steps: in repeats and periods, else between neighbours. Without these the
-floor lacks every noise that the rig file does not state, and a note says so.
+stated noise in other steps: in repeats and periods, else between neighbours. Without these that
+ratio is taken from the octave above the rows' band, where a model's residual is mostly noise:
+effects of the motion fall with frequency, and the noise of a differentiated channel grows.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
@@ -33,7 +34,7 @@ from analysis.regression.noise import (
     with_added_noise,
     with_added_rounding,
 )
-from analysis.regression.rows import Rows, in_common
+from analysis.regression.rows import Rows, filtering_above_rows, in_common
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.settings import DATA
@@ -45,6 +46,7 @@ Array = NDArray[np.float64]
 
 REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
 OTHER_STEPS = "noise of other steps"
+ABOVE = "frequencies above the rows'"
 UNSTATED = "a residual that follows nothing"
 Group = tuple[int, str]
 NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
@@ -116,7 +118,33 @@ def floors(
     scale = _measured_over_stated([*out, *others], (NEIGHBOURS,))
     scale |= _measured_over_stated([*out, *others], (REPEATS, PERIODS))
     scaled = (_scaled(_without_aperiodic(f, by_repeats), scale, OTHER_STEPS) for f in out)
-    return [_by_ratio(floor, noise_ratio or {}) for floor in scaled]
+    split = [_by_ratio(floor, noise_ratio or {}) for floor in scaled]
+    if coarse:  # rounding errors of a slow signal have another spectrum than noise
+        return split
+    above = {
+        group: noise_above_rows(rig, terms, members[groups[group][0]], beta)
+        for group in {f.group for f in split if f.source == STATED and f.total > 0.0}
+    }
+    return [_scaled(floor, above.get(floor.group, {}), ABOVE) for floor in split]
+
+
+def noise_above_rows(
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, beta: Mapping[str, float]
+) -> dict[str, float]:
+    """Return by equation the ratio of noise to the stated one in the octave above the rows'.
+
+    Ratios below 1 are left out.
+    """
+    filtering = filtering_above_rows(conditioned.record, conditioned.filtering)
+    above = replace(conditioned, filtering=filtering)
+    rows = model_rows(rig, terms, above)
+    stated = stated_noise(rig, terms, above, rows, beta)
+    ratios = {
+        e: float(np.sqrt(np.mean(row_residual(r, beta) ** 2))) / stated[e]
+        for e, r in rows.items()
+        if stated[e] > NO_ROWS
+    }
+    return {e: ratio for e, ratio in ratios.items() if ratio > 1.0}
 
 
 def _floor(

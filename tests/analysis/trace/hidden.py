@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -72,6 +73,24 @@ def understated(rig: Rig, times: float = 1.5) -> Rig:
         for name, sensor in rig.sensors if hasattr(sensor, "noise")
     }  # fmt: skip
     return rig.model_copy(update={"sensors": rig.sensors.model_copy(update=quiet)})
+
+
+def with_filtered_noise(run: Run, times: float, corner: float = 60.0) -> Run:
+    """Return a run with `times` the stated noise behind a pole at `corner` [Hz], periods unknown.
+
+    It is added to pistons and chamber pressures.
+    """
+    rng, records = np.random.default_rng(3), []
+    for record in run.records:
+        channels = dict(record.channels)
+        pole = np.exp(-2 * np.pi * corner / record.sample_rate)
+        for name, x in channels.items():
+            if name.startswith(("piston", "cap", "rod")):
+                size = times * run.rig.sensors.of(name.rsplit("_", 1)[0]).noise
+                white = rng.standard_normal(len(x))
+                channels[name] = x + size * lfilter([np.sqrt(1 - pole**2)], [1, -pole], white)
+        records.append(replace(record, channels=channels, period=0, lines=()))
+    return replace(run, records=tuple(records))
 
 
 def hardening(run: Run, force_per_cubed: float) -> Run:

@@ -25,6 +25,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.noise_floor import (
+    ABOVE,
     NEIGHBOURS,
     OTHER_STEPS,
     PERIODS,
@@ -44,6 +45,7 @@ from rig.model.rig import Rig
 from rig.model.wire.codes import decode_input, encode_input
 from rig.runs.rigs import load_rig
 from tests.analysis.carriage import Carriage, moves, record
+from tests.analysis.trace.hidden import pair_of_runs, with_filtered_noise
 
 
 def floor_over_stated(rig: Rig, noise: float) -> dict[str, float]:
@@ -135,9 +137,28 @@ def floor_of(run: Run) -> Floor:
 def test_a_motion_that_comes_back_shows_noise_that_the_rig_file_does_not_state() -> None:
     """Nobody says that the reference repeats; its states do."""
     once, thrice, known = (floor_of(to_and_fro(*n)) for n in ((1,), (3,), (1, 4)))
-    assert (once.source, thrice.source, known.source) == (STATED, NEIGHBOURS, REPEATS)
-    assert once.noise < 0.3 * known.noise
+    assert (once.source, thrice.source, known.source) == (ABOVE, NEIGHBOURS, REPEATS)
+    assert once.noise < 0.3 * known.noise  # above the rows, the encoder's noise hides the drive's
     assert thrice.noise == pytest.approx(known.noise, rel=0.35)
+
+
+def test_rows_show_filtered_noise_above_the_motion_beside_an_effect(rig: Rig) -> None:
+    """Four times the stated noise, and a leak that leaves twice as much in the flows."""
+
+    def floors_with(leak: float) -> dict[str, Floor]:
+        run = pair_of_runs(rig, c_internal=leak)[0]
+        noisy = with_filtered_noise(replace(run, records=run.records[:1]), 4.0)
+        terms = tuple(map(Used, baseline_of(rig)))
+        split = regression_data(rig, terms, conditioned_records(rig, [noisy])).floors
+        return {floor.equation: floor for floor in split}
+
+    sound, leaking = floors_with(0.0), floors_with(2e-12)
+    for equation, floor in sound.items():
+        assert floor.source == ABOVE
+        assert floor.noise > 3.0 * floor.stated
+        assert floor.noise == pytest.approx(floor.total, rel=0.2)  # nothing but noise is left
+        assert leaking[equation].noise == pytest.approx(floor.noise, rel=0.05)
+    assert leaking["flow_cap_2"].total > 2.0 * sound["flow_cap_2"].total
 
 
 @pytest.mark.parametrize("in_motion", [(), (0,)])
@@ -174,9 +195,9 @@ def test_noise_that_repeats_of_one_step_show_holds_for_a_step_taken_once() -> No
         assert floor.source == OTHER_STEPS
         assert floor.noise == pytest.approx(known.noise, rel=0.1)
     assert together["moves"].source == REPEATS
-    assert floors_of(other)["other"].source == STATED
     loud = floor_of(to_and_fro(1, 4))  # so loud that it is no noise of the sensors
-    assert floors_of(other, others=[loud])["other"].source == STATED
+    for unlike in ([], [loud]):
+        assert floors_of(other, others=unlike)["other"].source == ABOVE
 
 
 def test_noise_that_a_motion_shows_by_coming_back_holds_for_another_step() -> None:
