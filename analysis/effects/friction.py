@@ -153,7 +153,7 @@ class Friction(Effect):
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:
         """Return the path s_w (n,) [m] of the contact (`stiffened_path`)."""
         i = self.joint
-        return stiffened_path(signals.s[:, i], signals.sd[:, i], self.contact_of(shape)[1])
+        return stiffened_path(signals.path(i), signals.sd[:, i], self.contact_of(shape)[1])
 
     def tolerance(self, shape: Sequence[float]) -> float:
         """Return a finer tolerance without memory: with a coarser one, creep at rest is noise."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals.filters import Smoother, align, channel_filter
+from analysis.signals.filters import Smoother, align, channel_filter, path_cutoff, row_filter
 from analysis.signals.locks import held_positions, motion_bands, within_band
 from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
@@ -37,7 +37,8 @@ class Signals:
     no row may use it. `bands` (N,) [Hz] are those in which the joints move, 0 for one that stands
     still (see `analysis.signals.locks.motion_bands`). `weight` (n, N), if given, weights each
     joint's torque balance (see `without_rests`). `loaded` states whether the last link carries a
-    load that it does not carry in other records; None: not known.
+    load that it does not carry in other records; None: not known. `path_cutoffs` (N,) [Hz], if
+    given, are those of `analysis.signals.filters.path_cutoff`.
     """
 
     rate: float
@@ -65,6 +66,14 @@ class Signals:
     bands: Array
     weight: Array | None = None
     loaded: bool | None = None
+    path_cutoffs: Array | None = None
+
+    def path(self, joint: int) -> Array:
+        """Return the path s (n,) of a joint (0-based) along which its friction reverses."""
+        s = self.s[:, joint]
+        if self.path_cutoffs is None or not np.isfinite(self.path_cutoffs[joint]):
+            return s
+        return row_filter(self.rate, float(self.path_cutoffs[joint])).apply(s)
 
     @property
     def joints(self) -> int:
@@ -219,7 +228,17 @@ def condition(
         ),
         bands=bands,
         loaded=record.loaded,
+        path_cutoffs=_path_cutoffs(rig, record.sample_rate, channels, sd),
     )  # fmt: skip
+
+
+def _path_cutoffs(rig: Rig, rate: float, channels: Mapping[str, Array], sd: Array) -> Array:
+    """Return `path_cutoff` (N,) [Hz] of joints of speeds (n, N), infinite for one at rest."""
+    measured = [channels.get(ch.channel(rig.position_kind, i + 1)) for i in range(sd.shape[1])]
+    return np.array([
+        np.inf if s is None or not sd[:, i].any() else path_cutoff(s, sd[:, i], rate)
+        for i, s in enumerate(measured)
+    ])  # fmt: skip
 
 
 def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from analysis.signals.convolution import convolved, convolved_rows, decimated
 from analysis.signals.settings import SIGNALS
 from rig.model.parse import InputError
+from rig.model.spectra import noise_power, power_spectrum
 
 Array = NDArray[np.float64]
 
@@ -199,6 +200,28 @@ def direction(v: Array, rate: float) -> Array:
     The mean of |v + noise| exceeds |v|, that of (v + noise) times this sign does not.
     """
     return np.asarray(np.sign(row_filter(rate, SIGNALS.direction_cutoff).apply(v)))
+
+
+def path_cutoff(s: Array, v: Array, rate: float) -> float:
+    """Return the pass band edge [Hz] of a joint's path along which its friction reverses.
+
+    `s` (n,) is the measured path and `v` (n,) its filtered speed. Noise of the power density S
+    [m^2/Hz] in s has the speed 2 pi sqrt(S c^3 / 3) below c [Hz] (`SIGNALS.path_noise`). Infinite
+    where the path needs no filter, and where it is too short for the narrowest one.
+    """
+    if len(s) <= row_filter(rate, min(SIGNALS.path_cutoffs)).reach:
+        return math.inf
+    density = 2.0 * noise_power(*power_spectrum(s, rate), SIGNALS.path_noise_from) / rate
+
+    def noise(edge: float) -> float:
+        return 2.0 * math.pi * math.sqrt(density * edge**3 / 3.0)
+
+    widest = SIGNALS.channel_cutoff
+    speed = math.sqrt(max(float(np.mean(v**2)) - noise(widest) ** 2, 0.0))
+    for edge in (widest, *SIGNALS.path_cutoffs):
+        if noise(edge) <= SIGNALS.path_noise * speed:
+            break
+    return math.inf if edge == widest else edge
 
 
 def row_step(rate: float, cutoff: float) -> int:

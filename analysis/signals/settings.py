@@ -19,6 +19,14 @@ class SignalSettings:
     # band makes |v| too large about each reversal: 5 mm/s of it beside slopes of 91 and 0 kN s/m
     # made a weight 0.5 % too small.
     direction_cutoff: float = 20.0
+    # Pass band edges [Hz] of a path along which dry friction reverses. The widest is taken that
+    # leaves noise of at most `path_noise` of the joint's rms speed, none where all leave less:
+    # noise reverses the contact at rest (with 14 um above 40 Hz the friction left 3 noise floors
+    # and was 13 % too large), and a narrow filter rounds the path at reversals (10 Hz made a
+    # presliding of 0.04 mm 15 times too large). Noise is measured from `path_noise_from` [Hz] on.
+    path_cutoffs: tuple[float, ...] = (40.0, 28.0, 20.0, 14.0, 10.0)
+    path_noise: float = 0.03
+    path_noise_from: float = 40.0
     # Half-width [samples] of the kernel that interpolates a multiplexed channel.
     align_half_width: int = 16
     # A locked joint moves where the rms of its acceleration within the widest of `moving_bands`

@@ -10,6 +10,7 @@ from scipy.signal import convolve, lfilter
 
 from analysis.signals import filters as d
 from analysis.signals.convolution import convolved, decimated, same_convolved
+from analysis.signals.settings import SIGNALS
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.model.spectra import noise_power, power_spectrum
@@ -116,6 +117,24 @@ def test_noise_is_measured_in_the_octave_where_it_is_strongest(corner: float) ->
     power = noise_power(*power_spectrum(motion + noise, rate), 15.0)
     at_octave = 1.0 / (1.0 + (21.0 / corner) ** 2)  # of the pole, at the octave's middle
     assert power == pytest.approx(1e-10 * at_octave, rel=0.12)
+
+
+def test_a_path_is_filtered_until_its_noise_is_slow() -> None:
+    """The more noise, the narrower; what is left is as slow as the settings say."""
+    rate, rng = 1000.0, np.random.default_rng(2)
+    t = np.arange(20_000) / rate
+    motion, speed = 0.02 * np.sin(2 * np.pi * 0.7 * t), 0.02 * 2 * np.pi * 0.7 * np.cos(4.4 * t)
+    edges = []
+    for size in (0.0, 5e-6, 3e-5, 1e-4, 3e-4):
+        noise = size * rng.standard_normal(len(t))
+        edges.append(d.path_cutoff(motion + noise, speed, rate))
+        if np.isfinite(edges[-1]) and edges[-1] > min(SIGNALS.path_cutoffs):
+            left = d.row_filter(rate, edges[-1]).apply(noise, 1)
+            assert np.std(left) < 1.6 * SIGNALS.path_noise * np.sqrt(np.mean(speed**2))
+    assert edges[0] == edges[1] == np.inf
+    assert edges == sorted(edges, reverse=True)
+    assert edges[-1] == min(SIGNALS.path_cutoffs)
+    assert d.path_cutoff((motion + noise)[:300], speed[:300], rate) == np.inf  # too short for it
 
 
 def test_a_record_shorter_than_the_filter_is_refused() -> None:

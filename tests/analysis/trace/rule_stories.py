@@ -454,6 +454,14 @@ def noise_that_falls_with_frequency_is_noise_where_nothing_repeats(b: Benches) -
         assert result.verdict == verdict
 
 
+def noise_of_a_position_leaves_a_level_as_it_is(b: Benches) -> None:
+    """It moves the contact to and fro at rest, as long as its path is not filtered."""
+    runs = [with_filtered_noise(run, 10.0, 300.0) for run in b.runs(Fc=60.0)]
+    (found,) = b.traced((runs[0], runs[1]), "coulomb_friction", "base_inclination").effects
+    low, high = found.parameters["Fc2"].ci95
+    assert low < 60.0 < high < 70.0
+
+
 def noise_of_torque_rows(_: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
     """Return the rms of the residual of torque rows, as if neighbouring states showed it."""
     return float(np.sqrt(np.mean(residual**2))) if rows.equation.startswith("torque") else None
@@ -745,6 +753,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_a_cubic_spring_adds_is_no_error_of_an_offsets_form, ("exact forms",)),
     (noise_above_the_measured_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (noise_that_falls_with_frequency_is_noise_where_nothing_repeats, ("noise above the rows",)),
+    (noise_of_a_position_leaves_a_level_as_it_is, ("filtered path",)),
     (thinner_oil_on_the_held_out_day_is_no_effect, ("oil of another day",)),
     (a_clean_bench_in_a_loop_that_oscillates_is_clean, ("repeats that differ",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),

@@ -91,7 +91,7 @@ def test_friction_is_as_uncertain_as_a_breakaway_that_noise_hides(rig: Rig) -> N
     """The level takes up most of the breakaway, and viscous friction the fall behind it."""
     level = 24.0
     runs = pair_of_runs(
-        rig, Hidden(level, level, breakaway=8.0, stribeck=0.05), repeats=1, noise=4.0
+        rig, Hidden(level, level, breakaway=6.0, stribeck=0.05), repeats=1, noise=4.0
     )
     alone, beside = (
         traced(rig, runs, *names)

@@ -20,6 +20,7 @@ from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.supply import LineDrop
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
+from analysis.signals.settings import SIGNALS
 from analysis.trace import engine, finding, fitted_model, free_forms, in_motion, judging
 from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import alternatives, gates, held_out, inference, rivals
@@ -228,6 +229,8 @@ RULES: Final = (
          (setting("viscosity_change", 0.0), setting("bulk_change", 0.0))),
     Rule("unstated noise", "where nothing repeats, noise is at most that above the rows",
          ((engine, "unstated_noise", lambda *_: {}),)),
+    Rule("filtered path", "friction reverses along the path as it is measured, noise included",
+         ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
          ((noise_floor, "noise_above_rows", lambda *_: {}),)),
     Rule("noise beside effects",
