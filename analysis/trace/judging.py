@@ -225,7 +225,8 @@ class Judge:
     ) -> tuple[tuple[JudgedEffect, ...], tuple[JudgedEffect, ...], Hypothesis]:
         """Return the effects that pass every gate together, the refused ones, the set of the first.
 
-        An effect may pass beside others and fail without them: a reduced set is judged again.
+        An effect may pass beside others and fail without them, or fail since another one of the set
+        is unphysical: that one is left out first, and a reduced set is judged again.
         """
         refused: tuple[JudgedEffect, ...] = ()
         while winner.effects:
@@ -234,10 +235,14 @@ class Judge:
             failed = [used for used, f in judged.items() if not gates.passes_gates(f)]
             if not failed:
                 return effects, refused, winner
-            dropped = self._least_needed(winner, failed)
+            dropped = self._least_needed(winner, self._unphysical_of(winner, failed) or failed)
             refused += tuple(judged[used] for used in dropped)
             winner = self.hypotheses.refined([u for u in winner.effects if u not in dropped])
         return (), refused, winner
+
+    def _unphysical_of(self, winner: Hypothesis, failed: Sequence[Used]) -> list[Used]:
+        """Return the failed effects that are themselves unphysical; the others may be right."""
+        return [used for used in failed if self.hypotheses.effect_problem(winner, used)]
 
     def _least_needed(self, winner: Hypothesis, failed: Sequence[Used]) -> list[Used]:
         """Return the failed effects to leave out: of those of one family at one place, one.

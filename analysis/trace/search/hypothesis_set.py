@@ -108,21 +108,25 @@ class HypothesisSet:
         The effect `first` is tested first, and its problem stated without its name. Shapes of the
         effects `may_be_at_bounds` (name, where) may lie at their bounds.
         """
-        rig = self.train_data.rig
-        values = hypothesis.fit.parameters(rig)
         for used in sorted(hypothesis.effects, key=lambda used: used is not first):
-            effect, terms = effect_in(used), hypothesis.fit.terms
+            effect = effect_in(used)
             for name in effect.excludes:
                 if (name, effect.where) in hypothesis.keys:
                     return f"{effect.name} and {name} exclude each other at one place"
-            problem = effect.problem(rig, values, used.shape)
-            problem = problem or effect.not_shown(rig, values, used.shape, terms, self._signals)
-            if effect.key not in may_be_at_bounds:
-                problem = problem or effect.outside(rig, used.shape)
-            if problem:
+            if problem := self.effect_problem(hypothesis, used, effect.key in may_be_at_bounds):
                 whose = f"of {effect.name} at {place_in_words(effect.where)}: "
                 return problem if used is first else whose + problem
-        return negative_body(rig, hypothesis.fit, self.empty.fit)
+        return negative_body(self.train_data.rig, hypothesis.fit, self.empty.fit)
+
+    def effect_problem(
+        self, hypothesis: Hypothesis, used: Used, may_be_at_bounds: bool = False
+    ) -> str:
+        """Return in words which number of one effect of a set is impossible ('' if none is)."""
+        rig, effect, terms = self.train_data.rig, effect_in(used), hypothesis.fit.terms
+        values = hypothesis.fit.parameters(rig)
+        problem = effect.problem(rig, values, used.shape)
+        problem = problem or effect.not_shown(rig, values, used.shape, terms, self._signals)
+        return problem or ("" if may_be_at_bounds else effect.outside(rig, used.shape))
 
     def refined(self, effects: Sequence[Used], rival: Hypothesis | None = None) -> Hypothesis:
         """Return the exact fit of a set of effects, computed once for its names and places.

@@ -43,8 +43,10 @@ from tests.analysis.trace.hidden import (
     hardening,
     misread,
     pair_of_runs,
+    piston_speed,
     pushed,
     with_filtered_noise,
+    with_force,
 )
 from tests.studies.foreign.bench import TRAIN, records_of, runs_of
 from tests.studies.foreign.cases import case_of
@@ -462,6 +464,19 @@ def noise_of_a_position_leaves_a_level_as_it_is(b: Benches) -> None:
     assert low < 60.0 < high < 70.0
 
 
+def a_leak_is_not_refused_for_a_friction_that_would_drive(b: Benches) -> None:
+    """Something pushes the piston on; a set with friction of a negative level is judged."""
+    train, held_out = (
+        with_force(run, lambda record: -15.0 * np.sign(piston_speed(record)))
+        for run in b.runs(c_internal=LEAK)
+    )
+    bench = gate_cases.searched(b.rig, train, held_out, "internal_leakage", "coulomb_friction")
+    pushed_on = bench.set_of("internal_leakage", "coulomb_friction")
+    assert bench.hypotheses.physical_problem(pushed_on)
+    found = bench.judge(np.random.default_rng(0)).apply_gates(pushed_on)
+    assert [e.name for e in found.named] == ["internal_leakage"]
+
+
 def noise_of_torque_rows(_: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
     """Return the rms of the residual of torque rows, as if neighbouring states showed it."""
     return float(np.sqrt(np.mean(residual**2))) if rows.equation.startswith("torque") else None
@@ -754,6 +769,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_above_the_measured_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (noise_that_falls_with_frequency_is_noise_where_nothing_repeats, ("noise above the rows",)),
     (noise_of_a_position_leaves_a_level_as_it_is, ("filtered path",)),
+    (a_leak_is_not_refused_for_a_friction_that_would_drive, ("unphysical companion",)),
     (thinner_oil_on_the_held_out_day_is_no_effect, ("oil of another day",)),
     (a_clean_bench_in_a_loop_that_oscillates_is_clean, ("repeats that differ",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),

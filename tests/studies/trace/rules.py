@@ -229,6 +229,8 @@ RULES: Final = (
          (setting("viscosity_change", 0.0), setting("bulk_change", 0.0))),
     Rule("unstated noise", "where nothing repeats, noise is at most that above the rows",
          ((engine, "unstated_noise", lambda *_: {}),)),
+    Rule("unphysical companion", "all effects of a set with an unphysical one are refused",
+         ((judging.Judge, "_unphysical_of", lambda *_: []),)),
     Rule("filtered path", "friction reverses along the path as it is measured, noise included",
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
