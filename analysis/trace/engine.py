@@ -39,6 +39,7 @@ from analysis.trace.notes import (
     evidence_notes,
     exact_geometry_notes,
     geometry_note,
+    narrower_rows_note,
     not_judged_notes,
     record_condition_notes,
     refitted_notes,
@@ -108,7 +109,8 @@ def trace(
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
-    result = _with_stated_rig(rig, _traced(records, options, progress or (lambda _: None)))
+    result = _traced(records, options, progress or (lambda _: None))
+    result = _with_stated_rig(rig, _traced_in_narrower_rows(records, options, result) or result)
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
     may_be_load &= all(used.term.name != Payload.name for used in known)
@@ -336,6 +338,27 @@ def _traced_within_tolerances(
             return None
     note = geometry_note(geometry, finding.named, explained)
     return replace(again, notes=(note, *again.notes))
+
+
+def _traced_in_narrower_rows(records: TraceRuns, options: _Options, result: Trace) -> Trace | None:
+    """Return an explanation in rows of lower frequencies where a result names nothing, else None.
+
+    Its effects must leave no more than noise in the judging rows of the measured bandwidth too.
+    """
+    width = records.bandwidth
+    if result.verdict != UNEXPLAINED or result.effects or width is None:
+        return None
+    narrower = TRACE.narrower_bandwidth * width
+    again = _traced(records.of_bandwidth(narrower), options, lambda _: None)
+    if again.verdict not in (EXPLAINED, CONFOUNDED):
+        return None
+    rows = trace_rows(records)
+    hypotheses = HypothesisSet(rows.train, [])
+    named = {(effect.name, effect.at) for effect in again.effects}
+    explained = hypotheses.refined([u for u in again.model_after.terms if u.term.key in named])
+    if judging_rows_above_band(rows.judging, hypotheses.empty, explained)[0]:
+        return None
+    return replace(again, notes=(narrower_rows_note(narrower, width), *again.notes))
 
 
 def _final_verdict(

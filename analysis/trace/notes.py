@@ -229,6 +229,15 @@ def geometry_note(geometry: Geometry, named: Sequence[JudgedEffect], explained: 
     )
 
 
+def narrower_rows_note(narrower: float, width: float) -> str:
+    """State the bandwidths [Hz] with and without which the effects are named."""
+    return (
+        f"the effects are named with rows for a motion up to {plain(narrower, 2)} Hz; in those for "
+        f"the measured bandwidth of {plain(width, 2)} Hz, which they explain to within the noise, "
+        "noise of the accelerations hides them (`bandwidth` of the manifest)"
+    )
+
+
 def not_judged_notes(
     remaining: Sequence[Remainder], noise: Mapping[str, float], after: Mapping[str, float]
 ) -> list[str]:

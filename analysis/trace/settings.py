@@ -82,6 +82,10 @@ class TraceSettings:
     noted_ratio: float = 1.3
     """Held-out rms of an equation over its noise floor, from which a note beside an explanation
     states what remains (contract)."""
+    narrower_bandwidth: float = 0.25
+    """Bandwidth of records whose residual is unexplained, over the measured one, with which they
+    are traced again: the noise of an acceleration grows with frequency and hides slow effects
+    (tuned: a spring left 1.6 noise floors in rows up to 14 Hz, 4.7 in those up to 6 Hz)."""
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
     motion_ratio: float = 0.65

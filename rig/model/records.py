@@ -191,7 +191,16 @@ def common_bandwidth(widths: Sequence[float | None]) -> float | None:
 
 def with_common_bandwidth(runs: Sequence[Run]) -> tuple[Run, ...]:
     """Return runs whose records state their `common_bandwidth`; those with excited lines none."""
-    width = common_bandwidth([r.bandwidth for run in runs for r in run.records if not r.lines])
+    return of_bandwidth(runs, bandwidth_of(runs))
+
+
+def bandwidth_of(runs: Sequence[Run]) -> float | None:
+    """Return the `common_bandwidth` [Hz] of the records without excited lines."""
+    return common_bandwidth([r.bandwidth for run in runs for r in run.records if not r.lines])
+
+
+def of_bandwidth(runs: Sequence[Run], width: float | None) -> tuple[Run, ...]:
+    """Return runs whose records without excited lines state a bandwidth [Hz], or none."""
     return tuple(
         replace(run, records=tuple(r if r.lines else _of_bandwidth(r, width) for r in run.records))
         for run in runs

@@ -24,7 +24,7 @@ from analysis.trace.data.set_aside import TraceRows, set_aside
 from analysis.trace.settings import DATA, TRACE
 from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Record, Run, bandwidth_of, of_bandwidth
 from rig.model.rig import Rig
 from rig.model.units import plain
 
@@ -53,13 +53,23 @@ class TraceRuns:
         """The runs that no parameter is fitted to."""
         return (*self.holdout, *self.judge)
 
+    @property
+    def bandwidth(self) -> float | None:
+        """Frequency [Hz] below which the motion of records without excited lines is."""
+        return bandwidth_of([*self.train, *self.unseen])
+
     def of_rig(self, rig: Rig) -> TraceRuns:
         """Return the runs as records of another rig."""
-        train, holdout, judge = (
-            tuple(replace(run, rig=rig) for run in runs)
-            for runs in (self.train, self.holdout, self.judge)
-        )
-        return replace(self, rig=rig, train=train, holdout=holdout, judge=judge)
+        changed = self._changed(lambda runs: tuple(replace(run, rig=rig) for run in runs))
+        return replace(changed, rig=rig)
+
+    def of_bandwidth(self, width: float) -> TraceRuns:
+        """Return the runs with another bandwidth [Hz], which the filter of their rows follows."""
+        return self._changed(lambda runs: of_bandwidth(runs, width))
+
+    def _changed(self, change: Callable[[tuple[Run, ...]], tuple[Run, ...]]) -> TraceRuns:
+        train, holdout, judge = map(change, (self.train, self.holdout, self.judge))
+        return replace(self, train=train, holdout=holdout, judge=judge)
 
 
 def trace_rows(

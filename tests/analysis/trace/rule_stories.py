@@ -19,19 +19,21 @@ from scipy.signal import lfilter
 from analysis.effects.valve import ValveDeadband
 from analysis.regression.rows import Rows
 from analysis.simulation.synthetic import multisine, synthetic_run
-from analysis.terms.base import Used
+from analysis.terms import baseline_of
+from analysis.terms.base import FAMILIES, Used
 from analysis.trace import engine
 from analysis.trace.data import noise_floor
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import ConditionedRecord, conditioned_records
 from analysis.trace.data.regression_data import regression_data
+from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.judge import gates, held_out, inference
-from analysis.trace.result import Trace
+from analysis.trace.result import UNEXPLAINED, Trace
 from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended, extended_in
 from rig.model.parse import InputError
-from rig.model.records import Run
+from rig.model.records import Run, of_bandwidth
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 from tests.analysis import carriage, small_bench
@@ -477,6 +479,28 @@ def a_leak_is_not_refused_for_a_friction_that_would_drive(b: Benches) -> None:
     assert [e.name for e in found.named] == ["internal_leakage"]
 
 
+def slow_rows_show_what_noise_of_the_acceleration_hides(b: Benches) -> None:
+    """Sensors eight times as noisy as stated hide a spring in rows up to 15 Hz."""
+    hidden = foreign_bench.Hidden(spring=6.0)
+    train, held_out = (
+        with_filtered_noise(replace(run, records=run.records[:1]), 8.0, 1e4)
+        for run in b.kept("soft", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    )
+    train, held_out = of_bandwidth((train, held_out), 10.0)
+    terms = tuple(map(Used, baseline_of(b.rig)))
+    records = TraceRuns(b.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
+    candidates = gate_cases.at_joint_2(b.rig, "joint_spring", "base_inclination")
+    options = engine._Options(candidates, 0, look_ahead=False, free_forms=False)
+    wide = engine._traced(records, options, lambda _: None)
+    assert wide.effects == ()
+    # Where the wide rows keep a little more than noise, the narrower ones are asked.
+    again = engine._traced_in_narrower_rows(records, options, replace(wide, verdict=UNEXPLAINED))
+    assert again is not None
+    named = {*again.tied_at, *((e.name, e.at) for e in again.effects)}
+    assert named == {("joint_spring", "joint 2"), ("base_inclination", "bench")}
+    assert "up to 2.5 Hz" in again.notes[0]
+
+
 def noise_of_torque_rows(_: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
     """Return the rms of the residual of torque rows, as if neighbouring states showed it."""
     return float(np.sqrt(np.mean(residual**2))) if rows.equation.startswith("torque") else None
@@ -768,6 +792,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_a_cubic_spring_adds_is_no_error_of_an_offsets_form, ("exact forms",)),
     (noise_above_the_measured_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (noise_that_falls_with_frequency_is_noise_where_nothing_repeats, ("noise above the rows",)),
+    (slow_rows_show_what_noise_of_the_acceleration_hides, ("narrower rows",)),
     (noise_of_a_position_leaves_a_level_as_it_is, ("filtered path",)),
     (a_leak_is_not_refused_for_a_friction_that_would_drive, ("unphysical companion",)),
     (thinner_oil_on_the_held_out_day_is_no_effect, ("oil of another day",)),

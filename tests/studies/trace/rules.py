@@ -231,6 +231,8 @@ RULES: Final = (
          ((engine, "unstated_noise", lambda *_: {}),)),
     Rule("unphysical companion", "all effects of a set with an unphysical one are refused",
          ((judging.Judge, "_unphysical_of", lambda *_: []),)),
+    Rule("narrower rows", "what rows of all frequencies leave unexplained stays so",
+         ((engine, "_traced_in_narrower_rows", lambda *_: None),)),
     Rule("filtered path", "friction reverses along the path as it is measured, noise included",
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
