@@ -23,10 +23,10 @@ from analysis.regression.settings import REGRESSION
 from analysis.signals.filters import Smoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
+from rig.model.numerics.spectra import power_spectrum
 from rig.model.parts import AnySensor, converter_step
 from rig.model.records import Record, bridged
 from rig.model.rig import Rig
-from rig.model.spectra import power_spectrum
 
 _BANDS = 8  # of the upper half of a spectrum
 _LEAST_SAMPLES = 512  # for 16 frequencies in each band

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from analysis.signals.convolution import convolved, convolved_rows, decimated
 from analysis.signals.settings import SIGNALS
+from rig.model.numerics.spectra import noise_power, power_spectrum
 from rig.model.parse import InputError
-from rig.model.spectra import noise_power, power_spectrum
 
 Array = NDArray[np.float64]
 

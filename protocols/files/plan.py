@@ -21,7 +21,7 @@ from protocols.steps.lock import LockStep
 from protocols.steps.parts import CLOSED, END_MAX, Excite, Lock, Place
 from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
 from protocols.steps.warm_up import WarmUpStep
-from rig.model.exponential import exponential
+from rig.model.numerics.exponential import exponential
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.model.units import plain

@@ -11,9 +11,9 @@ from scipy.signal import convolve, lfilter
 from analysis.signals import filters as d
 from analysis.signals.convolution import convolved, decimated, same_convolved
 from analysis.signals.settings import SIGNALS
+from rig.model.numerics.spectra import noise_power, power_spectrum
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.model.spectra import noise_power, power_spectrum
 from tests.studies.estimators import other_filters
 from tests.studies.estimators.differentiation import markdown, table
 

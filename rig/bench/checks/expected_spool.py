@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.model.exponential import exponential
+from rig.model.numerics.exponential import exponential
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.model import channels as ch
+from rig.model.numerics.spectra import noise_power, power_spectrum
 from rig.model.parse import InputError
 from rig.model.records import BANDWIDTH, bridged, common_bandwidth
 from rig.model.rig import Rig
-from rig.model.spectra import noise_power, power_spectrum
 from rig.runs import archive, store
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.dead_sensors import silent_sensors

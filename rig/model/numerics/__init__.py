@@ -1,0 +1,1 @@
+"""Computations on arrays that more than one layer needs: spectra, the matrix exponential."""
