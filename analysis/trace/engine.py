@@ -352,11 +352,9 @@ def _traced_in_narrower_rows(records: TraceRuns, options: _Options, result: Trac
     again = _traced(records.of_bandwidth(narrower), options, lambda _: None)
     if again.verdict not in (EXPLAINED, CONFOUNDED):
         return None
-    rows = trace_rows(records)
-    hypotheses = HypothesisSet(rows.train, [])
     named = {(effect.name, effect.at) for effect in again.effects}
-    explained = hypotheses.refined([u for u in again.model_after.terms if u.term.key in named])
-    if judging_rows_above_band(rows.judging, hypotheses.empty, explained)[0]:
+    effects = [used for used in again.model_after.terms if used.term.key in named]
+    if not _explain_judging_rows(trace_rows(records), effects):
         return None
     return replace(again, notes=(narrower_rows_note(narrower, width), *again.notes))
 
@@ -376,11 +374,16 @@ def _final_verdict(
     joints = joints_with_friction(winner, above_band)
     if joints and not finding.rows.filtering.in_motion:
         rows = trace_rows(records, moving_filtering(joints))
-        hypotheses = HypothesisSet(rows.train, [])
-        moving = hypotheses.refined(winner.effects)
-        if not judging_rows_above_band(rows.judging, hypotheses.empty, moving)[0]:
+        if _explain_judging_rows(rows, winner.effects):
             above_band, notes = set(), rest_phase_notes(joints, included=True)
     return (UNEXPLAINED if above_band else finding.verdict), notes
+
+
+def _explain_judging_rows(rows: TraceRows, effects: Sequence[Used]) -> bool:
+    """Return whether effects, refined on the training rows, leave the judging rows in the band."""
+    hypotheses = HypothesisSet(rows.train, [])
+    refined = hypotheses.refined(effects)
+    return not judging_rows_above_band(rows.judging, hypotheses.empty, refined)[0]
 
 
 def judging_rows_above_band(
