@@ -54,19 +54,16 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
             "for model error, so the evidence for every name is weaker"
         )
     if single := steps(ABOVE, train_data):
-        most = max(train_data.floors, key=lambda f: f.noise / f.stated)
         out.append(
             f"one repeat of {single} and no whole periods to compare: the noise floor is what the "
-            f"octave above the rows' frequencies holds, {plain(most.noise / most.stated, 2)} times "
-            f"the stated sensor noise in {most.equation}; a repeat would measure it"
+            f"octave above the rows' frequencies holds, {_largest_noise(train_data)}; a repeat "
+            "would measure it"
         )
     if steps(UNSTATED, train_data):
-        most = max(train_data.floors, key=lambda f: f.noise / f.stated)
-        times = plain(most.noise / most.stated, 2)
         out.append(
-            f"nothing repeats, and what the model leaves, up to {times} times the stated sensor "
-            f"noise in {most.equation}, follows no variable of the records: it counts as noise; "
-            "repeat a record to measure the noise"
+            f"nothing repeats, and what the model leaves, up to {_largest_noise(train_data)}, "
+            "follows no variable of the records: it counts as noise; repeat a record to measure "
+            "the noise"
         )
     for where in (PERIODS, NEIGHBOURS):
         if single := steps(where, train_data):
@@ -86,6 +83,12 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
         *masked_row_notes("training", train_data),
         *masked_row_notes("held-out", holdout_data),
     ]
+
+
+def _largest_noise(data: RegressionData) -> str:
+    """Return in words the largest ratio of a noise floor to the stated noise, and its equation."""
+    most = max(data.floors, key=lambda f: f.noise / f.stated)
+    return f"{plain(most.noise / most.stated, 2)} times the stated sensor noise in {most.equation}"
 
 
 def _masked_step_notes(train_data: RegressionData) -> list[str]:
