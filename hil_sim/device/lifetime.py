@@ -31,7 +31,11 @@ def cannot_listen(host: str, port: int, error: OSError) -> EndpointError:
 
 
 class ParentProcess:
-    """The process that a server belongs to and ends with."""
+    """The process that a server belongs to and ends with.
+
+    Made before the endpoint is announced: who reads it may end at once, and until it is waited
+    for, an ended process still has its number.
+    """
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -56,12 +60,11 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def while_served(ended: Sequence[object], parent: int | None) -> Iterator[None]:
+def while_served(ended: Sequence[object], parent: ParentProcess | None) -> Iterator[None]:
     """Yield until `ended` is not empty, or process `parent` has ended."""
-    parent_process = None if parent is None else ParentProcess(parent)
     while not ended:
         yield
-        if parent_process is not None and parent_process.has_ended():
+        if parent is not None and parent.has_ended():
             return
 
 
@@ -120,7 +123,7 @@ def serve_session(
     session: WireSession[Data],
     device: Device,
     ended: Sequence[object],
-    parent: int | None = None,
+    parent: ParentProcess | None = None,
     lock: AbstractContextManager[object] | None = None,
 ) -> None:
     """Serve a device until `ended` is not empty, or process `parent` has ended; close `end`.

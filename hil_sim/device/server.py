@@ -18,6 +18,7 @@ from pymodbus.transport import ModbusProtocol
 from hil_sim.device.device import Device
 from hil_sim.device.laws import LawTable
 from hil_sim.device.lifetime import (
+    ParentProcess,
     WireEnd,
     WireSession,
     cannot_listen,
@@ -151,7 +152,7 @@ async def serve_tcp(
     port: int,
     on_ready: Callable[[str], None],
     ended: Sequence[object],
-    parent: int | None = None,
+    parent: ParentProcess | None = None,
 ) -> None:
     """Serve a device behind Modbus TCP until `ended` is not empty, or process `parent` has ended.
 
@@ -200,7 +201,7 @@ def serve(
     *,
     realtime: bool = False,
     on_ready: Callable[[str], None] = logger.info,
-    parent: int | None = None,
+    parent: ParentProcess | None = None,
     wire: str = TCP,
     layout: CanLayout | None = None,
     bitrate: int = BITRATE,

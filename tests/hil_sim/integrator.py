@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil_sim.device.lifetime import ParentProcess
 from hil_sim.device.server import serve
 from rig.model import channels as ch
 from rig.model.parse import parse_model
@@ -92,8 +93,8 @@ def expected_outputs(volts: NDArray[np.float64], rig: Rig, joint: int = 0) -> ND
 
 def main() -> None:
     """Serve the plant, print the endpoint first."""
+    parent = ParentProcess(int(sys.argv[2])) if len(sys.argv) > 2 else None
     rig = seed_rig()
-    parent = int(sys.argv[2]) if len(sys.argv) > 2 else None
     serve(
         rig,
         IntegratorPlant(rig),

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import sys
 
+from hil_sim.device.lifetime import ParentProcess
 from hil_sim.device.server import SERIAL, serve
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 
 def main() -> None:
     """Serve the plant, print the endpoint first."""
+    parent = ParentProcess(int(sys.argv[2])) if len(sys.argv) > 2 else None
     rig = seed_rig()
     serve(
         rig,
@@ -20,7 +22,7 @@ def main() -> None:
         wire=SERIAL,
         realtime=sys.argv[1] == "realtime",
         on_ready=lambda endpoint: print(endpoint, flush=True),  # noqa: T201
-        parent=int(sys.argv[2]) if len(sys.argv) > 2 else None,
+        parent=parent,
     )
 
 

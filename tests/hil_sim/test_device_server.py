@@ -23,6 +23,24 @@ from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 PATIENCE = 30.0  # a loaded machine may take long; the assertions do not depend on it
 
+DEVICE = "from tests.hil_sim.integrator import main; main()"
+
+# Its parent ends between the endpoint's line and the first request served.
+ANNOUNCING = """
+import os, sys, time
+from hil_sim.device.lifetime import ParentProcess
+from hil_sim.device.server import serve
+from tests.hil_sim.integrator import IntegratorPlant, seed_rig
+
+def announce(endpoint):
+    print(endpoint, flush=True)
+    while os.getppid() == int(sys.argv[2]):
+        time.sleep(0.01)
+
+rig = seed_rig()
+serve(rig, IntegratorPlant(rig), on_ready=announce, parent=ParentProcess(int(sys.argv[2])))
+"""
+
 HOST = """
 import sys
 from drivers import make_driver
@@ -98,17 +116,18 @@ def test_it_ends_cleanly_when_asked(number: signal.Signals) -> None:
         assert client.recv(1) == b""
 
 
-def test_it_ends_with_the_process_it_belongs_to() -> None:
+@pytest.mark.parametrize("script", [DEVICE, ANNOUNCING], ids=["serving", "announcing"])
+def test_it_ends_with_the_process_it_belongs_to(script: str) -> None:
     # A parent that starts the device and is killed: nobody is left to end it but itself.
-    script = (
+    parent_script = (
         "import os, subprocess, sys;"
-        "p = subprocess.Popen([sys.executable, '-m', 'tests.hil_sim.integrator', 'virtual',"
-        " str(os.getpid())], stdout=subprocess.PIPE, text=True);"
+        "p = subprocess.Popen([sys.executable, '-c', sys.argv[1], 'virtual', str(os.getpid())],"
+        " stdout=subprocess.PIPE, text=True);"
         "print(p.pid, p.stdout.readline(), flush=True);"
         "p.wait()"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT
+        [sys.executable, "-c", parent_script, script], stdout=subprocess.PIPE, text=True, cwd=ROOT
     ) as parent:
         assert parent.stdout is not None
         pid, endpoint = parent.stdout.readline().split()

@@ -17,7 +17,7 @@ import numpy as np
 
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.laws import OFF
-from hil_sim.device.lifetime import termination_signals, while_served
+from hil_sim.device.lifetime import ParentProcess, termination_signals, while_served
 from hil_sim.plant.interface import Law, PlantInterface
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -186,7 +186,7 @@ def serve_valves(
     plant: PlantInterface,
     adapter: Adapter,
     on_ready: Callable[[str], None],
-    parent: int | None,
+    parent: ParentProcess | None,
 ) -> None:
     """Serve a plant behind valve nodes 1 to N until SIGTERM, SIGINT or the end of `parent`."""
     bench = ValveBench(rig, plant, adapter)

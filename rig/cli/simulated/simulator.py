@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.modbus_tcp import TcpSettings
-from hil_sim.device.lifetime import EndpointError
+from hil_sim.device.lifetime import EndpointError, ParentProcess
 from hil_sim.device.server import CAN, SLCAN, TCP, VALVES, WIRES, serve, warm_up
 from hil_sim.faults import CLASSES
 from hil_sim.faults.wire import WireFault
@@ -79,7 +79,9 @@ def serve_bench(
     `scenario_name`: a file of hidden effects, the name of a shipped one, or ``random``, drawn by
     `seed`. `faults_name`: a file of faults, or the name of a fault of the wire that then affects
     one frame in a hundred. `truth`: a file for the true parameters and hidden effects.
+    `parent`: the number of the process that the bench ends with.
     """
+    process = None if parent is None else ParentProcess(parent)
     if wire not in WIRES:
         raise InputError(f"--wire {wire}: expected one of: {' '.join(WIRES)}")
     rig = load_bench(rig_name)
@@ -117,7 +119,7 @@ def serve_bench(
             wire=wire,
             realtime=real_time,
             on_ready=ready,
-            parent=parent,
+            parent=process,
             faults=scenario.device_faults,
         )
     except EndpointError as error:
