@@ -41,7 +41,7 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
-PLACES: Final = 6  # knots of s
+PLACES: Final = 9  # knots of s: a tight place is local
 GROWS: Final = (-0.8, -0.3, 0.3, 0.8)  # starting growths up to the end, over friction at mid-stroke
 MOST_GROWTH: Final = 2.0  # in the same unit: friction vanishes half way to an end
 ALIKE: Final = 0.03  # share of gravity that no curve of s fits: below, the records have one pose
@@ -219,7 +219,7 @@ class FrictionCurve(Friction):
 def _over_position(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        out[TORQUE, i] -= x[G, i] * curve_at(x[S, i], par, 1, 6)
+        out[TORQUE, i] -= x[G, i] * curve_at(x[S, i], par, 1, PLACES)
 
 
 @dataclass(frozen=True)
@@ -259,9 +259,10 @@ class PositionForce(Effect):
         return (*knot_shapes(names[:PLACES], path_unit(rig, self.joint), low, high), *fixed)
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
-        """Return knots at quantiles of the piston's position, and the gauge of these records."""
-        s = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
-        knots = spread_knots(s, (1.0 - LAST, 0.2, 0.4, 0.6, 0.8, LAST))
+        """Return knots evenly over the piston's travel, and the gauge of these records."""
+        place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
+        ends = np.quantile(place, (1.0 - LAST, LAST)) if len(place) else place
+        knots = spread_knots(ends, np.linspace(0.0, 1.0, PLACES).tolist())
         if not len(knots):
             return ()
         gauge = self._gravity_gauge(rig, evidence, knots)

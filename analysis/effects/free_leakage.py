@@ -39,7 +39,7 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
+DROPS: Final = 9  # knots of a leak's pressure, the first at zero: a relief valve opens suddenly
 PLACES: Final = 9  # knots of the piston's position: wear is local
 BACKWARDS: Final = 0.05  # of a leak's largest flow: a reverse flow within its uncertainty
 
@@ -69,7 +69,7 @@ def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     side = int(par[1])
     cap, rod = x[P_CAP, i], x[P_ROD, i]
     drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
-    flow = curve_at(abs(drop), par, 2, 5)
+    flow = curve_at(abs(drop), par, 2, DROPS)
     flow = flow if drop > 0.0 else -flow
     if side == 0:
         out[FLOW_CAP, i] -= flow
@@ -117,7 +117,7 @@ class LeakageCurve(_FreeLeakage):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots at quantiles of the pressure across the leak."""
         drop = evidence.of_joint(self.joint, lambda x: np.abs(self.across(x)))
-        return knot_points(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
+        return knot_points(drop, np.linspace(0.0, LAST, DROPS).tolist(), low=0.0)
 
     def _names(self) -> tuple[str, ...]:
         return tuple(f"Q_leak_{self.suffix}_{k}" for k in range(2, DROPS + 1))

@@ -392,8 +392,8 @@ REFUSED = [
     (
         "position_force",
         "joint 2",
-        {f"F_position_2_{k}": 1e5 for k in range(1, 6)},
-        (-0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.1, -0.5, 0.7, -0.7, 0.5, -0.1),
+        {f"F_position_2_{k}": 1e5 for k in range(1, 9)},
+        (*np.linspace(-0.04, 0.04, 9), *np.eye(9)[0]),
     ),
     (
         "metering_curve",
@@ -404,8 +404,8 @@ REFUSED = [
     (
         "leakage_curve",
         "joint 2",
-        {f"Q_leak_2_{k}": -1e-6 for k in (2, 3, 4, 5)},
-        (0.0, 1e6, 2e6, 3e6, 4e6),
+        {f"Q_leak_2_{k}": -1e-6 for k in range(2, 10)},
+        tuple(np.linspace(0.0, 4e6, 9)),
     ),
     (
         "bulk_modulus_curve",

@@ -36,8 +36,8 @@ def sprung(rig: Rig, reach: float) -> tuple[RegressionData, Used, ExactFit]:
     data = regression_data(rig, terms, conditioned_records(rig, [run]))
     s = data.records[0].signals.s[:, 1]
     middle, half = 0.5 * (s.min() + s.max()), 0.5 * reach * np.ptp(s)
-    knots = np.linspace(middle - half, middle + half, 6)
-    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(6)[0]))
+    knots = np.linspace(middle - half, middle + half, 9)
+    curve = Used(make("position_force", "joint 2"), (*knots, *np.eye(9)[0]))
     return data, curve, fit_coefficients(data, (*terms, curve))
 
 
