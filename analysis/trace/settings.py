@@ -222,13 +222,15 @@ class DataSettings:
     """Share of that energy which a variable removes from held-out records, from which it is no
     noise (tuned: noise in the regressors alone makes 0.1)."""
     unrepeated_share: float = 0.5
-    """Share of that scatter's energy at one frequency, from which the note states the frequency
-    (convention)."""
+    """Share of that scatter's energy at one frequency, from which the note states the frequency,
+    and from which what differs between neighbouring states at it is no noise (convention)."""
     line_ratio: float = 2.0
     """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
     torque at one frequency is looked for in it (tuned: clean benches stay below)."""
     least_turns: float = 5.0
     """Least number of turns that a frequency makes in a record: fewer are drift (tuned)."""
+    line_step: float = 0.25
+    """Step of the frequencies tried, over one turn in the record (convention)."""
     # Noise from neighbouring states.
     pair_time: float = 0.5
     """[s] Least time between the two rows of a pair: five times the row filter's memory."""

@@ -1,6 +1,6 @@
 """A carriage on a screw under its own position loop: what an electric joint's record looks like.
 
-M q'' = gain v - Fv q' - friction - offset by half-implicit steps of 0.1 ms, dry friction of
+M q'' = gain v - Fv q' - friction - offset + hum by half-implicit steps of 0.1 ms, dry friction of
 bristles that bend and slip (LuGre) and may fall with speed; nothing of it is the analysis' own.
 """
 
@@ -16,18 +16,23 @@ from rig.model.rig import Rig
 
 KP, KV = 160.0, 240.0  # [1/s], [V s/m]
 FINE = 10  # steps a sample
+HUM = 7.3  # [Hz]
 STIFFNESS, DAMPING = 1e6, 1e3  # [N/m], [N s/m] of the bristles
 
 
 @dataclass(frozen=True)
 class Carriage:
-    """Its parameters, SI; `breakaway` is how much more friction there is at rest [N]."""
+    """Its parameters, SI; `breakaway` is how much more friction there is at rest [N].
+
+    `hum` is the amplitude of a force in time [N], of `HUM` [Hz].
+    """
 
     mass: float = 95.0
     viscous: float = 200.0
     dry: float = 20.0
     offset: float = -3.0
     breakaway: float = 0.0
+    hum: float = 0.0
 
 
 def moves(rate: float, seconds: float, amplitude: float, wave: float) -> np.ndarray:
@@ -39,7 +44,7 @@ def moves(rate: float, seconds: float, amplitude: float, wave: float) -> np.ndar
 
 @njit(cache=True)
 def _run(reference, h, gain, par, q, v):  # type: ignore[no-untyped-def]
-    mass, viscous, dry, offset, breakaway = par
+    mass, viscous, dry, offset, breakaway, hum = par
     n = len(reference)
     position, drive = np.empty(n), np.empty(n)
     bend = 0.0
@@ -54,7 +59,8 @@ def _run(reference, h, gain, par, q, v):  # type: ignore[no-untyped-def]
             bend_rate = v - abs(v) * bend * STIFFNESS / max(level, 1e-9)
             friction = (STIFFNESS * bend + DAMPING * bend_rate) if level > 0 else 0.0
             bend += h * bend_rate
-            v += h * (gain * u - offset - viscous * v - friction) / mass
+            force = hum * np.sin(2 * np.pi * HUM * h * (k * FINE + fine)) - offset
+            v += h * (gain * u + force - viscous * v - friction) / mass
             q += h * v
     return position, drive
 

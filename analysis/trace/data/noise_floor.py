@@ -19,6 +19,7 @@ same in every repeat counts as noise too, up to its size by the rig file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -49,6 +50,9 @@ OTHER_STEPS = "noise of other steps"
 ABOVE = "frequencies above the rows'"
 UNSTATED = "a residual that follows nothing"
 Group = tuple[int, str]
+LINES_AT_ONCE = 256  # frequencies tried at once: bounds the memory
+# Determinant of two waves over that of orthogonal ones, times 4, below which they are one.
+SAME_COLUMN = 1e-6
 NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
 
 
@@ -239,11 +243,48 @@ def noise_by_neighbours(
     row = np.flatnonzero(apart.any(axis=1))
     nearest = np.argmax(apart, axis=1)[row]  # the nearest neighbour at least `pair_time` away
     distance2 = distance[row, nearest] ** 2
-    noise2 = 0.5 * (residual[neighbours[row, nearest]] - residual[row]) ** 2
     pairs = np.argsort(distance2)[: int(DATA.nearest_pair_share * len(states))]
     if len(pairs) < DATA.least_pairs or distance2[pairs[-1]] > DATA.pair_distance**2:
         return None
-    return float(np.sqrt(np.mean(noise2[pairs])))
+    first, second = row[pairs], neighbours[row, nearest][pairs]
+    change = residual[second] - residual[first]
+    total = float(change @ change)
+    line = _largest_line(rows.time[first], rows.time[second], change)
+    noise2 = total - line if line > DATA.unrepeated_share * total else total
+    return math.sqrt(0.5 * noise2 / len(pairs))
+
+
+def _largest_line(first: Array, second: Array, change: Array) -> float:
+    """Return the largest energy of one frequency in changes (m,) of a residual between instants.
+
+    `first` and `second` (m,) [s] are the instants. Neighbouring states have any phase of a torque
+    in time, which is no noise.
+    """
+    instants = np.unique(np.concatenate((first, second)))
+    length = float(instants[-1] - instants[0])
+    highest = 0.5 / float(np.min(np.diff(instants)))
+    frequency = np.arange(DATA.least_turns / length, highest, DATA.line_step / length)
+    best = 0.0
+    for part in np.array_split(frequency, 1 + len(frequency) // LINES_AT_ONCE):
+        before, after = (2.0 * np.pi * np.multiply.outer(t, part) for t in (first, second))
+        waves = np.cos(after) - np.cos(before), np.sin(after) - np.sin(before)
+        best = max(best, float(sine_energy(*waves, change[None]).max(initial=0.0)))
+    return best
+
+
+def sine_energy(c: Array, s: Array, series: Array) -> Array:
+    """Return the energy (f,) that two waves each, c and s (m, f), fit in series (n, m), summed.
+
+    Least squares with free amplitudes for each series (Lomb 1976).
+    """
+    cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
+    a, b = series @ c, series @ s
+    fitted = (ss * a * a - 2 * cs * a * b + cc * b * b).sum(axis=0)
+    determinant = cc * ss - cs * cs
+    # At multiples of half the sampling rate, sine and cosine are one column, or none.
+    single = determinant <= SAME_COLUMN * (cc + ss) ** 2
+    energy = (a * a + b * b).sum(axis=0) / np.maximum(cc + ss, np.finfo(np.float64).tiny)
+    return np.asarray(np.where(single, energy, fitted / np.where(single, 1.0, determinant)))
 
 
 def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:

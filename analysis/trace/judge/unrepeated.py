@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from analysis.regression.rows import WAVES, Line, sines_at, without_sines
 from analysis.simulation.model import Estimate
 from analysis.terms.base import equation, joint_of
 from analysis.trace.data.conditioned_record import model_rows, row_residual
-from analysis.trace.data.noise_floor import PERIODS, REPEATS, Floor, Group
+from analysis.trace.data.noise_floor import PERIODS, REPEATS, Floor, Group, sine_energy
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.data.set_aside import in_judging_block
 from analysis.trace.judge.gates import INVARIANT, NO_RIVAL, PHYSICAL, REMOVES, SIGNIFICANT
@@ -231,10 +230,6 @@ def phase_notes(effects: Sequence[JudgedEffect], lines: Sequence[Line]) -> list[
     ]
 
 
-# Determinant of sine and cosine over that of orthogonal ones, times 4, below which they are one.
-SAME_COLUMN: Final = 1e-6
-
-
 def unrepeated_notes(data: RegressionData) -> list[str]:
     """Return a note for each equation whose scatter between repeats exceeds stated sensor noise.
 
@@ -293,26 +288,15 @@ def dominant_frequency(parts: Sequence[tuple[Array, Array]]) -> tuple[float, flo
     def share(frequency: Array) -> Array:
         return np.asarray(sum(_sine_energy(t, series, frequency) for t, series in parts) / total)
 
-    frequency = np.arange(2.0 / length, highest, 0.25 / length)
+    frequency = np.arange(2.0 / length, highest, DATA.line_step / length)
     coarse = float(frequency[np.argmax(share(frequency))])
-    bounds = (coarse - 0.25 / length, coarse + 0.25 / length)
+    bounds = (coarse - DATA.line_step / length, coarse + DATA.line_step / length)
     best = minimize_scalar(lambda f: -share(np.array([f])).item(), bounds=bounds, method="bounded")
     return float(best.x), -float(best.fun)
 
 
 def _sine_energy(time: Array, series: Array, frequency: Array) -> Array:
-    """Return the energy (f,) that a sine at each frequency [Hz] fits in series (n, m), summed.
-
-    Least squares with free amplitude and phase for each series (Lomb 1976).
-    """
+    """Return the energy (f,) that a sine at each frequency [Hz] fits in series (n, m), summed."""
     series = series - series.mean(axis=1, keepdims=True)
     angle = 2 * np.pi * time[:, None] * frequency
-    c, s = np.cos(angle), np.sin(angle)
-    cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
-    a, b = series @ c, series @ s
-    fitted = (ss * a * a - 2 * cs * a * b + cc * b * b).sum(axis=0)
-    determinant = cc * ss - cs * cs
-    # At multiples of half the sampling rate, sine and cosine are one column.
-    single = determinant < SAME_COLUMN * (cc + ss) ** 2
-    energy = (a * a + b * b).sum(axis=0) / (cc + ss)
-    return np.asarray(np.where(single, energy, fitted / np.where(single, 1.0, determinant)))
+    return sine_energy(np.cos(angle), np.sin(angle), series)

@@ -732,7 +732,26 @@ def a_small_force_beside_friction_is_found_in_one_record(_: Benches) -> None:
 
     Without the second search 3 N are lost in a noise of 4 N, and 17 floors stay.
     """
-    machine, rig, runs = carriage.Carriage(dry=40.0, offset=-3.0), load_rig("emps"), []
+    result = traced_wandering(carriage.Carriage(dry=40.0, offset=-3.0))
+    assert result.verdict == "explained"
+    assert {e.name for e in result.effects} == {"coulomb_friction", "torque_offset"}
+    values = {n: e.value for f in result.effects for n, e in f.parameters.items()}
+    assert values["offset1"] == pytest.approx(-3.0, rel=0.05)
+    assert max(result.after[e] / result.noise_floor[e] for e in result.after) < 1.5
+
+
+def a_force_in_time_is_no_noise_between_like_states(_: Benches) -> None:
+    """Nothing repeats, and the force has any phase where the carriage comes back to a state."""
+    result = traced_wandering(carriage.Carriage(dry=0.0, offset=0.0, hum=3.0))
+    assert [e.name for e in result.effects] == ["periodic_disturbance"]
+    assert result.effects[0].parameters["frequency_1"].value == pytest.approx(
+        carriage.HUM, rel=1e-3
+    )
+
+
+def traced_wandering(machine: carriage.Carriage) -> Trace:
+    """Trace one record of a carriage that wanders about a place, and a held-out one."""
+    rig, runs = load_rig("emps"), []
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
         t = np.arange(round(40.0 * rig.sample_rate)) / rig.sample_rate
@@ -740,12 +759,7 @@ def a_small_force_beside_friction_is_found_in_one_record(_: Benches) -> None:
         wander = sum(np.sin(2 * np.pi * f * t + phase) for f, phase in waves)
         reference = 0.12 + 0.01 * np.clip(t, 0.0, 1.0) * wander
         runs.append(Run(rig, (carriage.record(rig, machine, reference, rng, "moves"),)))
-    result = engine.trace([runs[0]], [runs[1]], look_ahead=False)
-    assert result.verdict == "explained"
-    assert {e.name for e in result.effects} == {"coulomb_friction", "torque_offset"}
-    values = {n: e.value for f in result.effects for n, e in f.parameters.items()}
-    assert values["offset1"] == pytest.approx(-3.0, rel=0.05)
-    assert max(result.after[e] / result.noise_floor[e] for e in result.after) < 1.5
+    return engine.trace([runs[0]], [runs[1]], look_ahead=False)
 
 
 STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
@@ -763,6 +777,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_noise_makes_as_large_is_not_significant, ("family-wise p", "p always 0")),
     (a_null_and_its_sensors_offset_are_confounded, ("twins",)),
     (a_small_force_beside_friction_is_found_in_one_record, ("noise beside effects",)),
+    (a_force_in_time_is_no_noise_between_like_states, ("line no noise",)),
     (a_gain_and_a_crosstalk_that_fit_alike_are_confounded, ("rivals",)),
     (a_spring_that_fits_like_an_inclination_is_its_rival, ("rivals that matter",)),
     (what_a_linear_spring_leaves_of_a_cubic_one_is_not_nothing,

@@ -33,6 +33,7 @@ from analysis.trace.data.noise_floor import (
     STATED,
     Floor,
     floors,
+    sine_energy,
     stated_noise,
 )
 from analysis.trace.data.regression_data import regression_data
@@ -395,3 +396,15 @@ def test_half_the_rate_of_the_instants_is_no_frequency_of_a_scatter() -> None:
     found, share = dominant_frequency([(time, series)])
     assert found == pytest.approx(5.35, abs=0.01)
     assert 0.2 < share < 0.5  # a sine of amplitude 1 in noise of deviation 1: a third
+
+
+def test_waves_that_are_nothing_fit_nothing() -> None:
+    """Between states whole periods apart a sine of that period has no change."""
+    rng = np.random.default_rng(0)
+    c, s, series = np.zeros((50, 3)), np.zeros((50, 3)), rng.standard_normal((2, 50))
+    c[:, 1], c[:, 2], s[:, 2] = 1.0, rng.standard_normal(50), rng.standard_normal(50)
+    both = np.column_stack((c[:, 2], s[:, 2]))
+    left = series.T - both @ np.linalg.lstsq(both, series.T, rcond=None)[0]
+    mean = 50.0 * np.mean(series, axis=1) ** 2
+    wanted = [0.0, mean.sum(), (series**2).sum() - (left**2).sum()]
+    assert sine_energy(c, s, series) == pytest.approx(wanted)

@@ -237,6 +237,8 @@ RULES: Final = (
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
          ((noise_floor, "noise_above_rows", lambda *_: {}),)),
+    Rule("line no noise", "a torque in time counts as noise by neighbouring states",
+         ((noise_floor, "_largest_line", lambda *_: 0.0),)),
     Rule("noise beside effects",
          "noise by neighbouring states is that of the residual without effects",
          ((engine, "noise_beside_effects", lambda *_: {}),)),
