@@ -69,7 +69,14 @@ def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
     """Return whether a set that explains leaves enough for a free form in its place."""
     to_noise = hypotheses.within_noise(winner)
     several = len(winner.laws) > 1
-    return not to_noise and (several or not hypotheses.within_form_tolerance(winner))
+    return not to_noise and (several or not _within_form_tolerance(hypotheses, winner))
+
+
+def _within_form_tolerance(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
+    """Return whether a set leaves no more than its forms may miss; exact effects miss nothing."""
+    if all(effect.exact for effect in effects_among(winner.effects)):
+        return hypotheses.within_noise(winner)
+    return hypotheses.within_form_tolerance(winner)
 
 
 def _sets_with_free_form(
@@ -101,7 +108,7 @@ def _most_mechanisms(hypotheses: HypothesisSet, winner: Hypothesis) -> int:
     As many only where the names leave more than the tolerance for their forms: a level of friction
     that changes along the stroke misses what a curve follows.
     """
-    return len(winner.laws) - hypotheses.within_form_tolerance(winner)
+    return len(winner.laws) - _within_form_tolerance(hypotheses, winner)
 
 
 def _is_better(hypotheses: HypothesisSet, winner: Hypothesis, hypothesis: Hypothesis) -> bool:

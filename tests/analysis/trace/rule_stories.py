@@ -740,6 +740,14 @@ def a_small_force_beside_friction_is_found_in_one_record(_: Benches) -> None:
     assert max(result.after[e] / result.noise_floor[e] for e in result.after) < 1.5
 
 
+def a_hardening_spring_is_no_constant_torque(_: Benches) -> None:
+    """About one place of the stroke it nearly is; a constant has no form that could be wrong."""
+    train, unseen = runs_of(case_of(21033, kind="outside").bench, 21033)
+    candidates = catalogue(train.rig, ("torque_offset", "joint_spring", "coulomb_friction"))
+    result = engine.trace([train], unseen, candidates, look_ahead=False)
+    assert [(e.name, e.where) for e in result.effects] == [("position_force", "joint 1")]
+
+
 def a_force_in_time_is_no_noise_between_like_states(_: Benches) -> None:
     """Nothing repeats, and the force has any phase where the carriage comes back to a state."""
     result = traced_wandering(carriage.Carriage(dry=0.0, offset=0.0, hum=3.0))
@@ -777,6 +785,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_noise_makes_as_large_is_not_significant, ("family-wise p", "p always 0")),
     (a_null_and_its_sensors_offset_are_confounded, ("twins",)),
     (a_small_force_beside_friction_is_found_in_one_record, ("noise beside effects",)),
+    (a_hardening_spring_is_no_constant_torque, ("without a form",)),
     (a_force_in_time_is_no_noise_between_like_states, ("line no noise",)),
     (a_gain_and_a_crosstalk_that_fit_alike_are_confounded, ("rivals",)),
     (a_spring_that_fits_like_an_inclination_is_its_rival, ("rivals that matter",)),

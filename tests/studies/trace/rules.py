@@ -237,6 +237,8 @@ RULES: Final = (
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
          ((noise_floor, "noise_above_rows", lambda *_: {}),)),
+    Rule("without a form", "a name that has no form may miss as much as one that has",
+         ((free_forms, "_within_form_tolerance", lambda h, o: h.within_form_tolerance(o)),)),
     Rule("line no noise", "a torque in time counts as noise by neighbouring states",
          ((noise_floor, "_largest_line", lambda *_: 0.0),)),
     Rule("noise beside effects",
