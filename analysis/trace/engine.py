@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -55,8 +56,11 @@ from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.settings import SEARCH, TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
+from rig.model.parse import InputError
 from rig.model.records import Run, refuse_malformed, with_common_bandwidth, with_loads_stated
 from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
 
 # Share of the work done after each stage, as measured on six records: reported as progress.
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
@@ -349,7 +353,11 @@ def _traced_in_narrower_rows(records: TraceRuns, options: _Options, result: Trac
     if result.verdict != UNEXPLAINED or result.effects or width is None:
         return None
     narrower = TRACE.narrower_bandwidth * width
-    again = _traced(records.of_bandwidth(narrower), options, lambda _: None)
+    try:
+        again = _traced(records.of_bandwidth(narrower), options, lambda _: None)
+    except InputError as error:  # the longer filter leaves too few rows of short records
+        log.info("not traced in rows up to %.3g Hz: %s", narrower, error)
+        return None
     if again.verdict not in (EXPLAINED, CONFOUNDED):
         return None
     named = {(effect.name, effect.at) for effect in again.effects}

@@ -79,7 +79,7 @@ def evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> 
         )
     return [
         *out,
-        *_masked_step_notes(train_data),
+        *_short_step_notes(train_data),
         *masked_row_notes("training", train_data),
         *masked_row_notes("held-out", holdout_data),
     ]
@@ -91,12 +91,12 @@ def _largest_noise(data: RegressionData) -> str:
     return f"{plain(most.noise / most.stated, 2)} times the stated sensor noise in {most.equation}"
 
 
-def _masked_step_notes(train_data: RegressionData) -> list[str]:
-    """Name the equations of a step that are left out, since nearly all their rows are masked."""
+def _short_step_notes(train_data: RegressionData) -> list[str]:
+    """Name the equations of a step that are left out, since it leaves too few of their rows."""
     kept = {(s.group, s.equation) for s in train_data.segments}
     return [
-        f"{equation}: step {group[1]!r} is left out of training, since {WHY_MASKED}, in all but "
-        f"fewer than {TRACE.least_rows} rows"
+        f"{equation}: step {group[1]!r} is left out of training, since fewer than "
+        f"{TRACE.least_rows} rows are usable: its records are short, or {WHY_MASKED}"
         for group, equation in sorted({(f.group, f.equation) for f in train_data.floors} - kept)
     ]
 

@@ -80,7 +80,7 @@ def trace_rows(
 
     `filtering` gives the row filter of each record; `cache` may hold training rows under the same
     filters. Coefficients are fitted to the training rows.
-    Raises InputError where a step leaves too few rows of an equation (`_without_masked_steps`).
+    Raises InputError where a step leaves too few rows of an equation (`_without_short_steps`).
     """
 
     def filters(record: Record) -> Filtering:
@@ -114,30 +114,30 @@ def _training_rows(
     def rows(terms: tuple[Used, ...]) -> RegressionData:
         ratio = records.noise_ratio
         data = regression_data(records.rig, terms, train, cache=cache, noise_ratio=ratio)
-        return _without_masked_steps(data)
+        return _without_short_steps(data)
 
     data = rows(records.terms)
     paths = path_terms(data)
     return rows((*records.terms, *paths)) if paths else data
 
 
-def _without_masked_steps(train_data: RegressionData) -> RegressionData:
-    """Return the rows without those equations of a step that have nearly all rows masked.
+def _without_short_steps(train_data: RegressionData) -> RegressionData:
+    """Return the rows without those equations of a step of which it leaves too few.
 
-    Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation and is
-    too short, or is the only one with rows of that equation.
+    Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation and no
+    other step has more.
     """
     least = TRACE.least_rows
     short = [s for s in train_data.segments if s.count < least]
     equations_elsewhere = {s.equation for s in train_data.segments if s not in short}
     used_rows = np.ones(train_data.base.shape[0], dtype=bool)
     for s in short:
+        if s.equation in equations_elsewhere:
+            used_rows[s.where] = False
+            continue
         count = s.count
         conditioned, rows = train_data.source(s)
         record, masked = conditioned.record, rows.masked
-        if masked > count and s.equation in equations_elsewhere:
-            used_rows[s.where] = False
-            continue
         remedy = "take longer records"
         if masked > count:
             remedy = (

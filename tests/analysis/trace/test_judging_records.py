@@ -23,11 +23,18 @@ from analysis.trace.search.exact_fit import design_matrix, fit_coefficients
 from analysis.trace.settings import TRACE
 from rig.cli.main import app
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Record, Run, of_bandwidth
 from rig.model.rig import Rig
 from rig.runs.archive import write_run
 from tests.analysis.trace.gate_cases import LEAK, at_joint_2, joined
-from tests.analysis.trace.hidden import RMS, experiment, pair_of_runs, pushed
+from tests.analysis.trace.hidden import (
+    RMS,
+    experiment,
+    hardening,
+    pair_of_runs,
+    pushed,
+    with_filtered_noise,
+)
 
 FEW = ("internal_leakage", "external_leakage", "spool_offset")
 PUSH = 10.0  # [N], five times the torque's noise in a block
@@ -232,13 +239,36 @@ def test_an_equation_whose_rows_a_step_masks_is_traced_with_the_other_steps(rig:
     masked = replace(other, records=tuple(map(high, other.records)))
     candidates = at_joint_2(rig, "internal_leakage")
     result = trace([joined(train, masked)], [held_out], candidates, look_ahead=False)
-    note = "flow_cap_2: step 'step2' is left out of training, since a pressure lies outside"
+    note = "flow_cap_2: step 'step2' is left out of training, since fewer than 40 rows are usable"
     assert sum(n.startswith(note) for n in result.notes) == 1
     assert {f.equation for f in result.floors if f.group[1] == "step1"} <= set(result.after)
     whole = trace([train], [held_out], candidates, look_ahead=False)
     assert not any("left out of training" in n for n in whole.notes)
     with pytest.raises(InputError, match=r"rows of flow_cap_2; the trace needs 40: \d+ others are"):
         trace([masked], [held_out], candidates, look_ahead=False)
+
+
+def test_a_short_step_is_left_out_where_others_have_its_equations(
+    rig: Rig, leaky: tuple[Run, Run]
+) -> None:
+    train, held_out = leaky
+    first = train.records[0]
+    cut = {name: x[: int(0.8 * first.sample_rate)] for name, x in first.channels.items()}
+    short = replace(train, records=(replace(first, channels=cut, period=0),))
+    result = traced(rig, joined(train, short), held_out)
+    assert [e.name for e in result.effects] == ["internal_leakage"]
+    left_out = [n for n in result.notes if "is left out of training" in n]
+    assert {n.split(": ")[1].split(" is")[0] for n in left_out} == {"step 'step2'"}
+    with pytest.raises(InputError, match="the trace needs 40: take longer records"):
+        traced(rig, short, held_out)
+
+
+def test_records_too_short_for_narrower_rows_keep_their_answer(rig: Rig) -> None:
+    """Their filter would leave hardly any row of what a quarter of their bandwidth holds."""
+    runs = [with_filtered_noise(hardening(run, 1e7), 1.0) for run in pair_of_runs(rig)]
+    train, held_out = of_bandwidth(runs, 2.0)
+    result = traced(rig, train, held_out)
+    assert (result.verdict, result.effects) == ("unexplained", ())
 
 
 def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) -> None:
