@@ -173,11 +173,11 @@ class FrictionCurve(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G z and G |z| times the curves' bases."""
         i, shape = self.joint, self.shape_of(rig, shape)
-        z = self._along(rig, shape, signals.s[:, i]) * self.contact(rig, signals, shape)
+        along, z = self._along(rig, shape, signals.s[:, i]), self.contact(rig, signals, shape)
         basis = spline(shape[:SPEEDS], np.abs(signals.sd[:, i]))
         shared, extending = self._names(rig)
-        odd = (signals.G[:, i] * z)[:, None] * (basis @ self._shared(rig))
-        even = (signals.G[:, i] * np.abs(z))[:, None] * basis
+        odd = (signals.G[:, i] * along * z)[:, None] * (basis @ self._shared(rig))
+        even = (signals.G[:, i] * along * self.size(signals, z, shape))[:, None] * basis
         return self.row(dict(zip((*shared, *extending), (*odd.T, *even.T), strict=True)))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from analysis.effects.base import Array, Effect, Shape, out_of_range
 from analysis.effects.contact import (
@@ -190,6 +191,18 @@ class Friction(Effect):
             return memoryless(signals.sd[:, self.joint], speed, self.tail_of(shape))
         return np.asarray(contact_state(self.path(signals, shape), distance))
 
+    def size(self, signals: Signals, z: Array, shape: Sequence[float]) -> Array:
+        """Return |z| (n,) of `contact`, of a contact without memory at rest by its slow speed.
+
+        The mean size of a noisy z is not 0 at rest: while the speed below 20 Hz stays below the
+        transition speed, it takes the place of the speed.
+        """
+        if self.remembers(shape):
+            return np.abs(z)
+        slow, speed = signals.slow_speed(self.joint), self.contact_of(shape)[2]
+        largest = maximum_filter1d(np.abs(slow), max(1, round(REST * signals.rate)))
+        return np.abs(np.where(largest < speed, memoryless(slow, speed, self.tail_of(shape)), z))
+
     def over_speed(self, speed: Array, shape: Sequence[float]) -> Array:
         """Return z (n,) in steady motion at speeds (n,) [m/s] above 0."""
         if self.remembers(shape):
@@ -217,6 +230,7 @@ def force_unit(rig: Rig, joint: int) -> str:
     return str(getattr(rig.joints[joint], "force_unit", "N"))
 
 
+REST: Final = 0.1  # [s] twice the shortest period of the slow speed
 LARGEST_FALL: Final = 0.5  # of the level, up to the speed limit: Coulomb's level is constant
 
 

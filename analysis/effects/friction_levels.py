@@ -111,7 +111,8 @@ class AsymmetricFriction(Friction):
             a, r = contact_levels(self.path(signals, ()), shape[0], shape[1])
             return a, r
         z = self.contact(rig, signals, shape)
-        return np.maximum(z, 0.0), np.maximum(-z, 0.0)
+        size = self.size(signals, z, shape)
+        return 0.5 * (size + z), 0.5 * (size - z)
 
     def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]

@@ -10,7 +10,6 @@ import numpy as np
 
 from analysis.effects.base import Array, Effect
 from analysis.signals.conditioning import Signals
-from analysis.signals.filters import direction
 from analysis.terms.base import (
     CONTRIBUTE,
     SD,
@@ -77,7 +76,7 @@ class AsymmetricViscousFriction(Effect):
         """Return G times the part of s' that goes either way (electric: |q'|)."""
         i = self.joint
         G, v = signals.G[:, i], signals.sd[:, i]
-        way = direction(v, signals.rate)
+        way = signals.direction(i)
         parts = (v * way,) if rig.electric else (v * (way > 0.0), v * (way <= 0.0))
         columns = {name: G * part for name, part in zip(self._names(rig), parts, strict=True)}
         return {equation("torque", i): columns}

@@ -75,6 +75,17 @@ class Signals:
             return s
         return row_filter(self.rate, float(self.path_cutoffs[joint])).apply(s)
 
+    def slow_speed(self, joint: int) -> Array:
+        """Return the speed s' (n,) of a joint below `SIGNALS.direction_cutoff`."""
+        return row_filter(self.rate, SIGNALS.direction_cutoff).apply(self.sd[:, joint])
+
+    def direction(self, joint: int) -> Array:
+        """Return the sign (n,) of `slow_speed`.
+
+        The mean of |v + noise| exceeds |v|, that of (v + noise) times this sign does not.
+        """
+        return np.asarray(np.sign(self.slow_speed(joint)))
+
     @property
     def joints(self) -> int:
         """N."""

@@ -194,14 +194,6 @@ def band_filter(rate: float, cutoff: float) -> FirSmoother:
     )
 
 
-def direction(v: Array, rate: float) -> Array:
-    """Return the sign (n,) of a velocity (n,) without noise above `SIGNALS.direction_cutoff`.
-
-    The mean of |v + noise| exceeds |v|, that of (v + noise) times this sign does not.
-    """
-    return np.asarray(np.sign(row_filter(rate, SIGNALS.direction_cutoff).apply(v)))
-
-
 def path_cutoff(s: Array, v: Array, rate: float) -> float:
     """Return the pass band edge [Hz] of a joint's path along which its friction reverses.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -94,6 +96,21 @@ def test_a_level_without_memory_has_either_tail_and_returns_to_the_other(rig: Ri
         assert effect.shape_names()[-1] == "tail_1"
         assert effect.other_form_starts(rig, heavy) == (normal,)
     assert "tail_1" not in StribeckFriction("joint 1").shape_names()
+
+
+def test_noise_at_rest_is_no_force_of_levels_that_differ(rig: Rig, multisine_run: Run) -> None:
+    """The mean of a noisy |z| is not 0 at rest; in motion the levels stay as they are."""
+    moving = condition(rig, multisine_run.records[0])
+    noise = 2e-3 * np.random.default_rng(1).standard_normal(moving.sd.shape)
+    resting = replace(moving, sd=noise, path_cutoffs=None)
+    effect, shape = AsymmetricFriction("joint 1"), (0.0, 0.0, 4e-3)
+    z = effect.contact(rig, resting, shape)
+    assert np.mean(effect.size(resting, z, shape)) < 0.3 * np.mean(np.abs(z))
+    extending, retracting = effect.columns(rig, moving, shape)["torque_1"].values()
+    z = effect.contact(rig, moving, shape) * moving.G[:, 0]
+    fast = np.abs(moving.sd[:, 0]) > 4e-3
+    assert extending[fast] == pytest.approx(np.maximum(z, 0.0)[fast])
+    assert retracting[fast] == pytest.approx(np.minimum(z, 0.0)[fast])
 
 
 def test_a_shape_without_the_detail_is_a_contact_that_does_not_stiffen(
