@@ -82,23 +82,29 @@ def _within_form_tolerance(hypotheses: HypothesisSet, winner: Hypothesis) -> boo
 def _sets_with_free_form(
     hypotheses: HypothesisSet, winner: Hypothesis, explained: bool
 ) -> list[Hypothesis]:
-    """Return the physical sets with a free form that leave little enough (see the caller)."""
+    """Return the physical sets with a free form that leave little enough (see the caller).
+
+    Those that leave least are tried with a further effect too.
+    """
     most = _most_mechanisms(hypotheses, winner) if explained else math.inf
+    singles = [
+        (start, single)
+        for start in _sets_to_extend(hypotheses, winner, explained)
+        if len(start.laws) < most
+        for single in extensions(hypotheses, start, free=True)
+        # An effect that removes so little would be needless beside a further one.
+        if not removes_too_little(start, single, hypotheses.noise_band)
+    ]
+    singles.sort(key=lambda pair: pair[1].total)
+    growing = [o.keys for _, o in singles if len(o.laws) < most][: SEARCH.free_forms_extended]
     out: list[Hypothesis] = []
-    for start in _sets_to_extend(hypotheses, winner, explained):
-        if len(start.laws) >= most:
-            continue
-        for single in extensions(hypotheses, start, free=True):
-            # An effect that removes so little would be needless beside a further one.
-            if removes_too_little(start, single, hypotheses.noise_band):
-                continue
-            may_grow_further = len(single.laws) < most
-            larger = [_with_further_effect(hypotheses, single)] if may_grow_further else []
-            for hypothesis in (single, *larger):
-                explains = _explains_what_it_alters(hypotheses, start, hypothesis)
-                better = not explained or _is_better(hypotheses, winner, hypothesis)
-                if explains and better and not hypotheses.physical_problem(hypothesis):
-                    out.append(hypotheses.prune(hypothesis))
+    for start, single in singles:
+        larger = [_with_further_effect(hypotheses, single)] if single.keys in growing else []
+        for hypothesis in (single, *larger):
+            explains = _explains_what_it_alters(hypotheses, start, hypothesis)
+            better = not explained or _is_better(hypotheses, winner, hypothesis)
+            if explains and better and not hypotheses.physical_problem(hypothesis):
+                out.append(hypotheses.prune(hypothesis))
     return out
 
 

@@ -394,6 +394,8 @@ class SearchSettings:
     # Free forms.
     free_forms_judged: int = 4
     """Largest number of free forms that are put through the gates."""
+    free_forms_extended: int = 6
+    """Largest number of sets with a free form that are tried with a further effect."""
     free_form_ratio: float = 0.5
     """Largest remaining energy of a free form over that of the several named mechanisms which it
     replaces (tuned)."""
