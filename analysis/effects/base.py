@@ -309,6 +309,13 @@ class Effect(Term):
         """
         return ""
 
+    def without_fall(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...] | None:
+        """Return the shape of a friction whose level does not fall with speed, None if it cannot.
+
+        Beside a level of another contact it is a detail of that contact's form.
+        """
+        return None
+
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State a size at the conditions of the records ('' where its parameter states it)."""
         return ""

@@ -231,6 +231,7 @@ def force_unit(rig: Rig, joint: int) -> str:
 
 
 REST: Final = 0.1  # [s] twice the shortest period of the slow speed
+FAR_ABOVE: Final = 1e3  # of the speed limit: at it, a breakaway does not fall
 LARGEST_FALL: Final = 0.5  # of the level, up to the speed limit: Coulomb's level is constant
 
 
@@ -388,6 +389,10 @@ class StribeckFriction(Friction):
             return f"{name} = {force:.3g} N is {force / level:.1%} of the sliding level"
         too_large = out_of_range(name, force, "N", force_limit(rig, self.joint))
         return too_large or Effect.outside(self, rig, shape[:1])
+
+    def without_fall(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape with a Stribeck speed far above the joint's limit."""
+        return (FAR_ABOVE * rig.joints[self.joint].limits.speed, *shape[1:])
 
     def not_shown(
         self, rig: Rig, values: Mapping[str, float], shape: Sequence[float],

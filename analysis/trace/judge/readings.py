@@ -21,6 +21,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.inference import effect_errors, estimates
 from analysis.trace.judge.scatter import form_shift
+from analysis.trace.search.exact_fit import fit_coefficients, with_term
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
@@ -128,8 +129,11 @@ def _needs_richer(
         return False
     if len(other.effects) == len(hypothesis.effects):
         return _is_distinct(hypotheses, hypothesis, other)
-    new_effects = (u for u in other.effects if u.term.key not in hypothesis.keys)
-    return all(_is_determined(hypotheses, other, u) for u in new_effects)
+    new_effects = [u for u in other.effects if u.term.key not in hypothesis.keys]
+    return all(
+        _is_determined(hypotheses, other, u) and _falls(hypotheses, other, u, holdout_data)
+        for u in new_effects
+    )
 
 
 def _least_removed(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis) -> float:
@@ -174,6 +178,24 @@ def _is_determined(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used
     numbers = _numbers(hypotheses, hypothesis, used)
     intervals = [e.ci95 for name, e in numbers.items() if name not in details]
     return all(not low <= 0.0 <= high for low, high in intervals)
+
+
+def _falls(
+    hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used, holdout_data: RegressionData
+) -> bool:
+    """Return whether a further friction at a place falls with speed, of those that can.
+
+    Training and held-out records must need the fall: two contacts of one level, one with memory and
+    one without, fit a reversal that neither fits alone.
+    """
+    data, fit = hypotheses.train_data, hypothesis.fit
+    shape = effect_in(used).without_fall(data.rig, used.shape)
+    if shape is None:
+        return True
+    level = fit_coefficients(data, with_term(fit.terms, used, Used(used.term, shape)))
+    removed = level.energy - fit.energy
+    residual, other = (held_out_residual(holdout_data, model) for model in (level, fit))
+    return removed > SEARCH.number_price and loses_by_restriction(residual, other)
 
 
 def _numbers(hypotheses: HypothesisSet, hypothesis: Hypothesis, used: Used) -> dict[str, Estimate]:

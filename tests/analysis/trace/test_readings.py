@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from analysis.effects.friction import CoulombFriction, StribeckFriction
+from analysis.signals.conditioning import condition
+from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.judge import readings
+from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.settings import TRACE
+from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import Hidden, pair_of_runs
 from tests.analysis.trace.gate_cases import searched
@@ -66,6 +73,30 @@ def test_a_breakaway_is_added_only_where_records_determine_all_its_numbers(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("breakaway", "falls"), [(0.0, False), (60.0, True)])
+def test_a_breakaway_that_does_not_fall_is_a_second_contact_of_the_level(
+    rig: Rig, breakaway: float, falls: bool
+) -> None:
+    """One contact with memory and one without fit a reversal that neither fits alone."""
+    runs = pair_of_runs(rig, Hidden(40.0, 40.0, 3e-3, breakaway=breakaway))
+    s = searched(rig, *runs, "coulomb_friction", "stribeck_friction")
+    part = Used(StribeckFriction("joint 2"), (0.02, 1e-5))
+    effects = Used(CoulombFriction("joint 2"), (0.0, 0.0, 3e-3)), part
+    data, empty = s.hypotheses.train_data, s.hypotheses.empty
+    fit = fit_coefficients(data, (*empty.fit.terms, *effects))
+    pair = replace(empty, effects=effects, fit=fit)
+    assert readings._falls(s.hypotheses, pair, part, s.holdout_data) is falls
+
+
+def test_a_breakaway_without_its_fall_is_a_level(rig: Rig, multisine_run: Run) -> None:
+    signals = condition(rig, multisine_run.records[0])
+    breakaway, level = StribeckFriction("joint 1"), CoulombFriction("joint 1")
+    shape = breakaway.without_fall(rig, (0.01, 3e-5))
+    (one,) = breakaway.columns(rig, signals, shape)["torque_1"].values()
+    (other,) = level.columns(rig, signals, shape[1:])["torque_1"].values()
+    assert one == pytest.approx(other, abs=1e-4 * np.abs(other).max())
+
+
 def test_one_level_with_an_offset_torque_is_said_to_fit_as_well_as_levels_by_direction(
     rig: Rig,
 ) -> None:
