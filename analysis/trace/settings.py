@@ -263,6 +263,8 @@ class DataSettings:
     """[byte] Largest total size of cached rows."""
     cached_signal_bytes: float = 5e7
     """[byte] Largest total size of cached signals."""
+    cached_parts: int = 2000
+    """Number of parts of rows that are cached: each holds the signals that it was made of."""
     cached_signal_sets: int = 4
     """Number of different signals for which a term's columns are cached."""
     # Spectral lines.

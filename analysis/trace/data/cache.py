@@ -61,7 +61,10 @@ class SignalCache:
 
     def get(self, key: Hashable, signals: Signals, make: Callable[[Signals], Any]) -> Any:
         """Return `make(signals)`, computed again only if a field that `make` reads has changed."""
-        stored = self._values.setdefault(key, [])
+        stored = self._values.pop(key, [])  # put back as the newest
+        self._values[key] = stored
+        if len(self._values) > DATA.cached_parts:
+            del self._values[next(iter(self._values))]
         for fields_read, value in stored:
             if all(getattr(signals, name) is x for name, x in fields_read):
                 return value

@@ -8,6 +8,7 @@ import numpy as np
 
 from analysis.signals.conditioning import Array, Signals
 from analysis.trace.data.cache import Cache, RowCache, SignalCache
+from analysis.trace.settings import DATA
 from rig.model.rig import Rig
 
 
@@ -45,14 +46,18 @@ def test_flow_rows_stay_where_torque_rows_are_weighted_anew() -> None:
     assert made == ["mechanical", "fluid", "mechanical"]
 
 
-def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
+def ones(rig: Rig) -> Signals:
     n, N = 200, len(rig.joints)
     fields = ("u", "s", "sd", "q", "qd", "qdd", "theta", "G", "p_cap", "p_rod", "pd_cap", "pd_rod")
     arrays = {name: np.ones((n, N)) for name in (*fields, "V_cap", "V_rod")}
     bench = {name: np.ones(n) for name in ("t", "p_s", "p_tank", "temperature")}
     marks = {"excited": np.ones(N, dtype=bool), "valid": np.ones((n, N), dtype=bool)}
     marks |= {"lost": np.zeros((n, N), dtype=bool), "bands": np.full(N, np.inf)}
-    signals = Signals(rate=1e3, **arrays, **bench, **marks)
+    return Signals(rate=1e3, **arrays, **bench, **marks)
+
+
+def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
+    signals = ones(rig)
     values, made = SignalCache(), []
 
     def rate(seen: Signals) -> Array:
@@ -64,3 +69,19 @@ def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
     ):  # fmt: skip
         assert np.array_equal(values.get("rate", other, rate), other.V_cap * other.pd_cap)
     assert made == ["rate", "rate"]
+
+
+def test_parts_asked_for_long_ago_are_dropped(rig: Rig) -> None:
+    """Each holds the signals that it was made of: a search of shapes makes ever new ones."""
+    values, made, signals = SignalCache(), [], ones(rig)
+
+    def part(key: int) -> None:
+        values.get(key, signals, lambda x: made.append(key) or x.u)
+
+    part(0)
+    for key in range(1, DATA.cached_parts + 100):
+        part(key)
+        part(0)  # the baseline's, which every model uses
+    assert made.count(0) == 1
+    part(1)
+    assert made.count(1) == 2
