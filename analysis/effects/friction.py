@@ -45,6 +45,7 @@ from analysis.effects.contact import (
     transition,
 )
 from analysis.signals.conditioning import Signals
+from analysis.signals.settings import SIGNALS
 from analysis.terms.base import (
     CONTRIBUTE,
     SD,
@@ -230,7 +231,7 @@ def force_unit(rig: Rig, joint: int) -> str:
     return str(getattr(rig.joints[joint], "force_unit", "N"))
 
 
-REST: Final = 0.1  # [s] twice the shortest period of the slow speed
+REST: Final = 2.0 / SIGNALS.direction_cutoff  # [s] two of the slow speed's shortest periods
 FAR_ABOVE: Final = 1e3  # of the speed limit: at it, a breakaway does not fall
 LARGEST_FALL: Final = 0.5  # of the level, up to the speed limit: Coulomb's level is constant
 
