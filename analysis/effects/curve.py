@@ -138,6 +138,11 @@ def spread_knots(values: Array, quantiles: Sequence[float], low: float | None = 
     return np.asarray(knots)
 
 
+def outer_knots(values: Array) -> Array:
+    """Return the first and the last knot (2,) for values (n,), empty without any."""
+    return np.quantile(values, (1.0 - LAST, LAST)) if len(values) else values
+
+
 def knot_points(
     values: Array, quantiles: Sequence[float], low: float | None = None
 ) -> tuple[tuple[float, ...], ...]:

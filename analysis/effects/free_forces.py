@@ -18,6 +18,7 @@ from analysis.effects.curve import (
     curve_at,
     knot_shapes,
     knot_values,
+    outer_knots,
     packed,
     refuse_large,
     shortest_wave,
@@ -261,8 +262,7 @@ class PositionForce(Effect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots evenly over the piston's travel, and the gauge of these records."""
         place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
-        ends = np.quantile(place, (1.0 - LAST, LAST)) if len(place) else place
-        knots = spread_knots(ends, np.linspace(0.0, 1.0, PLACES).tolist())
+        knots = spread_knots(outer_knots(place), np.linspace(0.0, 1.0, PLACES).tolist())
         if not len(knots):
             return ()
         gauge = self._gravity_gauge(rig, evidence, knots)

@@ -17,6 +17,7 @@ from analysis.effects.curve import (
     curve_at,
     knot_points,
     knot_shapes,
+    outer_knots,
     packed,
     refuse_large,
     shown,
@@ -199,8 +200,7 @@ class LeakageAlongStroke(_FreeLeakage):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return knots evenly over the piston's travel: wear may be where it seldom is."""
         place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
-        ends = np.quantile(place, (1.0 - LAST, LAST)) if len(place) else place
-        return knot_points(ends, np.linspace(0.0, 1.0, PLACES).tolist())
+        return knot_points(outer_knots(place), np.linspace(0.0, 1.0, PLACES).tolist())
 
     def _names(self) -> tuple[str, ...]:
         return tuple(f"c_internal_{self.joint + 1}_at_{k}" for k in range(1, PLACES + 1))
