@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import select
 import signal
 import socket
 import threading
@@ -420,34 +421,35 @@ def adapter() -> Iterator[tuple[int, str]]:
     """The adapter's end of a serial line, and the name of the port at the host's end."""
     end, port = os.openpty()
     tty.setraw(port)
-    os.set_blocking(end, False)
     yield end, os.ttyname(port)
     os.close(port)
     os.close(end)
 
 
-def written(end: int) -> bytes:
-    try:
-        return os.read(end, 4096)
-    except BlockingIOError:
-        return b""
+def written(end: int, last: bytes) -> bytes:
+    """Read the adapter's end until `last` has come: the system passes a write on in parts."""
+    data = b""
+    while not data.endswith(last):
+        assert select.select([end], [], [], 30)[0], f"{last!r} did not come, but {data!r}"
+        data += os.read(end, 4096)
+    return data
 
 
 def test_the_port_of_an_slcan_adapter_belongs_to_one_program(adapter: tuple[int, str]) -> None:
     end, name = adapter
     run, probe = (CanPort(BusPlace.of(f"slcan{name}"), 500_000, None, frozenset()) for _ in "12")
     run.open()
-    assert written(end).endswith(b"O\r")  # the adapter's bus is open
+    written(end, b"O\r")  # the adapter's bus is open
     with pytest.raises(DeviceBusy, match=f"the port {name} is in use by another program"):
         probe.open()
-    assert written(end) == b""  # nothing that would close the bus of the run
     probe.open(shared=True)  # for a single frame that zeroes the outputs
     probe.send(CanFrame(0x80, b"\x01"))
     probe.close()
-    assert written(end) == b"t080101\r"
+    # Nothing before it or after it that would close the bus of the run.
+    assert written(end, b"1\r") == b"t080101\r"
     assert run.is_open
     assert run.fault is None
     run.close()
-    assert written(end) == b"C\r"
+    assert written(end, b"C\r") == b"C\r"
     probe.open()
     probe.close()
