@@ -50,7 +50,7 @@ def explained_by_free_form(
     extended = hypotheses.with_candidates(free)
     named = {kind.name for kind in extended.effects if not kind.free}
     sets = _sets_with_free_form(extended, winner, explained)
-    for hypothesis in _simplest_first(extended, sets):
+    for hypothesis in map(extended.in_best_forms, _simplest_first(extended, sets)):
         within_range = CurveRange(finding.rows.choosing, hypothesis.fit).rows
         effects = gates.judge_effects(extended, hypothesis, within_range, rng)
         remaining = remainders(extended, hypothesis, within_range)
@@ -91,7 +91,7 @@ def _sets_with_free_form(
         (start, single)
         for start in _sets_to_extend(hypotheses, winner, explained)
         if len(start.laws) < most
-        for single in extensions(hypotheses, start, free=True)
+        for single in extensions(hypotheses, start, free=True, rival=winner)
         # An effect that removes so little would be needless beside a further one.
         if not removes_too_little(start, single, hypotheses.noise_band)
     ]
@@ -99,13 +99,14 @@ def _sets_with_free_form(
     growing = [o.keys for _, o in singles if len(o.laws) < most][: SEARCH.free_forms_extended]
     out: list[Hypothesis] = []
     for start, single in singles:
-        larger = [_with_further_effect(hypotheses, single)] if single.keys in growing else []
+        grows = single.keys in growing
+        larger = [_with_further_effect(hypotheses, single, winner)] if grows else []
         for hypothesis in (single, *larger):
             explains = _explains_what_it_alters(hypotheses, start, hypothesis)
             better = not explained or _is_better(hypotheses, winner, hypothesis)
             if explains and better and not hypotheses.physical_problem(hypothesis):
-                out.append(hypotheses.prune(hypothesis))
-    return out
+                out.append(hypothesis)
+    return [hypotheses.prune(o) for o in _simplest_first(hypotheses, out)]
 
 
 def _most_mechanisms(hypotheses: HypothesisSet, winner: Hypothesis) -> int:
@@ -161,7 +162,9 @@ def _simplest_first(hypotheses: HypothesisSet, sets: Sequence[Hypothesis]) -> li
     return list({o.keys: o for o in ordered}.values())[: SEARCH.free_forms_judged]
 
 
-def _with_further_effect(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
+def _with_further_effect(
+    hypotheses: HypothesisSet, hypothesis: Hypothesis, winner: Hypothesis
+) -> Hypothesis:
     """Return the set with one more effect for the equations above form error, if there is one.
 
     Where all are within form error, the effect must leave only noise. Two curves in one balance are
@@ -173,7 +176,7 @@ def _with_further_effect(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> H
     if not above_form_error:
         larger = completed_to_noise(hypotheses, hypothesis)
     elif may_grow(hypothesis.effects):
-        larger = extended_in(hypotheses, hypothesis, above_form_error)
+        larger = extended_in(hypotheses, hypothesis, above_form_error, winner)
     return hypothesis if larger is None or _curves_share_a_balance(hypotheses, larger) else larger
 
 

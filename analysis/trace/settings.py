@@ -383,6 +383,9 @@ class SearchSettings:
     given up."""
     unpromising_ratio: float = 10.0
     """Energy of a set over that of the set that it may replace, above which it is unpromising."""
+    unpromising_form: float = 1.5
+    """Energy with an effect in another of its forms, beside the other effects as they are, over
+    that in the form at hand, above which the form is not searched further."""
     promising_drop: float = 0.5
     """Energy after the continuation over that before, up to which a set stays promising (tuned:
     useless sets 0.7 to 1)."""

@@ -35,7 +35,7 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> 
     band = hypotheses.noise_band
     while above := {e for e, v in current.excess_energy.items() if v > band[e]}:
         tried = [
-            hypotheses.refined_below(energy, effects)
+            hypotheses.refined_below(energy, effects, current)
             for energy, effects in _best_trials(hypotheses, current, above)
         ]
         pruned = hypotheses.prune(hypotheses.best([current, *tried]))

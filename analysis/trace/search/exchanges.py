@@ -83,14 +83,16 @@ def _with_another(hypotheses: HypothesisSet, current: Hypothesis) -> list[Hypoth
     alone.sort(key=lambda o: o.total)
     sets = []
     for used in current.effects:
-        smaller = hypotheses.refined_anew(current.without(used))
+        smaller = hypotheses.refined_anew(current.without(used), current)
         data = rebased(hypotheses.train_data, smaller.fit)
         starts = best_additions(hypotheses, data, smaller, columns)
         sets += [
-            extended(hypotheses, smaller, effects) for effects in starts[: SEARCH.replacements]
+            extended(hypotheses, smaller, effects, current)
+            for effects in starts[: SEARCH.replacements]
         ]
         shown = {effects[-1].term.key for effects in starts}
         hidden = [o for o in alone if not o.keys & shown and not hypotheses.physical_problem(o)]
         for single in hidden[:1]:
-            sets.append(hypotheses.refined((*smaller.effects, *single.effects), current))
+            both = (*smaller.effects, *single.effects)
+            sets.append(hypotheses.refined(both, current, both))
     return sets

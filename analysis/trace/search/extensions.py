@@ -37,14 +37,15 @@ Array = NDArray[np.float64]
 
 def extensions(
     hypotheses: HypothesisSet, current: Hypothesis, equations: Collection[str] = (),
-    free: bool = False,
+    free: bool = False, rival: Hypothesis | None = None,
 ) -> list[Hypothesis]:  # fmt: skip
     """Return the best sets with one more effect, found on data with the set in their model.
 
-    `equations` restricts the search to their rows, `free` to free mechanisms.
+    `equations` restricts the search to their rows, `free` to free mechanisms. `rival` is the set
+    that they may replace (`HypothesisSet.refined`).
     """
     larger = [
-        extended(hypotheses, current, effects)
+        extended(hypotheses, current, effects, rival)
         for effects in _starts_by_columns(hypotheses, current, equations, free)
     ]
     if free:
@@ -52,7 +53,7 @@ def extensions(
     hidden: dict[frozenset[Key], tuple[Used, ...]] = {}
     for effects in _starts_that_columns_hide(hypotheses, current, larger, equations):
         hidden.setdefault(keys_of(effects), effects)
-    return larger + [extended(hypotheses, current, effects) for effects in hidden.values()]
+    return larger + [extended(hypotheses, current, effects, rival) for effects in hidden.values()]
 
 
 def _starts_by_columns(
@@ -152,8 +153,11 @@ def with_parts_beside(
                 yield (*hypothesis.without(used), at_start(rig, member), at_start(rig, effect))
 
 
-def extended(hypotheses: HypothesisSet, current: Hypothesis, effects: Sequence[Used]) -> Hypothesis:
-    """Return the exact fit of a set that extends `current`, with its shapes as starting points.
+def extended(
+    hypotheses: HypothesisSet, current: Hypothesis, effects: Sequence[Used],
+    rival: Hypothesis | None = None,
+) -> Hypothesis:  # fmt: skip
+    """Return the exact fit of a set that extends `current`, with its shapes and forms.
 
     A new effect starts at the size that leaves least. Where an equation keeps more than under
     `current`, an earlier fit of the same set ended in a local minimum and is repeated.
@@ -161,9 +165,9 @@ def extended(hypotheses: HypothesisSet, current: Hypothesis, effects: Sequence[U
     added = [u for u in effects if u.term.key not in current.keys]
     others = [u for u in effects if u not in added]
     effects = [*others, *(at_best_size(hypotheses.train_data, u, others) for u in added)]
-    earlier = hypotheses.refined(effects)
+    earlier = hypotheses.refined(effects, rival, others)
     spoils = spoils_equation(earlier, current, hypotheses.noise_band)
-    return hypotheses.refined_anew(effects) if spoils else earlier
+    return hypotheses.refined_anew(effects, rival) if spoils else earlier
 
 
 def may_act(
@@ -181,12 +185,14 @@ def may_act(
 
 
 def extended_in(
-    hypotheses: HypothesisSet, current: Hypothesis, equations: Collection[str]
-) -> Hypothesis | None:
+    hypotheses: HypothesisSet, current: Hypothesis, equations: Collection[str],
+    rival: Hypothesis | None = None,
+) -> Hypothesis | None:  # fmt: skip
     """Return the set with the effect that removes most from `equations`, None if none does.
 
-    Other equations do not count: the form error of a large effect there would hide a small one
-    here. A set that leaves as little in `equations` with fewer effects is returned instead.
+    It may replace `rival`, if that is given (`HypothesisSet.refined`). Other equations do not
+    count: the form error of a large effect there would hide a small one here. A set that leaves as
+    little in `equations` with fewer effects is returned instead.
     """
     if not may_grow(current.effects):
         return None
@@ -201,7 +207,7 @@ def extended_in(
         least = SEARCH.number_price * (hypothesis.size[1] - current.size[1])
         return sum(drop[e] for e in acting) > max(least, SEARCH.add_share * start)
 
-    tried = extensions(hypotheses, current, equations)
+    tried = extensions(hypotheses, current, equations, rival=rival)
     tried += hypotheses.simpler_sets(tried)
     tried += _smaller_sets(hypotheses, current, tried)
     useful = [o for o in tried if removes_enough(o) and not hypotheses.physical_problem(o)]
@@ -210,7 +216,7 @@ def extended_in(
     least = min(map(remaining, useful))
     slack = max((SEARCH.simpler_ratio - 1.0) * max(0.0, least), SEARCH.number_price)
     similar = [o for o in useful if remaining(o) <= least + slack]
-    return min(similar, key=lambda o: (sum(o.size), remaining(o)))
+    return hypotheses.in_best_forms(min(similar, key=lambda o: (sum(o.size), remaining(o))))
 
 
 def _smaller_sets(

@@ -40,13 +40,13 @@ def _searched(
     current = hypotheses.prune(hypotheses.best([hypotheses.empty, *singles]))
     if hypotheses.within_noise(current):
         return current
-    pairs = [
-        hypotheses.refined([candidates.entries[m].used for m in pair.members])
-        for pair in (
-            *linear_fit.best_pairs(candidates, r),
-            *linear_fit.pairs_of_chambers(candidates, r),
-        )
-    ]
+    pairs: list[Hypothesis] = []
+    for pair in (
+        *linear_fit.best_pairs(candidates, r), *linear_fit.pairs_of_chambers(candidates, r)
+    ):  # fmt: skip
+        rival = min((current, *pairs), key=lambda o: o.total)
+        members = [candidates.entries[m].used for m in pair.members]
+        pairs.append(hypotheses.refined(members, rival))
     if hypotheses.within_form_tolerance(current):
         others = [o for o in pairs if not current.keys & o.keys]
         far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]
@@ -71,7 +71,7 @@ def _begun_with_another(
         o for o in singles if not o.keys & current.keys and not hypotheses.physical_problem(o)
     ]
     nearest = sorted(others, key=lambda o: o.total)[: SEARCH.other_starts]
-    pairs = [pair for single in nearest for pair in extensions(hypotheses, single)]
+    pairs = [pair for single in nearest for pair in extensions(hypotheses, single, rival=current)]
     return hypotheses.prune(hypotheses.best([current, *pairs]))
 
 

@@ -61,6 +61,7 @@ class HypothesisSet:
         self.effects = tuple(effects)
         self.noise_band = noise_band(train_data)
         self.fitted: dict[frozenset[Key], Hypothesis] = {}
+        self._in_form: set[frozenset[Key]] = set()
         self.empty = self.at_given_shapes(())
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
@@ -128,21 +129,39 @@ class HypothesisSet:
         problem = problem or effect.not_shown(rig, values, used.shape, terms, self._signals)
         return problem or ("" if may_be_at_bounds else effect.outside(rig, used.shape))
 
-    def refined(self, effects: Sequence[Used], rival: Hypothesis | None = None) -> Hypothesis:
+    def refined(
+        self, effects: Sequence[Used], rival: Hypothesis | None = None,
+        in_form: Collection[Used] = (),
+    ) -> Hypothesis:  # fmt: skip
         """Return the exact fit of a set of effects, computed once for its names and places.
 
         The search of its shapes ends early where it promises no improvement on the set `rival`.
+        The effects `in_form` keep their forms, which are searched once the set is chosen
+        (`in_best_forms`).
         """
         if not effects:
             return self.empty
         key = keys_of(effects)
         if key not in self.fitted:
             rival_fit = None if rival is None else rival.fit
-            fit = refine(self.train_data, (*self.base, *effects), rival_fit)
+            fit = refine(self.train_data, (*self.base, *effects), rival_fit, in_form)
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
+            (self._in_form.add if in_form else self._in_form.discard)(key)
         return self.fitted[key]
 
-    def refined_anew(self, effects: Sequence[Used]) -> Hypothesis:
+    def in_best_forms(self, hypothesis: Hypothesis) -> Hypothesis:
+        """Return a fitted set with the forms searched that its effects have kept."""
+        key = hypothesis.keys
+        if key not in self._in_form:
+            return hypothesis
+        earlier = self.fitted.pop(key)
+        again = self.refined(earlier.effects)
+        spoilt = self.physical_problem(again) and not self.physical_problem(earlier)
+        if spoilt or again.total > earlier.total:
+            self.fitted[key] = earlier
+        return self.fitted[key]
+
+    def refined_anew(self, effects: Sequence[Used], rival: Hypothesis | None = None) -> Hypothesis:
         """Return the best exact fit of a set: the earlier one, or one that starts at these shapes.
 
         Otherwise a further effect could seem to remove what a local minimum has left.
@@ -150,17 +169,21 @@ class HypothesisSet:
         earlier = self.refined(effects)
         if set(effects) != set(earlier.effects):
             del self.fitted[earlier.keys]
-            if self.refined(effects).total > earlier.total:
+            if self.refined(effects, rival).total > earlier.total:
                 self.fitted[earlier.keys] = earlier
         return self.fitted[earlier.keys]
 
-    def refined_below(self, energy: float, effects: Sequence[Used]) -> Hypothesis:
+    def refined_below(
+        self, energy: float, effects: Sequence[Used], rival: Hypothesis | None = None
+    ) -> Hypothesis:
         """Return the exact fit of a set whose shapes in `effects` leave `energy`, or less.
 
-        An earlier fit that leaves more ended in a local minimum and is repeated from these shapes.
+        It may replace `rival`, if that is given. An earlier fit that leaves more ended in a local
+        minimum and is repeated from these shapes.
         """
-        earlier = self.refined(effects)
-        return earlier if earlier.fit.energy <= energy else self.refined_anew(effects)
+        in_rival = [] if rival is None else [u for u in effects if u in rival.effects]
+        earlier = self.refined(effects, rival, in_rival)
+        return earlier if earlier.fit.energy <= energy else self.refined_anew(effects, rival)
 
     def replacements(
         self, winner: Hypothesis, used: Used, by: int = 1
@@ -189,8 +212,10 @@ class HypothesisSet:
         best = functools.reduce(preferred, (o for o in physical if o.size == best.size), best)
         similar = [o for o in physical if o is best or is_preferred(o, best, self.noise_band)]
         least_size = min((sum(o.size), o.size[0]) for o in similar)
-        return functools.reduce(
-            preferred, (o for o in similar if (sum(o.size), o.size[0]) == least_size)
+        return self.in_best_forms(
+            functools.reduce(
+                preferred, (o for o in similar if (sum(o.size), o.size[0]) == least_size)
+            )
         )
 
     def simpler_sets(self, among: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -263,7 +288,10 @@ class HypothesisSet:
         """Return the set without effects that are not needed or remove too little."""
         band = self.noise_band
         while len(hypothesis.effects) > 1:
-            smaller = [self.refined_anew(hypothesis.without(used)) for used in hypothesis.effects]
+            smaller = [
+                self.in_best_forms(self.refined_anew(hypothesis.without(used)))
+                for used in hypothesis.effects
+            ]
             smaller = [o for o in smaller if not self.physical_problem(o)]
             simpler = [
                 o

@@ -10,7 +10,7 @@ final fit is of rows without that scaling.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,13 +49,16 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 
-def refine(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None = None) -> ExactFit:
+def refine(
+    data: RegressionData, terms: Sequence[Used], rival: ExactFit | None = None,
+    in_form: Collection[Used] = (),
+) -> ExactFit:  # fmt: skip
     """Return the fit with searched shapes of all effects that are not among the data's own terms.
 
     The search starts from the shapes given. Of the forms of an effect the one that leaves least, at
     a price for each free number, is used. Then details of the form are added that remove more than
     chance (`SEARCH.number_price`) and more than `SEARCH.detail_share` of the remaining energy above
-    noise.
+    noise. Terms `in_form` keep the form that they have.
 
     With a fit `rival` to be replaced, the search ends early where it leaves over
     `SEARCH.unpromising_ratio` times as much and little less than `SEARCH.first_steps` before. Where
@@ -65,13 +68,16 @@ def refine(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None =
     (`RegressionData.relative`). The fit returned is of rows over their noise.
     """
     if not rescale(data, terms):
-        return _refined(data, terms, rival)
-    relative_fit = _refined(replace(data, relative=True), terms, rival)
+        return _refined(data, terms, rival, in_form)
+    relative_fit = _refined(replace(data, relative=True), terms, rival, in_form)
     return fit_coefficients(data, relative_fit.terms)
 
 
-def _refined(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None) -> ExactFit:
+def _refined(
+    data: RegressionData, terms: Sequence[Used], rival: ExactFit | None, in_form: Collection[Used]
+) -> ExactFit:
     """Return the fit of `refine` to rows of the size that `data.relative` states."""
+    unchanged = [k for k, used in enumerate(terms) if used in data.terms or used in in_form]
     in_rival: Sequence[int] = ()
     rival_energy = math.inf
     if rival is not None:
@@ -90,8 +96,7 @@ def _refined(data: RegressionData, terms: Sequence[Used], rival: ExactFit | None
     def in_best_forms(shown_first: bool) -> ExactFit:
         fit = start
         for k in range(len(terms)):
-            used = fit.terms[k]
-            if used in data.terms or not isinstance(used.term, Effect):
+            if k in unchanged or not isinstance(terms[k].term, Effect):
                 continue
             if k in in_rival and fit.energy > rival_energy:
                 continue
@@ -225,13 +230,31 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, shown_first: 
     while True:
         used = fit.terms[place]
         others = [
-            _with_searched_shapes(data, with_term(fit.terms, used, Used(used.term, shape)))
+            model
             for shape in effect_in(used).other_form_starts(data.rig, used.shape)
+            if (model := _in_other_form(data, fit, place, shape)) is not None
         ]
         best = min(others, key=priced, default=fit)
         if priced(best) >= priced(fit):
             return fit
         fit = best
+
+
+def _in_other_form(
+    data: RegressionData, fit: ExactFit, place: int, start: Sequence[float]
+) -> ExactFit | None:
+    """Return the fit with the term number `place` in another form, from the shape `start` of it.
+
+    None where the form leaves more than `SEARCH.unpromising_form` times as much beside the other
+    terms' shapes as they are.
+    """
+    used = fit.terms[place]
+    terms = with_term(fit.terms, used, Used(used.term, tuple(start)))
+    alone = _with_searched_shapes(data, terms, only=place)
+    if alone.energy > SEARCH.unpromising_form * fit.energy:
+        return None
+    # From the start: the shapes found alone may lie in a local minimum.
+    return _with_searched_shapes(data, terms)
 
 
 def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
@@ -247,10 +270,13 @@ def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Use
 
 
 def _with_searched_shapes(
-    data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps
+    data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps, only: int | None = None
 ) -> ExactFit:
-    """Return the fit whose searched shapes start at those of the terms, after at most `steps`."""
-    free = _free_shapes(data, terms)
+    """Return the fit whose searched shapes start at those of the terms, after at most `steps`.
+
+    Those of the term number `only`, if given, are searched alone.
+    """
+    free = [entry for entry in _free_shapes(data, terms) if only is None or entry[0] == only]
     if not free:
         return fit_coefficients(data, terms)
     terms = _on_better_side(data, terms, free)

@@ -245,6 +245,39 @@ def test_of_two_forms_the_one_that_the_records_show_is_chosen(
     assert (len(stribeck.shape) == 4) == shown
 
 
+def test_effects_keep_their_forms_until_their_set_is_chosen(rig: Rig) -> None:
+    """The lag is of second order; tried beside a leak, it stays of first order at first."""
+    hidden = foreign_bench.Hidden(spool_frequency=50.0, spool_damping=0.5)
+    runs = foreign_bench.pair_of_runs(rig, hidden, seed=2)
+    sets = searched(rig, *runs, "spool_lag", "internal_leakage").hypotheses
+    lag = Used(make("spool_lag", "joint 2"), (0.003,))
+    leak = at_start(rig, make("internal_leakage", "joint 2"))
+    sets.fitted.clear()
+    tried = sets.refined([lag, leak], in_form=[lag])
+    assert len(tried.effects[0].shape) == 1
+    assert sets.refined([lag, leak]) is tried
+    chosen = sets.in_best_forms(tried)
+    assert len(chosen.effects[0].shape) == 2
+    assert chosen.total < 0.1 * tried.total
+    assert sets.fitted[tried.keys] is sets.in_best_forms(chosen) is chosen
+
+
+def test_a_form_that_leaves_far_more_beside_the_others_is_searched_no_further(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A held input is half a sample of the lag: it leaves as much here."""
+    hidden = foreign_bench.Hidden(spool_frequency=50.0, spool_damping=0.9)
+    s = searched(rig, *foreign_bench.pair_of_runs(rig, hidden, seed=2), "spool_lag")
+    data, fit = s.hypotheses.train_data, s.winner.fit
+    (lag,) = s.winner.effects
+    place, (other,) = fit.terms.index(lag), lag.term.other_form_starts(rig, lag.shape)
+    found = refinement._in_other_form(data, fit, place, other)
+    assert found is not None
+    ratio = found.energy / fit.energy
+    monkeypatch.setattr(refinement, "SEARCH", replace(SEARCH, unpromising_form=0.9 * ratio))
+    assert refinement._in_other_form(data, fit, place, other) is None
+
+
 def test_a_lag_has_no_hold_at_its_input_unless_the_records_show_one(rig: Rig) -> None:
     """Of second order, the lag with a held input, half a sample shorter, fits as well by chance."""
     hidden = foreign_bench.Hidden(spool_frequency=50.0, spool_damping=0.9)
