@@ -113,7 +113,7 @@ def trace(
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
-    result = _traced(records, options, progress or (lambda _: None))
+    result = _traced(records, options, _without_steps_back(progress or (lambda _: None)))
     result = _with_stated_rig(rig, _traced_in_narrower_rows(records, options, result) or result)
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
@@ -123,12 +123,26 @@ def trace(
         refused = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
         load = undeclared_load(records, refused)
     if load is None:
-        return result
+        return replace(result, seconds=time.perf_counter() - started)
     again = _with_stated_rig(rig, _traced(load.records, options, lambda _: None))
     if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
-        seconds = time.perf_counter() - started
-        return replace(again, notes=(*notes, load.words, *again.notes), seconds=seconds)
-    return replace(result, notes=(*result.notes, load.words)) if load.shows_inertia else result
+        result = replace(again, notes=(*notes, load.words, *again.notes))
+    elif load.shows_inertia:
+        result = replace(result, notes=(*result.notes, load.words))
+    return replace(result, seconds=time.perf_counter() - started)
+
+
+def _without_steps_back(report: Callable[[float], None]) -> Callable[[float], None]:
+    """Return a report of progress that leaves out what a repeated search has reached before."""
+    reached = 0.0
+
+    def progress(share: float) -> None:
+        nonlocal reached
+        if share > reached:
+            reached = share
+            report(share)
+
+    return progress
 
 
 def _with_stated_rig(rig: Rig, result: Trace) -> Trace:
@@ -222,7 +236,6 @@ def _with_free_runs(
 
 def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], None]) -> Trace:
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
-    started = time.perf_counter()
     prepared = _prepared(records, options)
     baseline = prepared.baseline
 
@@ -313,7 +326,7 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
         lines=lines, formulas=formulas,
         free_curves=held_out.free_curves(runs_before, runs_after),
-        detection_limits=tuple(limits), seconds=time.perf_counter() - started,
+        detection_limits=tuple(limits),
     )  # fmt: skip
     notes += tolerated_error_notes(result)
     return replace(result, notes=tuple(notes), sentence=sentence(result))

@@ -17,6 +17,7 @@ from analysis.report.trace import body, render
 from analysis.simulation.model import load_model, save_model
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
+from analysis.trace import engine
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
@@ -60,6 +61,14 @@ def test_a_trace_tells_how_far_it_is(leaking: Trace, shares: list[float]) -> Non
     assert len(shares) > 20
     assert shares == sorted(shares)
     assert 0.0 < shares[0] < shares[-1] < 1.0
+
+
+def test_progress_does_not_go_back_where_a_search_is_repeated() -> None:
+    shares: list[float] = []
+    report = engine._without_steps_back(shares.append)
+    for share in (0.1, 0.5, 0.1, 0.5, 0.55, 0.3, 0.8):
+        report(share)
+    assert shares == [0.1, 0.5, 0.55, 0.8]
 
 
 def test_a_bench_with_nothing_wrong_is_clean_and_nothing_is_named(quiet: tuple[Run, Run]) -> None:
