@@ -50,7 +50,7 @@ from analysis.trace.notes import (
     unseen_load_notes,
 )
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, Gate, Trace
-from analysis.trace.search.geometry import geometry_for_smaller_set
+from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
@@ -153,16 +153,12 @@ def _with_stated_rig(rig: Rig, result: Trace) -> Trace:
 
 @dataclass(frozen=True)
 class _Options:
-    """Candidates and further options of `trace`.
-
-    `geometry_exact`: the rig's areas, volumes and pin distances are taken as they are.
-    """
+    """Candidates and further options of `trace`."""
 
     effects: Sequence[Effect]
     seed: int
     look_ahead: bool
     free_forms: bool
-    geometry_exact: bool = False
 
 
 @dataclass(frozen=True)
@@ -236,23 +232,38 @@ def _with_free_runs(
 
 def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], None]) -> Trace:
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
+    prepared, finding = _searched(records, options, progress)
+    if geometry := _geometry_that_explains(prepared, finding):
+        again = _traced_within_tolerances(records, options, finding, geometry)
+        if again is not None:
+            return again
+    progress(JUDGED)
+    return _concluded(prepared, options, finding)
+
+
+def _searched(
+    records: TraceRuns, options: _Options, progress: Callable[[float], None]
+) -> tuple[_Prepared, Finding]:
+    """Return the input of the search, and the judged set of effects that explains most."""
     prepared = _prepared(records, options)
-    baseline = prepared.baseline
 
     def columns(share: float) -> None:
         progress(PREPARED + (COLUMNS - PREPARED) * share)
 
-    def searched(p: _Prepared) -> Finding:
+    def found(p: _Prepared) -> Finding:
         return find(p.records, p.rows, p.candidates, columns)
 
-    finding = searched(prepared)
+    finding = found(prepared)
     for measured in (unstated_noise, noise_beside_effects):
         if ratio := measured(finding):
             prepared = _with_noise_ratio(prepared, ratio)
-            finding = searched(prepared)
-    if by_geometry := _traced_within_tolerances(records, options, finding, progress):
-        return by_geometry
-    progress(JUDGED)
+            finding = found(prepared)
+    return prepared, finding
+
+
+def _concluded(prepared: _Prepared, options: _Options, finding: Finding) -> Trace:
+    """Return the trace of a finding: models, free runs, errors of the judging rows, next step."""
+    baseline = prepared.baseline
     records = replace(prepared.records, lines=finding.rows.filtering.lines)
     finding, fitted, free_runs = _with_free_runs(prepared, records, finding)
     hypotheses, rows, train_data = finding.hypotheses, finding.rows, finding.rows.train
@@ -332,22 +343,39 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
     return replace(result, notes=tuple(notes), sentence=sentence(result))
 
 
-def _traced_within_tolerances(
-    records: TraceRuns, options: _Options, finding: Finding, progress: Callable[[float], None]
-) -> Trace | None:
-    """Return a simpler answer with a geometry within the rig file's tolerances, None if none."""
-    if options.geometry_exact:
-        return None
+def _geometry_that_explains(prepared: _Prepared, finding: Finding) -> Geometry | None:
+    """Return a geometry within the rig file's tolerances that explains with another set, or None.
+
+    The set is smaller than that of a finding that explains (`geometry_for_smaller_set`). Fitted to
+    the rows of the moved rig, it must leave the choosing rows within the band.
+    """
     explained = finding.verdict != UNEXPLAINED
     geometry = geometry_for_smaller_set(finding.hypotheses, finding.winner, explained)
     if geometry is None:
         return None
-    again = _traced(records.of_rig(geometry.rig), replace(options, geometry_exact=True), progress)
+    used = finding.rows.filtering
+    filtering = moving_filtering(used.in_motion, used.full_weight)
+    rows = trace_rows(prepared.records.of_rig(geometry.rig), filtering)
+    hypotheses = HypothesisSet(rows.train, [])
+    refined = hypotheses.refined(geometry.effects)
+    above_band = gates.equations_above_band(hypotheses, refined, rows.choosing)
+    return None if above_band else geometry
+
+
+def _traced_within_tolerances(
+    records: TraceRuns, options: _Options, finding: Finding, geometry: Geometry
+) -> Trace | None:
+    """Return the answer with another geometry, None unless it explains, with a smaller set."""
+    explained = finding.verdict != UNEXPLAINED
+    prepared, moved = _searched(records.of_rig(geometry.rig), options, lambda _: None)
     sizes = [
         (len(effects), sum(len(e.parameters) for e in effects))
-        for effects in (again.effects, finding.named)
+        for effects in (moved.named, finding.named)
     ]
-    if again.verdict == UNEXPLAINED or (explained and sizes[0] >= sizes[1]):
+    if moved.verdict == UNEXPLAINED or (explained and sizes[0] >= sizes[1]):
+        return None
+    again = _concluded(prepared, options, moved)
+    if again.verdict == UNEXPLAINED:
         return None
     for equation, ratio in held_out_ratios(finding.rows, finding.winner).items():
         largest = max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio)

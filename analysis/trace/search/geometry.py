@@ -24,6 +24,7 @@ from scipy.optimize import lsq_linear
 
 from analysis.regression.least_squares import shortest
 from analysis.signals.conditioning import of_other_geometry
+from analysis.terms.base import Used
 from analysis.trace.data.cache import RowCache
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.exact_fit import ExactFit, design_matrix, tangent
@@ -39,10 +40,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Geometry:
-    """A rig whose uncertain numbers are moved by `deviations` (J,) [sigma]."""
+    """A rig whose uncertain numbers are moved by `deviations` (J,) [sigma], and the set beside it.
+
+    The shapes of the `effects` are those fitted with the stated numbers.
+    """
 
     rig: Rig
     deviations: Array
+    effects: tuple[Used, ...]
 
 
 def geometry_for_smaller_set(
@@ -77,7 +82,10 @@ def geometry_for_smaller_set(
         )
         if is_as_small and (best is None or is_preferred(moved, best[0], band)):
             best = moved, deviations
-    return None if best is None else Geometry(data.rig.with_deviations(best[1].tolist()), best[1])
+    if best is None:
+        return None
+    hypothesis, deviations = best
+    return Geometry(data.rig.with_deviations(deviations.tolist()), deviations, hypothesis.effects)
 
 
 def residual_changes(

@@ -6,24 +6,26 @@ The bench keeps its geometry; the rig file that the records are read with states
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
+from analysis.trace import engine
 from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace
 from analysis.trace.search.exact_fit import fit_coefficients
-from analysis.trace.search.geometry import geometry_for_smaller_set, residual_changes
+from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set, residual_changes
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.tolerances import Tolerances
 from tests.analysis.small_bench import TRUTH
-from tests.analysis.trace.gate_cases import searched
+from tests.analysis.trace.gate_cases import at_joint_2, searched
 from tests.analysis.trace.hidden import STATED, misread, pair_of_runs
 
 
@@ -65,6 +67,37 @@ def test_a_part_of_the_set_is_tried_with_the_geometry_though_the_search_did_not_
     s.hypotheses.fitted = {winner.keys: winner}
     assert geometry_for_smaller_set(s.hypotheses, winner, explained=True) is not None
     assert frozenset({("internal_leakage", "joint 2")}) in s.hypotheses.fitted
+
+
+def test_records_are_traced_again_only_where_the_other_geometry_leaves_little(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To first order a geometry may explain what its rows do not bear out."""
+    traces: list[object] = []
+    again = engine._traced_within_tolerances
+    proposed = engine.geometry_for_smaller_set
+
+    def counted(*arguments: Any) -> Trace | None:
+        traces.append(arguments)
+        return again(*arguments)
+
+    def elsewhere(*arguments: Any, **named: Any) -> Geometry:
+        geometry = proposed(*arguments, **named)
+        far = runs[0].rig.with_deviations((-2.0 * geometry.deviations).tolist())
+        return replace(geometry, rig=far)
+
+    monkeypatch.setattr(engine, "_traced_within_tolerances", counted)
+    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig)]
+    candidates = at_joint_2(runs[0].rig, "sensor_gain", "dead_volume")
+
+    def verdict() -> str:
+        return trace([runs[0]], [runs[1]], candidates, look_ahead=False, free_forms=False).verdict
+
+    assert verdict() == "clean"
+    assert len(traces) == 1
+    monkeypatch.setattr(engine, "geometry_for_smaller_set", elsewhere)
+    assert verdict() != "clean"
+    assert len(traces) == 1
 
 
 def test_a_gain_far_beyond_the_tolerance_of_an_area_is_still_named(rig: Rig) -> None:
