@@ -636,7 +636,7 @@ def a_search_that_ended_beyond_the_spools_travel_is_begun_anew(b: Benches) -> No
         far = hypotheses.refined([Used(band, (0.5, 0.5, 0.003))])
         near = [Used(band, (0.004, 0.014, 0.003))]
         energy = fit_coefficients(hypotheses.train_data, (*hypotheses.base, *near)).energy
-        again = hypotheses.refined_below(energy, near)
+        again = hypotheses.refined_below(energy, near, hypotheses.empty)
     finally:
         hypotheses.fitted[known.keys] = known
     assert again.total < 1e-3 * far.total

@@ -257,7 +257,8 @@ RULES: Final = (
          tuple((module, "with_parts_beside", lambda *_: iter(()))
                for module in (alternatives, extensions, judging))),
     Rule("begun anew", "a search of shapes that ended in a local minimum is not begun anew",
-         ((HypothesisSet, "refined_below", lambda kept, _, effects: kept.refined(effects)),),
+         ((HypothesisSet, "refined_below",
+           lambda kept, _, effects, rival: kept.refined(effects, rival)),),
          comparable=False),
     Rule("nearer start", "a further effect begins at its size by first-order columns",
          ((extensions, "at_best_size", lambda _, used, _others: used),)),
