@@ -122,13 +122,12 @@ def trace(
     if result.verdict == UNEXPLAINED and MECHANICAL in families and may_be_load:
         refused = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
         load = undeclared_load(records, refused)
-    if load is None:
-        return replace(result, seconds=time.perf_counter() - started)
-    again = _with_stated_rig(rig, _traced(load.records, options, lambda _: None))
-    if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
-        result = replace(again, notes=(*notes, load.words, *again.notes))
-    elif load.shows_inertia:
-        result = replace(result, notes=(*result.notes, load.words))
+    if load is not None:
+        again = _with_stated_rig(rig, _traced(load.records, options, lambda _: None))
+        if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
+            result = replace(again, notes=(*notes, load.words, *again.notes))
+        elif load.shows_inertia:
+            result = replace(result, notes=(*result.notes, load.words))
     return replace(result, seconds=time.perf_counter() - started)
 
 
@@ -356,8 +355,7 @@ def _geometry_that_explains(prepared: _Prepared, finding: Finding) -> Geometry |
     used = finding.rows.filtering
     filtering = moving_filtering(used.in_motion, used.full_weight)
     rows = trace_rows(prepared.records.of_rig(geometry.rig), filtering)
-    hypotheses = HypothesisSet(rows.train, [])
-    refined = hypotheses.refined(geometry.effects)
+    hypotheses, refined = _refined_on(rows, geometry.effects)
     above_band = gates.equations_above_band(hypotheses, refined, rows.choosing)
     return None if above_band else geometry
 
@@ -430,9 +428,14 @@ def _final_verdict(
 
 def _explain_judging_rows(rows: TraceRows, effects: Sequence[Used]) -> bool:
     """Return whether effects, refined on the training rows, leave the judging rows in the band."""
-    hypotheses = HypothesisSet(rows.train, [])
-    refined = hypotheses.refined(effects)
+    hypotheses, refined = _refined_on(rows, effects)
     return not judging_rows_above_band(rows.judging, hypotheses.empty, refined)[0]
+
+
+def _refined_on(rows: TraceRows, effects: Sequence[Used]) -> tuple[HypothesisSet, Hypothesis]:
+    """Return the exact fit of effects to the training rows of `rows`, and the set that it is of."""
+    hypotheses = HypothesisSet(rows.train, [])
+    return hypotheses, hypotheses.refined(effects)
 
 
 def judging_rows_above_band(

@@ -146,7 +146,10 @@ class HypothesisSet:
             rival_fit = None if rival is None else rival.fit
             fit = refine(self.train_data, (*self.base, *effects), rival_fit, in_form)
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
-            (self._in_form.add if in_form else self._in_form.discard)(key)
+            if in_form:
+                self._in_form.add(key)
+            else:
+                self._in_form.discard(key)
         return self.fitted[key]
 
     def in_best_forms(self, hypothesis: Hypothesis) -> Hypothesis:
@@ -174,14 +177,14 @@ class HypothesisSet:
         return self.fitted[earlier.keys]
 
     def refined_below(
-        self, energy: float, effects: Sequence[Used], rival: Hypothesis | None = None
+        self, energy: float, effects: Sequence[Used], rival: Hypothesis
     ) -> Hypothesis:
         """Return the exact fit of a set whose shapes in `effects` leave `energy`, or less.
 
-        It may replace `rival`, if that is given. An earlier fit that leaves more ended in a local
-        minimum and is repeated from these shapes.
+        It may replace `rival`. An earlier fit that leaves more ended in a local minimum and is
+        repeated from these shapes.
         """
-        in_rival = [] if rival is None else [u for u in effects if u in rival.effects]
+        in_rival = [used for used in effects if used in rival.effects]
         earlier = self.refined(effects, rival, in_rival)
         return earlier if earlier.fit.energy <= energy else self.refined_anew(effects, rival)
 

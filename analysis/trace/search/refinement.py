@@ -241,7 +241,7 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, shown_first: 
 
 
 def _in_other_form(
-    data: RegressionData, fit: ExactFit, place: int, start: Sequence[float]
+    data: RegressionData, fit: ExactFit, place: int, start: tuple[float, ...]
 ) -> ExactFit | None:
     """Return the fit with the term number `place` in another form, from the shape `start` of it.
 
@@ -249,7 +249,7 @@ def _in_other_form(
     terms' shapes as they are.
     """
     used = fit.terms[place]
-    terms = with_term(fit.terms, used, Used(used.term, tuple(start)))
+    terms = with_term(fit.terms, used, Used(used.term, start))
     alone = _with_searched_shapes(data, terms, only=place)
     if alone.energy > SEARCH.unpromising_form * fit.energy:
         return None
