@@ -92,7 +92,7 @@ def trace(
     `look_ahead`: design the next experiment.
     `terms`: a model's terms in place of the baseline's; shapes of its effects are not searched.
     `free_forms`: try mechanisms whose curve the data give where no named effect explains.
-    `progress`: is called with the share of the work done.
+    `progress`: is called with the share of the work done, during the search with the same again.
 
     Raises InputError for records of different rigs, for no held-out records, for held-out or
     judging records that are equal to others, and for records that are too short.
@@ -113,8 +113,10 @@ def trace(
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
     with_b = ck.common_rig([*train, *unseen, *judging])
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
-    result = _traced(records, options, _without_steps_back(progress or (lambda _: None)))
-    result = _with_stated_rig(rig, _traced_in_narrower_rows(records, options, result) or result)
+    progress = _without_steps_back(progress or (lambda _: None))
+    result = _traced(records, options, progress)
+    narrower = _traced_in_narrower_rows(records, options, result, progress)
+    result = _with_stated_rig(rig, narrower or result)
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
     may_be_load &= all(used.term.name != Payload.name for used in known)
@@ -123,7 +125,7 @@ def trace(
         refused = [effect_of(f.name, f.at) for f in filter(gates.removes, result.refused)]
         load = undeclared_load(records, refused)
     if load is not None:
-        again = _with_stated_rig(rig, _traced(load.records, options, lambda _: None))
+        again = _with_stated_rig(rig, _traced(load.records, options, progress))
         if again.verdict != UNEXPLAINED and Payload.name in {f.name for f in again.effects}:
             result = replace(again, notes=(*notes, load.words, *again.notes))
         elif load.shows_inertia:
@@ -132,14 +134,13 @@ def trace(
 
 
 def _without_steps_back(report: Callable[[float], None]) -> Callable[[float], None]:
-    """Return a report of progress that leaves out what a repeated search has reached before."""
+    """Return a report of progress that stays where it is while a search is repeated."""
     reached = 0.0
 
     def progress(share: float) -> None:
         nonlocal reached
-        if share > reached:
-            reached = share
-            report(share)
+        reached = max(reached, share)
+        report(reached)
 
     return progress
 
@@ -233,7 +234,7 @@ def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], N
     """Trace records whose loads are stated, or taken to be the same (see `trace`)."""
     prepared, finding = _searched(records, options, progress)
     if geometry := _geometry_that_explains(prepared, finding):
-        again = _traced_within_tolerances(records, options, finding, geometry)
+        again = _traced_within_tolerances(records, options, finding, geometry, progress)
         if again is not None:
             return again
     progress(JUDGED)
@@ -361,11 +362,12 @@ def _geometry_that_explains(prepared: _Prepared, finding: Finding) -> Geometry |
 
 
 def _traced_within_tolerances(
-    records: TraceRuns, options: _Options, finding: Finding, geometry: Geometry
-) -> Trace | None:
+    records: TraceRuns, options: _Options, finding: Finding, geometry: Geometry,
+    progress: Callable[[float], None],
+) -> Trace | None:  # fmt: skip
     """Return the answer with another geometry, None unless it explains, with a smaller set."""
     explained = finding.verdict != UNEXPLAINED
-    prepared, moved = _searched(records.of_rig(geometry.rig), options, lambda _: None)
+    prepared, moved = _searched(records.of_rig(geometry.rig), options, progress)
     sizes = [
         (len(effects), sum(len(e.parameters) for e in effects))
         for effects in (moved.named, finding.named)
@@ -383,7 +385,9 @@ def _traced_within_tolerances(
     return replace(again, notes=(note, *again.notes))
 
 
-def _traced_in_narrower_rows(records: TraceRuns, options: _Options, result: Trace) -> Trace | None:
+def _traced_in_narrower_rows(
+    records: TraceRuns, options: _Options, result: Trace, progress: Callable[[float], None]
+) -> Trace | None:
     """Return an explanation in rows of lower frequencies where a result names nothing, else None.
 
     Its effects must leave no more than noise in the judging rows of the measured bandwidth too.
@@ -393,7 +397,7 @@ def _traced_in_narrower_rows(records: TraceRuns, options: _Options, result: Trac
         return None
     narrower = TRACE.narrower_bandwidth * width
     try:
-        again = _traced(records.of_bandwidth(narrower), options, lambda _: None)
+        again = _traced(records.of_bandwidth(narrower), options, progress)
     except InputError as error:  # the longer filter leaves too few rows of short records
         log.info("not traced in rows up to %.3g Hz: %s", narrower, error)
         return None

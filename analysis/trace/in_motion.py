@@ -41,7 +41,7 @@ def find(
     rests = any(_rests(rows.train.records, joint) for joint in joints)
     tried = replace(candidates, free=()) if rests else candidates
     on_all_rows = search_and_judge(rows, tried, progress)
-    finding = searched_in_motion(records, candidates, on_all_rows)
+    finding = searched_in_motion(records, candidates, progress, on_all_rows)
     if rests and finding is on_all_rows:
         finding = with_free_form(finding, candidates)
     finding = without_unnamed_effects(finding)
@@ -74,7 +74,9 @@ def _judged_lines(records: TraceRuns, finding: Finding) -> tuple[JudgedEffect, .
     return tuple(judged)
 
 
-def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Finding) -> Finding:
+def searched_in_motion(
+    records: TraceRuns, candidates: Candidates, progress: Callable[[float], None], finding: Finding
+) -> Finding:
     """Search again in rows weighted by speed, where a joint's torque balance is above the noise.
 
     While a joint rests, dry friction is any force up to its breakaway: no law of the speed fits
@@ -94,7 +96,7 @@ def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Find
         unweighted = finding.rows.train.cache.without_family("mechanical")
         filtering = moving_filtering({*weighted, *joints}, full_weight)
         rows = trace_rows(records, filtering, unweighted)
-        moving = search_and_judge(rows, candidates, lambda _: None)
+        moving = search_and_judge(rows, candidates, progress)
         resting = rest_phase_notes(rows.filtering.in_motion, included=False)
         return replace(moving, notes=(*resting, *moving.notes))
 
@@ -113,7 +115,7 @@ def searched_in_motion(records: TraceRuns, candidates: Candidates, finding: Find
     notes = *_breakaway_notes(moving, finding, acting), *moving.notes
     failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
     moving = replace(moving, notes=notes, effects=(*moving.effects, *failed))
-    return searched_in_motion(records, candidates, moving)
+    return searched_in_motion(records, candidates, progress, moving)
 
 
 def _joints_to_weight(finding: Finding, friction: Sequence[Effect]) -> tuple[set[str], set[int]]:

@@ -57,13 +57,13 @@ def search_and_judge(
 ) -> Finding:
     """Search the candidates for the effects that the model lacks; judge them on the choosing rows.
 
-    `progress` receives the share of the candidates' columns that is computed.
+    `progress` is called as by `HypothesisSet`.
     """
-    hypotheses, choosing = HypothesisSet(rows.train, candidates.named), rows.choosing
+    hypotheses, choosing = HypothesisSet(rows.train, candidates.named, progress), rows.choosing
     in_noise = hypotheses.within_noise(hypotheses.empty)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    found = exchanged(hypotheses, search(hypotheses, progress))
+    found = exchanged(hypotheses, search(hypotheses))
     winner = improved_by_exact_trials(hypotheses, found)
     if in_noise:
         winner = _shown_by_held_out_rows(hypotheses, winner, choosing)

@@ -34,13 +34,28 @@ def test_short_work_is_quiet_and_long_work_says_what_is_left() -> None:
         progress(share)
     assert said == []
     clock.now = 100.0 + 20.0
-    progress(0.25)
+    progress(0.25001)
     progress(0.26)
     clock.now += LINE_SECONDS
     progress(0.5)
     clock.now += 100.0
     progress(1.0)
     assert said == ["tracing: 25 %, about 1:00 left", "tracing: 50 %, about 0:23 left"]
+
+
+def test_work_that_does_not_get_on_states_no_remaining_time() -> None:
+    """A search of unknown length reports the share reached before it, each time it has tried."""
+    clock, said = Clock(), []
+    progress = Countdown("tracing", said.append, clock)
+    for seconds, share in ((5.0, 0.5), (4.0, 0.5), (3.0, 0.5), (70.0, 0.5), (5.0, 0.8)):
+        clock.now += seconds
+        progress(share)
+    assert said == [
+        "tracing: 50 %, about 0:05 left",
+        "tracing: 50 % for 0:04, time left unknown",
+        "tracing: 50 % for 1:17, time left unknown",
+        "tracing: 80 %, about 0:22 left",
+    ]
 
 
 @pytest.mark.parametrize(

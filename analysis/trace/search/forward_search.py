@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +17,9 @@ from analysis.trace.settings import SEARCH
 Array = NDArray[np.float64]
 
 
-def search(
-    hypotheses: HypothesisSet, progress: Callable[[float], None] | None = None
-) -> Hypothesis:
-    """Search single effects, pairs and extensions, and return the best set.
-
-    `progress` is called with the share of the candidates' columns that is computed.
-    """
-    hypotheses.compute_columns(progress)
+def search(hypotheses: HypothesisSet) -> Hypothesis:
+    """Search single effects, pairs and extensions, and return the best set."""
+    hypotheses.compute_columns()
     candidates, r = hypotheses.candidates, hypotheses.train_data.mean_residual
     r = r - candidates.basis @ (candidates.basis.T @ r)
     result = _searched(hypotheses, candidates, r)

@@ -52,16 +52,21 @@ class HypothesisSet:
 
     `base` are the model's own terms, `effects` the candidates, `fitted` all sets fitted so far by
     names and places, `empty` the set without effects (the baseline), `noise_band` the energy that
-    counts as noise. `columns` and `candidates` are set by `compute_columns`.
+    counts as noise. `columns` and `candidates` are set by `compute_columns`. `progress` is called
+    with the share of the candidates' columns that is computed, and again after each fitted set.
     """
 
-    def __init__(self, train_data: RegressionData, effects: Sequence[Effect]) -> None:
+    def __init__(
+        self, train_data: RegressionData, effects: Sequence[Effect],
+        progress: Callable[[float], None] = lambda _: None,
+    ) -> None:  # fmt: skip
         self.train_data = train_data
         self.base = tuple(train_data.terms)
         self.effects = tuple(effects)
         self.noise_band = noise_band(train_data)
         self.fitted: dict[frozenset[Key], Hypothesis] = {}
         self._in_form: set[frozenset[Key]] = set()
+        self._progress = progress
         self.empty = self.at_given_shapes(())
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
@@ -74,10 +79,11 @@ class HypothesisSet:
         fit = fit_coefficients(self.train_data, (*self.base, *effects))
         return self._hypothesis(fit.terms[len(self.base) :], fit)
 
-    def compute_columns(self, progress: Callable[[float], None] | None = None) -> None:
-        """Compute the candidates' columns under the baseline; `progress` receives the share."""
+    def compute_columns(self) -> None:
+        """Compute the candidates' columns under the baseline."""
         data = self.train_data
-        self.columns = variant_columns(data, self.variants_of(data, data.mean_residual), progress)
+        candidates = self.variants_of(data, data.mean_residual)
+        self.columns = variant_columns(data, candidates, self._progress)
         self.candidates = self.candidate_columns(data, self.columns)
 
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
@@ -145,6 +151,7 @@ class HypothesisSet:
         if key not in self.fitted:
             rival_fit = None if rival is None else rival.fit
             fit = refine(self.train_data, (*self.base, *effects), rival_fit, in_form)
+            self._progress(1.0)
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
             if in_form:
                 self._in_form.add(key)

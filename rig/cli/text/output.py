@@ -58,7 +58,9 @@ def clock_text(seconds: float) -> str:
 class Countdown:
     """Reports progress and remaining time; called with the share done, 0 to 1.
 
-    Reports nothing within the first LINE_SECONDS, so not at all for short work.
+    Reports nothing within the first LINE_SECONDS, so not at all for short work. While the share
+    stays the same, it reports for how long, since no remaining time follows from it, and reports
+    again when that time has doubled.
     """
 
     def __init__(
@@ -68,16 +70,25 @@ class Countdown:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._what, self._say, self._clock = what, say, clock
-        self._start = self._last_line = clock()
+        self._start = self._last_line = self._reached = clock()
+        self._share = 0.0
 
     def __call__(self, share: float) -> None:
         """Report the share done so far, at most once every LINE_SECONDS."""
         now = self._clock()
-        if now - self._last_line < LINE_SECONDS or not 0.0 < share < 1.0:
+        rises = share > self._share
+        if rises:
+            self._share, self._reached = share, now
+        pause = LINE_SECONDS if rises else max(LINE_SECONDS, self._last_line - self._reached)
+        if now - self._last_line < pause or not 0.0 < share < 1.0:
             return
         self._last_line = now
-        remaining = (now - self._start) * (1.0 - share) / share
-        self._say(f"{self._what}: {100 * share:.0f} %, about {clock_text(remaining)} left")
+        percent = f"{self._what}: {100 * share:.0f} %"
+        if rises:
+            remaining = (now - self._start) * (1.0 - share) / share
+            self._say(f"{percent}, about {clock_text(remaining)} left")
+        else:
+            self._say(f"{percent} for {clock_text(now - self._reached)}, time left unknown")
 
 
 def _plain(value: Any) -> Any:

@@ -494,7 +494,8 @@ def slow_rows_show_what_noise_of_the_acceleration_hides(b: Benches) -> None:
     wide = engine._traced(records, options, lambda _: None)
     assert wide.effects == ()
     # Where the wide rows keep a little more than noise, the narrower ones are asked.
-    again = engine._traced_in_narrower_rows(records, options, replace(wide, verdict=UNEXPLAINED))
+    unexplained = replace(wide, verdict=UNEXPLAINED)
+    again = engine._traced_in_narrower_rows(records, options, unexplained, lambda _: None)
     assert again is not None
     named = {*again.tied_at, *((e.name, e.at) for e in again.effects)}
     assert named == {("joint_spring", "joint 2"), ("base_inclination", "bench")}
