@@ -107,8 +107,10 @@ def judge_effects(
         without = held_out_residual(holdout_data, alternative.fit)
         changes = held_out.removed_energy(winner, alternative)
         tie_test = rivals.TieTest(holdout_data, changes, after, without)
-        pairs = rivals.tied_pairs(hypotheses, winner, used, tie_test)
-        others = rivals.rivals_of(hypotheses, winner, used, alternative, tie_test, pairs)
+        pairs, others = [], []
+        if changes:  # an effect that removes nothing leaves no equation to compare others in
+            pairs = rivals.tied_pairs(hypotheses, winner, used, tie_test)
+            others = rivals.rivals_of(hypotheses, winner, used, alternative, tie_test, pairs)
         removed = held_out.removal_of(holdout_data, changes, without, after)
         disturbed = {
             *held_out.disturbed_equations(hypotheses, winner, alternative),
@@ -129,6 +131,8 @@ def judge_effects(
         removes = removed.share >= TRACE.least_removed and not disturbed
         significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown_size else "")
         rival_words = rivals.rivals_in_words([*inseparable, *others])
+        if not changes:
+            rival_words = "it removes nothing that another effect could remove"
         separated = not (inseparable or any(r.tied for r in others))
         if separated:
             rival_words += rivals.pair_in_words(pairs)

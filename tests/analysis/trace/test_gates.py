@@ -13,7 +13,7 @@ import pytest
 
 from analysis.trace import judging
 from analysis.trace.finding import Finding, remainders
-from analysis.trace.judge import held_out
+from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.gates import judged_beside_unknown_cause
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import SEARCH
@@ -63,6 +63,23 @@ def test_an_edge_cannot_overlap_and_be_open_at_the_null(rig: Rig) -> None:
     assert "exclude each other" in s.hypotheses.physical_problem(s.set_of(*names))
     for name in names:
         assert "exclude" not in s.hypotheses.physical_problem(s.set_of(name))
+
+
+def test_an_effect_that_removes_nothing_is_compared_with_no_other(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without it the other effects leave as little: no equation shows what a rival would do."""
+    names = ("internal_leakage", "sensor_offset")
+    s = gate_cases.searched(rig, *pair_of_runs(rig, c_internal=LEAK), *names)
+    leak = s.set_of("internal_leakage")
+    s.set_of("sensor_offset")
+    monkeypatch.setattr(gates, "_set_without", lambda *_: leak)
+    (judged,) = gates.judge_effects(s.hypotheses, leak, s.holdout_data, np.random.default_rng(0))
+    words = {gate.name: gate.detail for gate in judged.gates}
+    assert judged.rivals == ()
+    assert not gates.passes_gates(judged)
+    assert "it removes nothing" in words[gates.NO_RIVAL]
+    assert not any("nan" in text for text in words.values())
 
 
 def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect(rig: Rig) -> None:
