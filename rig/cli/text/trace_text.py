@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.loop_rounds import Round
@@ -13,6 +14,8 @@ from rig.cli.text.output import table
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
 from rig.model.units import RESULTS, display_unit, plain, typeset
+
+RIVALS_SHOWN: Final = 8  # of an effect, the nearest; the report and the JSON have all of them
 
 
 def trace_text(result: Trace) -> str:
@@ -88,8 +91,12 @@ def _effect(effect: JudgedEffect, rig: Rig) -> list[str]:
     lines += [
         f"  rival {r.name} at {r.location}: {r.ratio:.2f} times the held-out rms"
         + (" (cannot be separated)" if r.tied else "")
-        for r in effect.rivals
+        for r in effect.rivals[:RIVALS_SHOWN]
     ]
+    further = effect.rivals[RIVALS_SHOWN:]
+    if further:
+        tied = sum(r.tied for r in further)
+        lines.append(f"  and {len(further)} further rivals, {tied} of which cannot be separated")
     return [*lines, ""]
 
 

@@ -22,6 +22,7 @@ from analysis.trace.notes import not_judged_notes, rival_notes, undetermined_not
 from analysis.trace.result import EXPLAINED, UNEXPLAINED, Gate, JudgedEffect, Rival, Trace
 from analysis.trace.search.exact_fit import ExactFit
 from analysis.trace.words import quantity, sentence, tolerated_error_notes
+from rig.cli.text.trace_text import RIVALS_SHOWN, trace_text
 from rig.model.rig import Rig
 
 FLOOR = {"flow_cap_1": 3.5e-8, "torque_2": 0.14}
@@ -242,3 +243,15 @@ def test_an_equation_that_the_effects_make_worse_is_said_to_be_worse() -> None:
         (left,) = finding.remainders(hypotheses, cast("Any", after), cast("Any", data))
     assert left.equation == "torque_1"
     assert left.words == "the repeatable rms is 1.15 times the noise, more than under the baseline"
+
+
+def test_of_many_rivals_a_terminal_shows_the_nearest(rig: Rig) -> None:
+    """A refused effect of one crane had 38 rivals that could not be separated."""
+    rivals = tuple(
+        Rival("sensor_offset", f"joint {k}", 1.0, 1.0, k < 30, f"joint {k} cap") for k in range(40)
+    )
+    text = trace_text(explained(rig, (replace(SPRING, rivals=rivals),)))
+    assert text.count("  rival ") == RIVALS_SHOWN
+    further = 40 - RIVALS_SHOWN
+    assert f"  and {further} further rivals, {30 - RIVALS_SHOWN} of which cannot be" in text
+    assert "further" not in trace_text(explained(rig, (replace(SPRING, rivals=rivals[:3]),)))
