@@ -167,11 +167,16 @@ def motion_bandwidth(
 
 
 def _bandwidth(position: Array, rate: float) -> float:
-    """Return the bandwidth [Hz] of a position (n,); lines that noise may cause do not count."""
+    """Return the bandwidth [Hz] of a position (n,); lines that noise may cause do not count.
+
+    The power of noise is exponentially distributed about its mean: of N lines, N exp(-x) are
+    expected above x times the mean.
+    """
     f, power = power_spectrum(position, rate)
     noise = noise_power(f, power, EXCHANGE.highest_bandwidth)
     inside = f <= EXCHANGE.highest_bandwidth
-    seen = np.where(power > EXCHANGE.above_noise * noise, power, 0.0)[inside]
+    least = noise * math.log(np.count_nonzero(inside) / EXCHANGE.noise_lines)
+    seen = np.where(power > least, power, 0.0)[inside]
     if not seen.any():
         return EXCHANGE.highest_bandwidth
     velocity = np.cumsum(seen * f[inside] ** 2)

@@ -20,11 +20,11 @@ class ExchangeSettings:
     trip_seconds: float = 2.0  # [s] before the offending sample, and after it
 
     # Bandwidth of the motion in records without excited lines: the share of the velocity's power
-    # below it, how many times the noise's mean power a spectral line must have (noise exceeds 10
-    # times once in 22 000 lines), the highest frequency examined [Hz], and the shortest record [s]
-    # that states one.
+    # below it, the expected number of lines of noise in a channel that count as motion (one of
+    # them gives a bench rows for ten times its motion), the highest frequency examined [Hz], and
+    # the shortest record [s] that states one.
     velocity_share: float = 0.998
-    above_noise: float = 10.0
+    noise_lines: float = 1e-4
     highest_bandwidth: float = 15.0
     bandwidth_seconds: float = 6.0
 
