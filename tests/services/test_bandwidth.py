@@ -69,8 +69,23 @@ def test_slow_motion_has_a_narrow_filter_alike_in_all_records(rig: Rig, tmp_path
     assert cutoff_of(bare) == pytest.approx(1.3 * wide, rel=0.05)
 
 
-def test_the_bandwidth_that_a_manifest_states_holds(rig: Rig, tmp_path: Path) -> None:
-    (record,) = imported(tmp_path, rig, ", bandwidth: 8 Hz", moved(rig, 0.3, 1.3))
+def test_a_stated_bandwidth_holds_up_to_that_of_the_motion(rig: Rig, tmp_path: Path) -> None:
+    """A careful user states more than the motion needs: the rows would hold noise alone there."""
+    for stated, used in ((0.9, 0.9), (8.0, 1.3)):
+        folder = tmp_path / f"{stated}"
+        folder.mkdir()
+        (record,) = imported(folder, rig, f", bandwidth: {stated} Hz", moved(rig, 0.3, 1.3))
+        assert record.bandwidth == pytest.approx(used, abs=0.2)
+        said = (folder / "run" / "events.jsonl").read_text()
+        words = f"8 Hz is stated, and the motion is below {record.bandwidth:.2g} Hz"
+        assert (words in said) == (stated == 8.0)
+        assert ("bandwidth:" in said) == (stated == 8.0)
+
+
+def test_a_short_record_keeps_the_bandwidth_that_it_states(rig: Rig, tmp_path: Path) -> None:
+    """Its spectrum is too coarse to show the bandwidth of its motion."""
+    short = moved(rig, 0.3, 1.3, seconds=4.0)
+    (record,) = imported(tmp_path, rig, ", bandwidth: 8 Hz", short)
     assert record.bandwidth == 8.0
     assert cutoff_of(record) == pytest.approx(1.3 * 12.0, rel=0.05)
 

@@ -84,6 +84,7 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
     records = [_read(source, entry) for entry in manifest.records]
     warnings = _warnings(source, records)
     records = _with_bandwidth(rig, [_without_outliers(rig, r) for r in records])
+    warnings += _narrowed(manifest, records)
     _write(source, records, folder, warnings)
     samples = sum(len(next(iter(r.channels.values()))) for r in records)
     return ImportReport(folder, len(records), samples, warnings)
@@ -131,23 +132,52 @@ def _without_outliers(rig: Rig, imported: _Imported) -> _Imported:
 
 
 def _with_bandwidth(rig: Rig, records: list[_Imported]) -> list[_Imported]:
-    """Return records with the `common_bandwidth` of those that state neither it nor lines."""
+    """Return records with their bandwidths, except those that state lines.
 
-    def is_measured(r: _Imported) -> bool:
-        return not r.entry.lines and r.entry.bandwidth is None
-
-    width = common_bandwidth(
-        [
-            motion_bandwidth(rig, r.entry.locked, r.channels, r.sample_rate)
-            for r in records
-            if is_measured(r)
-        ]
-    )
-    stated = {BANDWIDTH: width}
-    return [
-        replace(r, entry=r.entry.model_copy(update=stated)) if is_measured(r) else r
+    It is the `common_bandwidth` of those that do not state it, and for another one that of its
+    motion where it states more.
+    """
+    measured = [
+        motion_bandwidth(rig, r.entry.locked, r.channels, r.sample_rate)
+        if not r.entry.lines
+        else None
         for r in records
     ]
+    unstated = [
+        width
+        for width, r in zip(measured, records, strict=True)
+        if not r.entry.lines and r.entry.bandwidth is None
+    ]
+    common = common_bandwidth(unstated)
+
+    def of(record: _Imported, width: float | None) -> float | None:
+        stated = record.entry.bandwidth
+        if stated is None:
+            return None if record.entry.lines else common
+        return stated if width is None else min(stated, width)
+
+    return [
+        replace(r, entry=r.entry.model_copy(update={BANDWIDTH: of(r, width)}))
+        for r, width in zip(records, measured, strict=True)
+    ]
+
+
+def _narrowed(manifest: Manifest, records: list[_Imported]) -> tuple[str, ...]:
+    """Say where records state a bandwidth that their motion does not reach."""
+    pairs = [
+        (entry.bandwidth, r.entry.bandwidth)
+        for entry, r in zip(manifest.records, records, strict=True)
+        if entry.bandwidth is not None and r.entry.bandwidth is not None
+    ]
+    if not pairs:
+        return ()
+    stated, used = (max(widths) for widths in zip(*pairs, strict=True))
+    if used > EXCHANGE.narrowed * stated:
+        return ()
+    return (
+        f"bandwidth: {stated:g} Hz is stated, and the motion is below {used:.2g} Hz: rows are "
+        "filtered for that, since wider ones hold more noise",
+    )
 
 
 def motion_bandwidth(

@@ -27,6 +27,7 @@ class ExchangeSettings:
     noise_lines: float = 1e-4
     highest_bandwidth: float = 15.0
     bandwidth_seconds: float = 6.0
+    narrowed: float = 0.7  # of the stated bandwidth: up to this, the measured one is reported
 
     # Clipped, stuck and constant sensors.
     fewest_levels: int = 500  # in the range; a channel with fewer has flat tops anyway
