@@ -99,9 +99,9 @@ def oil_changes(holdout_data: RegressionData, model: ExactFit) -> dict[str, floa
 
     Oil of another temperature has another viscosity and bulk modulus: one factor for the viscous
     friction of all joints, and one for 1/b, each within `TRACE.viscosity_change` and
-    `TRACE.bulk_change`. A factor counts only where it exceeds `TRACE.noted_shift` and
-    `TRACE.standard_errors` of its noise and leaves at most `TRACE.noted_ratio` times the noise:
-    otherwise it would hide a part of an effect that the model lacks.
+    `TRACE.bulk_change`. A factor counts only where it exceeds `TRACE.standard_errors` of its noise
+    and leaves at most `TRACE.noted_ratio` times the noise: otherwise it would hide a part of an
+    effect that the model lacks.
     """
     return _oil_changes(holdout_data.rig, design_matrix(holdout_data, model.terms), model)
 
@@ -121,8 +121,7 @@ def _oil_changes(rig: Rig, rows: DesignMatrix, model: ExactFit) -> dict[str, flo
         change = float(np.clip(column @ residual / size**2, -bound, bound))
         left = (residual - change * column)[acting]
         noise_alone = left @ left <= TRACE.noted_ratio**2 * len(left)
-        significant = abs(change) > max(TRACE.standard_errors / size, TRACE.noted_shift)
-        if significant and noise_alone:
+        if abs(change) > TRACE.standard_errors / size and noise_alone:
             changes |= dict.fromkeys(beta, change)
     return changes
 

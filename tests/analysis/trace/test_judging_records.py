@@ -26,6 +26,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run, of_bandwidth
 from rig.model.rig import Rig
 from rig.runs.archive import write_run
+from tests.analysis.trace import foreign_bench
 from tests.analysis.trace.gate_cases import LEAK, at_joint_2, joined
 from tests.analysis.trace.hidden import (
     RMS,
@@ -287,3 +288,15 @@ def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) 
     assert masked_row_notes("training", few) == []
     notes = masked_row_notes("training", many)
     assert any(n.startswith("flow_cap_2: 9 % of the training rows") for n in notes), notes
+
+
+def test_oil_a_percent_thinner_on_another_day_is_allowed_for_where_rows_show_it(rig: Rig) -> None:
+    """A machine with little noise shows it at three times its noise, and lacks nothing else."""
+    terms = tuple(map(Used, baseline_of(rig)))
+    train, day = (
+        regression_data(rig, terms, conditioned_records(rig, [run]))
+        for run in foreign_bench.pair_of_runs(rig, foreign_bench.Hidden(), noise=0.1)
+    )
+    model = fit_coefficients(train, terms)
+    thicker = replace(model, beta={**model.beta, "Fv2": 1.009 * model.beta["Fv2"]})
+    assert held_out.oil_changes(day, thicker)["Fv2"] == pytest.approx(-0.009, abs=0.002)
