@@ -413,9 +413,9 @@ class SearchSettings:
     explain that equation (tuned)."""
     most_deviations: float = 3.0
     """Largest deviation of a number of the rig file, in its standard uncertainties (convention)."""
-    independent_rows: float = 0.03
-    """Share of the rows with independent noise, since the row filter correlates it (tuned: with it
-    a geometry drawn within its tolerances is estimated best)."""
+    independent_rows: float = 0.1
+    """Share of the rows with independent noise, since the row filter correlates it (tuned: with
+    0.03 a gain cost less than the deviation of an area by one standard uncertainty)."""
     free_form_near: float = 2.0
     """Remaining energy over the least of all sets with a free form: of the sets with less, the
     simplest is judged first (tuned)."""

@@ -56,7 +56,8 @@ def geometry_for_smaller_set(
     """Return the geometry with which a set simpler than `winner` leaves as little, None if none.
 
     `explained`: the `winner` explains the records; then no equation may keep more than with it or
-    than noise. Otherwise the other set may be of any size, and form error may remain.
+    than noise, by more than the price of the effects and numbers saved. Otherwise the other set may
+    be of any size, and form error may remain.
     """
     data = hypotheses.train_data
     numbers = data.rig.uncertain_numbers
@@ -72,12 +73,15 @@ def geometry_for_smaller_set(
     for hypothesis in (hypotheses.empty, *hypotheses.fitted.values()):
         if explained and hypothesis.size >= winner.size:
             continue
-        deviations, left = _likeliest(data, hypothesis, changes)
+        deviations, left = likeliest(data, hypothesis, changes)
         if float(deviations @ deviations) > limit:  # chi square with J degrees of freedom
             continue
         moved, band = replace(hypothesis, excess_energy=left), hypotheses.noise_band
+        price = SEARCH.number_price * (sum(winner.size) - sum(hypothesis.size))
         is_as_small = all(
-            v <= max(band[e], winner.excess_energy[e]) if explained else hypotheses.negligible(e, v)
+            v <= max(band[e], winner.excess_energy[e]) + price
+            if explained
+            else hypotheses.negligible(e, v)
             for e, v in left.items()
         )
         if is_as_small and (best is None or is_preferred(moved, best[0], band)):
@@ -120,7 +124,7 @@ def shape_errors(data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return {name: error for name, error in errors.items() if name not in fit.beta}
 
 
-def _likeliest(
+def likeliest(
     data: RegressionData, hypothesis: Hypothesis, changes: Array
 ) -> tuple[Array, dict[str, float]]:
     """Return the deviations (J,) [sigma] beside a set, and the energy above noise they leave."""

@@ -19,8 +19,10 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace
+from analysis.trace.search import geometry
 from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set, residual_changes
+from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.tolerances import Tolerances
@@ -98,6 +100,26 @@ def test_records_are_traced_again_only_where_the_other_geometry_leaves_little(
     monkeypatch.setattr(engine, "geometry_for_smaller_set", elsewhere)
     assert verdict() != "clean"
     assert len(traces) == 1
+
+
+@pytest.mark.parametrize(("share", "is_smaller"), [(0.5, True), (1.5, False)])
+def test_a_smaller_set_may_leave_the_price_of_the_numbers_it_saves(
+    rig: Rig, share: float, is_smaller: bool
+) -> None:
+    """A leak was named with a gain within the area's tolerance: alone it left 1 % more."""
+    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig, c_internal=2e-12)]
+    s = searched(runs[0].rig, *runs, "internal_leakage", "sensor_gain")
+    data, leak = s.hypotheses.train_data, s.set_of("internal_leakage")
+    gain = at_start(data.rig, make("sensor_gain", "joint 2 cap"))
+    both = s.hypotheses.refined([*leak.effects, gain])
+    changes = residual_changes(data, both.fit, data.rig.uncertain_numbers)
+    _, left = geometry.likeliest(data, leak, changes)
+    price = SEARCH.number_price * (sum(both.size) - sum(leak.size))
+    winner = replace(both, excess_energy={e: v - share * price for e, v in left.items()})
+    s.hypotheses.fitted = {leak.keys: leak, winner.keys: winner}
+    s.hypotheses.noise_band = dict.fromkeys(left, -np.inf)
+    found = geometry_for_smaller_set(s.hypotheses, winner, explained=True)
+    assert (found is not None and found.effects == leak.effects) == is_smaller
 
 
 def test_a_gain_far_beyond_the_tolerance_of_an_area_is_still_named(rig: Rig) -> None:
