@@ -46,7 +46,8 @@ class LogFormatter(logging.Formatter):
         return alarm(line) if getattr(record, "alarm", False) else line
 
 
-def _print_error(message: str) -> None:
+def print_error(message: str) -> None:
+    """Print each line of an error's message; one about outputs not at zero is white on red."""
     from rig.bench.outputs import UNSURE
 
     for part in message.strip().splitlines() or [""]:
@@ -120,15 +121,15 @@ def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
     try:
         code = work() or OK
         if code == INTERRUPTED:
-            _print_error("stopped")
+            print_error("stopped")
         return code
     except typer.Exit as error:
         return error.exit_code
     except typer.Abort:
-        _print_error("stopped")
+        print_error("stopped")
         return INTERRUPTED
     except TyperException as error:
-        _print_error(f"{error.format_message().rstrip('.')}; see --help")
+        print_error(f"{error.format_message().rstrip('.')}; see --help")
         return BAD_INPUT
     except SystemExit as error:
         # Typer ends the process at a closed pipe, without a message.
@@ -143,7 +144,7 @@ def _failed(error: BaseException, debug: bool) -> int:
     if debug:
         traceback.print_exception(error)
     code, message = code_and_message(error)
-    _print_error(message)
+    print_error(message)
     return code
 
 

@@ -158,6 +158,35 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
     ended_by(stop, endless, run)
 
 
+def test_stop_zeroes_one_bench_while_another_does_not_answer(endless: Path, tmp_path: Path) -> None:
+    with simulated() as one, simulated() as two:
+        # In the order in which `stop` finds them: the first device hangs.
+        (hung, device), (sound, _) = sorted((one, two), key=lambda bench: bench[0])
+        with (
+            third_record(endless, tmp_path / "hung", hung) as beside,
+            third_record(endless, tmp_path / "sound", sound) as process,
+        ):
+            try:
+                device.send_signal(signal.SIGSTOP)
+                with started("stop") as stopping:
+                    said = wait_for("use the emergency stop", stopping)
+                    assert f"outputs not confirmed at zero, shinshu-2dof at {hung}" in said[-1]
+                    told = [line for line in said if "stopping process" in line]
+                    assert any(str(tmp_path / "hung") in line for line in told)
+                    confirmed = stopping.stdout.readline()
+                    assert confirmed.startswith("outputs at zero, confirmed by the device of ")
+                    assert sound in confirmed
+                    assert process.wait(LONG) == 130
+                    assert outputs_are_zero(sound)
+                    assert stopping.poll() is None  # it still asks the other device
+                    device.send_signal(signal.SIGCONT)
+                    stopping.communicate(timeout=LONG)
+            finally:
+                device.send_signal(signal.SIGCONT)
+            beside.communicate(timeout=LONG)
+            assert outputs_are_zero(hung)
+
+
 def test_stop_by_another_name_of_the_port_ends_the_run(endless: Path, tmp_path: Path) -> None:
     run, link = tmp_path / "stopped", tmp_path / "ttyBENCH"
     with simulated("--wire", "modbus-rtu") as (endpoint, _):

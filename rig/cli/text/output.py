@@ -28,7 +28,8 @@ def progress(message: str) -> None:
     if sys.stderr is None:  # closed by the caller; print would write to standard output
         return
     try:
-        print(message, file=sys.stderr, flush=True)
+        # One write: lines of several threads stay apart.
+        print(f"{message}\n", end="", file=sys.stderr, flush=True)
     except OSError:
         discard(sys.stderr.fileno())
 

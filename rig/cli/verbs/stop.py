@@ -1,16 +1,19 @@
-"""The `stop` verb: outputs set to zero at once."""
+"""The `stop` verb: outputs set to zero at once, of several benches at the same time."""
 
 from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from contextlib import suppress
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final
 
 import typer
 
-from rig.cli.execution.device import device_of, print_pressure, refuse_endpoint_alone
+from rig.cli.errors import alarm, code_and_message, print_error
+from rig.cli.execution.device import device_of, refuse_endpoint_alone
 from rig.cli.options import EndpointOption, KnownRigOption
 from rig.cli.text.output import progress
 
@@ -18,8 +21,13 @@ if TYPE_CHECKING:
     from drivers.base import Driver
     from rig.bench.latch import Holder
     from rig.model.parts import Wire
+    from rig.model.rig import Rig
+
+News = SimpleQueue[str | BaseException | None]
 
 NOT_IN_USE: Final = "no process of this computer drives a bench"
+# Without an answer for so long the operator is told to use the emergency stop.
+SILENCE: Final = 1.0  # [s]
 # A stopped run records its outputs at zero, for at most 6 s and two answer times.
 RECORDS_ZERO: Final = 15.0  # [s]
 # The next law of another computer's run may overwrite a single zero command.
@@ -30,11 +38,11 @@ BETWEEN_ZEROS: Final = 0.2  # [s]
 def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     """Set all outputs to zero now, whoever is in control, and end the run that drives them.
 
-    Without --rig it stops every bench that this computer drives.
+    Without --rig it stops every bench that this computer drives, all at once.
 
     Example: bramah stop --rig shinshu-2dof
     """
-    from drivers.base import DeviceError
+    from rig.bench import probe  # noqa: F401 - before the threads, which all need it
     from rig.bench.latch import rigs_in_use
     from rig.model.parse import InputError
 
@@ -42,91 +50,170 @@ def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     rigs = [rig] if rig is not None else [str(path) for path in rigs_in_use()]
     if not rigs:
         raise InputError(f"{NOT_IN_USE}; name the bench: --rig RIG")
-    errors: list[Exception] = []
-    for name in rigs:  # an error of one bench must not keep another from being stopped
-        try:
-            stop_bench(name, endpoint)
-        except (InputError, DeviceError) as error:
-            errors.append(error)
-    for further in errors[1:]:
-        progress(str(further))
-    if errors:
+    news: News = SimpleQueue()
+    stops = [BenchStop(name, endpoint, news) for name in rigs]
+    for one in stops:
+        one.start()
+    _warn_of_silence(stops)
+    errors = _told(news, len(stops))
+    if errors and len(stops) == 1:
         raise errors[0]
+    if errors:
+        raise typer.Exit(code_and_message(errors[0])[0])
 
 
-def stop_bench(rig: str, endpoint: str | None) -> None:
-    """Set the outputs of one bench to zero, end the run that drives it, print what is pressurised.
+class BenchStop(threading.Thread):
+    """One bench that is being stopped: its outputs set to zero, the run that drives it ended.
 
-    Raises InputError and DeviceError.
+    A thread of its own, because a device that does not answer must not keep another bench moving;
+    a daemon, so that Ctrl-C waits for no device. `answered` is set when the outputs are at zero or
+    the stop has failed; `news` receives results, an error, and None at the end.
     """
-    from drivers.base import DeviceError
-    from rig.bench import probe as bench
+
+    def __init__(self, rig: str, endpoint: str | None, news: News) -> None:
+        super().__init__(name=f"stop {rig}", daemon=True)
+        self.place = rig
+        self.answered = threading.Event()
+        self._rig, self._endpoint, self._news = rig, endpoint, news
+
+    def run(self) -> None:
+        """Stop the bench; every error becomes news."""
+        try:
+            self._stop()
+        except BaseException as error:  # also a driver's sys.exit()
+            self._news.put(error)
+        finally:
+            self.answered.set()
+            self._news.put(None)
+
+    def _stop(self) -> None:
+        """Set the outputs to zero, end the run that drives them, state what is pressurised.
+
+        The run is signalled first: it then zeroes the outputs too, whatever this device answers.
+        Raises InputError and DeviceError.
+        """
+        from drivers.base import DeviceError
+        from rig.bench import probe as bench
+        from rig.bench.outputs import UNSURE
+
+        bench_rig, driver = device_of(self._rig, self._endpoint)
+        self.place = _place(bench_rig)
+        holder = _told_to_end(bench_rig.wire)
+        try:
+            self._zero(driver, bench_rig.wire, holder)
+        except DeviceError as error:
+            watchdog = bench_rig.wire.watchdog
+            raise type(error)(
+                f"{UNSURE}, {self.place}: {error}; use the emergency stop (the device's watchdog "
+                f"zeroes the outputs {watchdog:g} s after the host's last message)"
+            ) from error
+        finally:
+            driver.close()
+        _await_end(bench_rig.wire, holder)
+        self._news.put(f"outputs at zero, confirmed by the device of {self.place}")
+        try:
+            readings = bench.probe(device_of(self._rig, self._endpoint)[1], bench_rig)
+        except DeviceError as error:
+            progress(f"pressures not read, {self.place}: {error}")
+        else:
+            if pressurised := bench.pressurised(readings):
+                places = ", ".join(pressurised)
+                self._news.put(f"still under pressure, {self.place}: {places}")
+
+    def _zero(self, driver: Driver, wire: Wire, holder: Holder | None) -> None:
+        """Zero the outputs, several times where a run of another computer may still set them.
+
+        A process of this computer that drives the bench may take the device's answers from the
+        line: if they are missing, its end is awaited. Raises DeviceError without an answer after
+        that.
+        """
+        from drivers.base import DeviceError
+
+        try:
+            driver.zero_outputs()
+        except DeviceError:
+            if holder is None:
+                raise
+            _await_end(wire, holder)
+            driver.zero_outputs()
+        self.answered.set()
+        for _ in range(ZEROS - 1 if holder is None else 0):
+            time.sleep(BETWEEN_ZEROS)
+            driver.zero_outputs()
+
+
+def _warn_of_silence(stops: list[BenchStop]) -> None:
+    """Wait for an answer about each bench; say after SILENCE which have none, whatever their wires.
+
+    The time limit of a wire may be longer, and an operator must not wait for it.
+    """
     from rig.bench.outputs import UNSURE
 
-    bench_rig, driver = device_of(rig, endpoint)
-    try:
-        _zero(driver, bench_rig.wire)
-    except DeviceError as error:
-        watchdog = bench_rig.wire.watchdog
-        raise type(error)(
-            f"{UNSURE}: {error}; use the emergency stop (the device's watchdog "
-            f"zeroes the outputs {watchdog:g} s after the host's last message)"
-        ) from error
-    finally:
-        driver.close()
-    _end_run(bench_rig.wire)
-    typer.echo("outputs at zero, confirmed by the device")
-    try:
-        print_pressure(bench.pressurised(bench.probe(device_of(rig, endpoint)[1], bench_rig)))
-    except DeviceError as error:
-        progress(f"pressures not read: {error}")
+    deadline = time.monotonic() + SILENCE
+    for one in stops:
+        if not one.answered.wait(max(0.0, deadline - time.monotonic())):
+            why = f"{UNSURE}, {one.place}: no answer for {SILENCE:g} s; use the emergency stop"
+            progress(alarm(f"bramah: {why}"))
 
 
-def _zero(driver: Driver, wire: Wire) -> None:
-    """Zero the outputs, several times where a run of another computer may still set them.
+def _told(news: News, benches: int) -> list[BaseException]:
+    """Print what the stops of so many benches report, failures first; return the errors.
 
-    A process of this computer that drives the bench may take the device's answers from the line: if
-    they are missing it is ended, which zeroes the outputs too. Raises DeviceError without an answer
-    after that.
+    Errors of several benches are printed, that of one is left to the caller.
     """
-    from drivers.base import DeviceError
+    errors: list[BaseException] = []
+    known = sorted(
+        (news.get() for _ in range(news.qsize())),
+        key=lambda item: not isinstance(item, BaseException),
+    )
+    running = benches
+    while running:
+        item = known.pop(0) if known else news.get()
+        if item is None:
+            running -= 1
+        elif isinstance(item, str):
+            typer.echo(item)
+        else:
+            errors.append(item)
+            if benches > 1:
+                print_error(code_and_message(item)[1])
+    return errors
 
-    try:
-        driver.zero_outputs()  # before anything else
-    except DeviceError:
-        if _holder(wire) is None:
-            raise
-        _end_run(wire)
-        driver.zero_outputs()
-    elsewhere = _holder(wire) is None
-    for _ in range(ZEROS - 1 if elsewhere else 0):
-        time.sleep(BETWEEN_ZEROS)
-        driver.zero_outputs()
+
+def _place(rig: Rig) -> str:
+    return f"{rig.name} at {rig.wire.endpoint}"
 
 
-def _end_run(wire: Wire) -> None:
-    """End the process of this computer that drives the bench, or its next law moves joints again.
+def _told_to_end(wire: Wire) -> Holder | None:
+    """Tell the process of this computer that drives the bench to end; return it, None if none.
 
-    Raises DeviceBusy if the process does not end.
+    Its next law would move joints again.
     """
+    holder = _holder(wire)
+    if holder is not None:
+        progress(f"stopping process {holder.pid}{_run_of(holder)} as well")
+        with suppress(ProcessLookupError):  # the process has ended by itself
+            os.kill(holder.pid, signal.SIGTERM)
+    return holder
+
+
+def _await_end(wire: Wire, holder: Holder | None) -> None:
+    """Wait for the end of a process told to end; raises DeviceBusy if it does not end."""
     from drivers.base import DeviceBusy
     from rig.bench.outputs import UNSURE
 
-    holder = _holder(wire)
-    if holder is None:
-        return
-    run = f", which writes {holder.run}," if holder.run else ""
-    progress(f"stopping process {holder.pid}{run} as well")
-    with suppress(ProcessLookupError):  # the process has ended by itself
-        os.kill(holder.pid, signal.SIGTERM)
     deadline = time.monotonic() + RECORDS_ZERO
-    while _holder(wire) == holder:
+    while holder is not None and _holder(wire) == holder:
         if time.monotonic() > deadline:
             raise DeviceBusy(
-                f"{UNSURE}: process {holder.pid}{run or ','} was told to stop but runs on; use the "
-                "emergency stop"
+                f"{UNSURE}: process {holder.pid}{_run_of(holder) or ','} was told to stop but runs "
+                "on; use the emergency stop"
             )
         time.sleep(0.05)
+
+
+def _run_of(holder: Holder) -> str:
+    return f", which writes {holder.run}," if holder.run else ""
 
 
 def _holder(wire: Wire) -> Holder | None:
