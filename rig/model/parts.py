@@ -11,7 +11,14 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 from urllib.parse import urlencode
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from rig.model import channels as ch
 from rig.model import linkage
@@ -30,6 +37,7 @@ from rig.model.quantity import (
     Time,
     Voltage,
     Volume,
+    is_from_file,
 )
 
 Array = linkage.Array
@@ -357,6 +365,21 @@ class Wire(Part):
         low, high = WATCHDOG_RANGE
         if not low <= value <= high:
             raise ValueError(f"watchdog {value:g} s: a device takes {low:g} s to {high:g} s")
+        return value
+
+    @field_validator("timeout")
+    @classmethod
+    def _ends_while_a_watchdog_could_run(cls, value: float, info: ValidationInfo) -> float:
+        """Reject a wait for an answer during which no device would still be driven.
+
+        The host can neither stop nor trip while it waits. Stored runs may state more.
+        """
+        longest = WATCHDOG_RANGE[1]
+        if is_from_file(info) and value > longest:
+            raise ValueError(
+                f"timeout {value:g} s: expected at most {longest:g} s, the longest watchdog of a "
+                "device: the host waits so long before it says that a device is lost"
+            )
         return value
 
     @property

@@ -98,9 +98,14 @@ def parse_quantity(text: str, si: str) -> float:
     return value
 
 
+def is_from_file(info: ValidationInfo) -> bool:
+    """Return whether a model is read from a file that a person wrote, not from a run's own."""
+    return bool(info.context and cast(dict[str, bool], info.context).get("from_file"))
+
+
 def _validator(si: str) -> BeforeValidator:
     def validate(value: Any, info: ValidationInfo) -> Any:
-        from_file = bool(info.context and cast(dict[str, bool], info.context).get("from_file"))
+        from_file = is_from_file(info)
         if isinstance(value, bool) or value is None:
             raise UnitError(f"{value!r} is not a number with a unit; expected one like '1 {si}'")
         if isinstance(value, str):

@@ -56,6 +56,7 @@ def test_a_bench_survives_being_stored_with_a_run() -> None:
     [
         ("watchdog: 0.5 s", "watchdog: 100 s", "watchdog 100 s: a device takes 0.02 s to 10 s"),
         ("watchdog: 0.5 s", "watchdog: 10 ms", "watchdog 0.01 s: a device takes 0.02 s to 10 s"),
+        ("timeout: 1 s", "timeout: 1 h", "wire.timeout: timeout 3600 s: expected at most 10 s"),
         (
             "pressure: [-0.2 MPa, 9 MPa]",
             "pressure: [-0.2 MPa, 12 MPa]",
