@@ -56,7 +56,7 @@ JOURNAL_FILES: Final = ("", "-wal", "-shm", "-tail")  # behind the journal's nam
 TAIL_BLOCKS: Final = 32  # moved into the database at once
 TAIL_BYTES: Final = 1 << 16
 _ENTRY = struct.Struct("<4sII")  # begin, length of the body, its checksum
-_ENTRY_BEGIN = b"BLK1"
+ENTRY_BEGIN: Final = b"BLK1"
 _NUMBERS = struct.Struct("<5qdII")  # id, stream, sequence, tick, samples, late, checksum, length
 
 # Keys of every record's description that the archive needs.
@@ -137,7 +137,7 @@ class JournalTail:
             *row[:5], math.nan if row.late is None else row.late, row.crc, len(row.data)
         )
         body += row.data + row.saturated
-        entry = _ENTRY.pack(_ENTRY_BEGIN, len(body), zlib.crc32(body)) + body
+        entry = _ENTRY.pack(ENTRY_BEGIN, len(body), zlib.crc32(body)) + body
         end = self._end + len(entry)
         if end > TAIL_BYTES:
             return False
@@ -165,24 +165,39 @@ def read_tail(path: Path, after: int) -> list[BlockRow]:
     A row whose checksum fails is left out. Raises OSError.
     """
     tail = tail_of(path)
-    data = tail.read_bytes()[:TAIL_BYTES] if tail.is_file() else b""
-    rows, offset = [], 0
+    data = tail.read_bytes() if tail.is_file() else b""
+    rows = (row for _, row in entries(data[:TAIL_BYTES]))
+    return sorted(row for row in rows if row is not None and row.id > after)
+
+
+def entry_bytes(size: int) -> int:
+    """Return the bytes in a tail of a row with `size` bytes of samples and marks."""
+    return _ENTRY.size + _NUMBERS.size + size
+
+
+def entries(data: bytes) -> Iterator[tuple[int, BlockRow | None]]:
+    """Yield (where it ends, row) of the entries from the begin of `data` on.
+
+    The row is None where its checksum fails.
+    """
+    offset = 0
     while offset + _ENTRY.size <= len(data):
         begin, length, crc = _ENTRY.unpack_from(data, offset)
         body = data[offset + _ENTRY.size : offset + _ENTRY.size + length]
-        if begin != _ENTRY_BEGIN or not _NUMBERS.size <= len(body) == length:
-            break
+        if begin != ENTRY_BEGIN or not _NUMBERS.size <= len(body) == length:
+            return
         offset += _ENTRY.size + length
         if zlib.crc32(body) != crc:
+            yield offset, None
             continue
         *numbers, late, block_crc, size = _NUMBERS.unpack_from(body)
         samples, marks = body[_NUMBERS.size :][:size], body[_NUMBERS.size + size :]
-        row = BlockRow._make(
-            (*numbers, None if math.isnan(late) else late, block_crc, samples, marks)
+        yield (
+            offset,
+            BlockRow._make(
+                (*numbers, None if math.isnan(late) else late, block_crc, samples, marks)
+            ),
         )
-        if row.id > after:
-            rows.append(row)
-    return sorted(rows)
 
 
 class Journal:

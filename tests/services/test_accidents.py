@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -176,8 +177,65 @@ def test_a_torn_tail_costs_the_newest_blocks_only(interrupted: Path, kept: int) 
     each = 12 + int.from_bytes(raw[4:8], "little")
     newest = 45 % TAIL_BLOCKS
     assert found_as_measured(interrupted) == 10 * (newest - kept // each)
-    assert report.damaged is None
+    assert report.damaged is not None
+    assert f"tail has {kept} bytes, not 65536; up to 310 samples (0.310 s)" in report.message
     assert load_run(interrupted).records[0].samples == 300
+
+
+@pytest.mark.parametrize(
+    ("state", "what"), [("gone", "is missing"), ("zeros", "is filled with zeros")]
+)
+def test_a_tail_without_the_newest_blocks_is_damage(
+    interrupted: Path, state: str, what: str
+) -> None:
+    tail = interrupted / "journal.sqlite-tail"
+    if state == "gone":
+        tail.unlink()
+    else:
+        tail.write_bytes(bytes(tail.stat().st_size))
+    done = CliRunner().invoke(app, ["recover", str(interrupted)], standalone_mode=False)
+    assert f"journal.sqlite-tail {what}; up to 310 samples (0.310 s)" in done.stdout
+    assert "its journal was damaged" in str(done.exception)
+    assert (interrupted / "journal.damaged.sqlite").exists()
+    assert found_as_measured(interrupted) == 10 * (45 % TAIL_BLOCKS)
+
+
+def test_a_tail_whose_newer_half_is_zeros_is_damage(interrupted: Path) -> None:
+    tail = interrupted / "journal.sqlite-tail"
+    raw = tail.read_bytes()
+    tail.write_bytes(raw[:5000] + bytes(len(raw) - 5000))
+    assert "tail is filled with zeros" in recover(interrupted).message
+
+
+def test_a_zeroed_tail_is_damage_where_nothing_else_was_written_yet(tmp_path: Path) -> None:
+    run = killed_after(5, tmp_path)
+    tail = run / "journal.sqlite-tail"
+    tail.write_bytes(bytes(tail.stat().st_size))
+    with pytest.raises(RecordingFailed, match="lacks the first blocks of the last stream"):
+        recover(run)
+    assert (run / "journal.sqlite").exists()
+
+
+def test_a_run_killed_before_its_first_block_is_not_damaged(tmp_path: Path) -> None:
+    report = recover(killed_after(0, tmp_path))
+    assert (report.damaged, report.samples) == (None, 0)
+
+
+@pytest.mark.parametrize("blocks", [1, 31, 32, 33, 63, 64, 65, 100])
+def test_a_run_killed_at_any_block_is_not_damaged(tmp_path: Path, blocks: int) -> None:
+    report = recover(killed_after(blocks, tmp_path))
+    assert (report.damaged, report.outside) == (None, 10 * blocks)
+
+
+def killed_after(blocks: int, folder: Path) -> Path:
+    """A run whose process died after so many blocks."""
+    original, copy = folder / "run", folder / "copy"
+    with Bench(RIG, FakeDriver(RIG), Recorder(original, RIG), signals=False) as bench:
+        for _ in range(blocks):
+            bench.exchange()
+        shutil.copytree(original, copy)
+        (copy / "owner.json").unlink()
+    return copy
 
 
 def test_a_damaged_block_of_the_tail_is_lost_alone_and_counted(interrupted: Path) -> None:

@@ -34,6 +34,7 @@ from rig.runs.journal import (
 )
 from rig.runs.runstate import read_events
 from rig.runs.salvage.scan import best_marks, block_rows, marks, raw_bytes
+from rig.runs.salvage.tail import find_tail_damage
 
 log = logging.getLogger(__name__)
 
@@ -104,17 +105,20 @@ def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tup
     (rows, highest) = db.execute("SELECT count(*), max(id) FROM block").fetchone()
     if not rows == count == (highest or 0):
         return "blocks are missing"
-    return _check_tail(journal.path, rig, newest, count)
+    return _check_tail(journal.path, db, rig, newest, count)
 
 
-def _check_tail(path: Path, rig: Rig, newest: tuple[int, int], count: int) -> str | tuple[int, int]:
-    """Return the damage of the rows behind the database's `count`, or the newest block."""
-    for row in read_tail(path, after=count):
+def _check_tail(
+    path: Path, db: sqlite3.Connection, rig: Rig, newest: tuple[int, int], count: int
+) -> str | tuple[int, int]:
+    """Return the damage of the tail behind the database's `count` rows, or the newest block."""
+    rows = read_tail(path, after=count)
+    for row in rows:
         block = _as_block(row, rig)
         if block is None or (block.stream, block.tick) <= newest or row.id != count + 1:
             return f"blocks before the newest in {tail_of(path).name} are missing"
         newest, count = (block.stream, block.tick), row.id
-    return newest
+    return find_tail_damage(path, db, rig, rows) or newest
 
 
 def _torn(raw: Any) -> bool:
