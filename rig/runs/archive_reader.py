@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead
@@ -16,6 +17,7 @@ from rig.runs.runstate import BETWEEN
 from rig.runs.sections import Written
 
 FORMAT = 1
+STRETCH: Final = 1_000_000  # samples of a channel in memory at a time
 _HEAD = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
 
 
@@ -55,17 +57,34 @@ def samples_of(
 ) -> Record:
     """Read the samples [first, last) of a record's group; InputError for a wrong checksum."""
     part = slice(first, last)
-    columns = {}
-    for name in head.channels:
-        try:
-            columns[name] = np.asarray(group[name][part], dtype=np.float64)
-        except OSError as error:
-            raise InputError(
-                f"{group.file.filename}: record {head.name}, channel {name}: samples were changed "
-                "or damaged since they were written (their checksum does not match); take the "
-                f"file from a backup, or leave this run out ({error})"
-            ) from error
+    columns = {name: _samples(group, name, f"record {head.name}", part) for name in head.channels}
     return head.record(columns)
+
+
+def _samples(group: h5py.Group, channel: str, place: str, part: slice) -> NDArray[np.float64]:
+    """Read a part of a channel (n,); InputError with its place for a wrong checksum."""
+    try:
+        return np.asarray(group[channel][part], dtype=np.float64)
+    except OSError as error:
+        raise InputError(
+            f"{group.file.filename}: {place}, channel {channel}: samples were changed "
+            "or damaged since they were written (their checksum does not match); take the "
+            f"file from a backup, or leave this run out ({error})"
+        ) from error
+
+
+def verify(path: Path) -> None:
+    """Read every sample of an archive, also those outside of records, for their checksums.
+
+    Raises InputError that names the place and the channel of samples that were changed.
+    """
+    with readable(path), open_archive(path) as file:
+        between = file[BETWEEN].items() if BETWEEN in file else ()
+        records = ((f"record {name}", group) for name, group in file.items() if name != BETWEEN)
+        for place, group in (*records, *((f"{BETWEEN}/{name}", group) for name, group in between)):
+            for channel, data in group.items():
+                for first in range(0, len(data), STRETCH):
+                    _samples(group, channel, place, slice(first, first + STRETCH))
 
 
 @contextmanager

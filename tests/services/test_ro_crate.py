@@ -9,6 +9,7 @@ from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 from typer.testing import CliRunner
 
@@ -147,3 +148,17 @@ def test_an_occupied_folder_and_a_model_are_refused(run: Path) -> None:
         export(run)
     with pytest.raises(InputError, match="--model cannot be used"):
         export(run, "--model", "m.json", "--out", "x")
+
+
+@pytest.mark.parametrize("group", ["s_r1", "between/0001"])
+def test_damaged_samples_are_not_archived_as_the_right_ones(run: Path, group: str) -> None:
+    path = run / "records.h5"
+    with h5py.File(path) as file:
+        at = file[f"{group}/piston_2"].id.get_chunk_info(0).byte_offset + 8
+    raw = bytearray(path.read_bytes())
+    raw[at] ^= 1
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match=f"{group}, channel piston_2: .*checksum") as refused:
+        export(run)
+    assert str(path) in str(refused.value)
+    assert not run.with_name("monday-ro-crate").exists()

@@ -52,12 +52,17 @@ def export_crate(run: Path, out: Path, licence: str = "") -> list[Path]:
     """Copy a run into the folder `out` and describe it; returns the files.
 
     `licence` is the URL of the data's licence; without one the crate says that none was given.
-    Raises InputError for a run that cannot be read or a folder that is occupied.
+    Raises InputError for a run that cannot be read, samples that were changed since they were
+    written, or a folder that is occupied.
     """
+    from rig.runs.archive_reader import verify  # noqa: PLC0415 - h5py loads slowly
+
     head = read_run_head(run, partial=True)
     header = store.read_header(run)
     store.refuse_occupied(out)
     names = [name for name in _FILES if (run / name).is_file()]
+    if ARCHIVE in names:  # the crate's SHA-256 would state damaged samples as the right ones
+        verify(run / ARCHIVE)
     try:
         with new_folder(out) as folder:
             for name in names:
