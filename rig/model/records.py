@@ -160,10 +160,15 @@ def refuse_repeated_runs(runs: Sequence[Run]) -> None:
 
 def samples_digest(record: Record) -> str:
     """Return a digest of a record's samples, the same whatever its name."""
+    return channels_digest(record.channels)
+
+
+def channels_digest(channels: Mapping[str, Array]) -> str:
+    """Return a digest of samples (n,) by channel, the same in whatever order they are."""
     digest = hashlib.sha256()
-    for name in sorted(record.channels):
+    for name in sorted(channels):
         digest.update(name.encode())
-        digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
+        digest.update(np.ascontiguousarray(channels[name], dtype=np.float64).tobytes())
     return digest.hexdigest()
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from rig.model.parse import InputError
+from rig.model.parse import InputError, shipped_files
 from rig.model.trips import RecordingFailed
 from rig.runs.archive import write_run
 from rig.runs.exchange.importer import import_records
@@ -412,8 +412,48 @@ def test_channels_of_a_locked_joint_may_stand_still(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("channel", "values", "said"),
+    [
+        ("cap_pressure_1", 1e3 * PRESSURE, "to an end of the range -100000 to 1e+07"),
+        ("rod_pressure_1", 1e-5 * PRESSURE, "stays below 53 Pa, .* is the unit another"),
+        ("cap_pressure_1", np.full(4000, 3e6), "every sample is 3e+06 Pa; is the sensor"),
+        ("piston_1", 20 + WAVE, "to an end of the range -0.04 to 0.04"),
+        ("oil_temperature", np.full(4000, 312.0), "goes from 312 to 312 degC, to an end of"),
+    ],
+)
+def test_what_a_locked_joint_or_the_oil_can_never_be_is_spoken_of(
+    tmp_path: Path, channel: str, values: np.ndarray, said: str
+) -> None:
+    report = bring(tmp_path, ONE, a__csv=csv(data=moving(**{channel: values})))
+    (warning,) = report.warnings
+    assert re.search(said.replace("+", r"\+"), warning), warning
+
+
+def test_a_column_whose_sensor_the_rig_does_not_describe_is_imported(tmp_path: Path) -> None:
+    text = shipped_files("rig", "shipped")["shinshu-2dof"].read_text()
+    without = [line for line in text.splitlines() if not line.startswith("  supply_pressure: {")]
+    (tmp_path / "own.yaml").write_text("\n".join(without))
+    manifest = ONE.replace("shinshu-2dof", "own.yaml")
+    assert bring(tmp_path, manifest, a__csv=csv(data=moving())).warnings == ()
+    assert "supply_pressure" in load_run(tmp_path / "run").records[0].channels
+
+
+def test_one_column_for_two_channels_is_spoken_of(tmp_path: Path) -> None:
+    manifest = f"{ONE}columns:\n  rod_pressure_2: {{column: cap_pressure_2}}\n"
+    report = bring(tmp_path, manifest, a__csv=csv(data=moving()))
+    assert report.warnings == (
+        "column 'cap_pressure_2' is taken for cap_pressure_2 and rod_pressure_2",
+    )
+
+
+@pytest.mark.parametrize(
     ("entry", "said"),
     [
+        ("locked: [1], lines: [1, 3]", "a.csv: lines without a period"),
+        (
+            "locked: [1], period: 1000, lines: [3, 700]",
+            "a.csv: line 700 is 700 Hz, expected below half the rate, 500 Hz",
+        ),
         ("locked: [1, 2]", "a.csv: every joint is locked"),
         ("locked: [1], period: 5000", "a.csv: has 4000 samples, less than its period of 5000"),
         ("locked: [1], bandwidth: 600 Hz", "a.csv: bandwidth of 600 Hz, expected below .*500 Hz"),
@@ -437,6 +477,17 @@ def test_a_full_disk_is_said_and_leaves_no_half_run(tmp_path: Path) -> None:
         with pytest.raises(RecordingFailed, match=r"again: cannot be written: .*too large"):
             write_run(tmp_path / "again", load_run(tmp_path / "run"))
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("file", ["a.csv", "b.csv"])
+def test_repeats_with_the_same_samples_are_imported_with_a_message(
+    tmp_path: Path, file: str
+) -> None:
+    """They show sensors without noise; as two steps they do no harm."""
+    second = f"  - {{file: {file}, step: s, repeat: 2}}\n  - {{file: {file}, step: t}}\n"
+    report = bring(tmp_path, ONE + second, a__csv=csv(), b__csv=csv())
+    (message,) = (w for w in report.warnings if "same samples" in w)
+    assert message.startswith(f"{file}: s_r2 has the same samples as s_r1")
 
 
 TWO_STEPS = ONE + "  - {file: a.csv, step: heavy, repeat: 1%s}\n"

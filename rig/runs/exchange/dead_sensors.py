@@ -25,27 +25,48 @@ _DRIVEN = (ch.SPOOL, ch.DRIVE)  # channels that a waveform or its limit may keep
 def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
     """Return a sentence for each constant, stuck, clipped or far too small channel (n,); else [].
 
-    Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
+    Also for one beyond its sensor's range. Spool and piston of `locked` joints (1-based) may stand
+    still, and so may the oil's temperature; what a value can never be is said of them as well.
     """
     sentences = []
     for name, values in channels.items():
         kind, joint = ch.kind_of(name)
-        if kind in (ch.COMMAND, ch.TEMPERATURE) or joint in locked:
+        if name not in rig.channels:  # a command, or of a sensor that the rig does not describe
+            continue
+        if kind == ch.TEMPERATURE or joint in locked:
+            sentences += _impossible_at_rest(rig, kind, name, values)
             continue
         low, high = float(values.min()), float(values.max())
-        unit = rig.unit_of(name)
         if low == high:
-            sentences.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
+            sentences.append(_constant(rig, name, low))
             continue
         if small := _too_small(rig, kind, name, low, high):
             sentences += small
             continue
         outside = _outside_range(rig, kind, name, low, high)
-        flat = [] if outside or kind in _DRIVEN else _flat(name, values, unit)
+        flat = [] if outside or kind in _DRIVEN else _flat(name, values, rig.unit_of(name))
         sentences += outside + flat
         if joint is not None and kind in (ch.CAP, ch.ROD) and not outside + flat:
             sentences += _stuck(rig, name, values, channels[ch.channel(ch.PISTON, joint)])
     return sentences
+
+
+def _impossible_at_rest(rig: Rig, kind: str, name: str, values: Array) -> list[str]:
+    """Return a sentence for a channel (n,) of a joint at rest, or of the oil, that cannot be so."""
+    low, high = float(values.min()), float(values.max())
+    bottom, top = rig.sensors.of(kind).range
+    margin = EXCHANGE.end_share * (top - bottom)
+    if low < bottom - margin or high > top + margin:  # a locked piston may rest at an end of it
+        return _outside_range(rig, kind, name, low, high)
+    if kind not in _PRESSURES:
+        return []
+    if small := _too_small(rig, kind, name, low, high):
+        return small
+    return [_constant(rig, name, low)] if low == high else []
+
+
+def _constant(rig: Rig, name: str, value: float) -> str:
+    return f"{name}: every sample is {value:g} {rig.unit_of(name)}; is the sensor connected?"
 
 
 def _stuck(rig: Rig, name: str, values: Array, piston: Array) -> list[str]:

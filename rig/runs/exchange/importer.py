@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rig.model import channels as ch
 from rig.model.numerics.spectra import noise_power, power_spectrum
 from rig.model.parse import InputError
-from rig.model.records import BANDWIDTH, bridged, common_bandwidth
+from rig.model.records import BANDWIDTH, bridged, channels_digest, common_bandwidth
 from rig.model.rig import Rig
 from rig.runs import archive, store
 from rig.runs.exchange.columns import read_table
@@ -318,6 +318,13 @@ def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
         if lacking:
             where = "" if len(lacking) == len(records) else f" in {len(lacking)} file(s)"
             warnings.append(f"{name}: the rig has it, the data does not{where}; imported without")
+    channels_of_column: dict[str, list[str]] = {}
+    for name in dict.fromkeys(name for r in records for name in r.channels):
+        channels_of_column.setdefault(source.column(name), []).append(name)
+    for column, names in channels_of_column.items():
+        if len(names) > 1:
+            warnings.append(f"column {column!r} is taken for {' and '.join(names)}")
+    warnings += _repeated_samples(records)
     for rate in sorted({r.sample_rate for r in records}):
         if abs(rate - rig.sample_rate) > 1e-6 * rig.sample_rate:
             warnings.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")
@@ -335,6 +342,22 @@ def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
+def _repeated_samples(records: list[_Imported]) -> list[str]:
+    """Say which repeats of a step hold the samples of another one."""
+    known: dict[tuple[str, str], str] = {}
+    out = []
+    for record in records:
+        name = record.entry.meta().name
+        of_step = record.entry.step, channels_digest(record.channels)
+        first = known.setdefault(of_step, name)
+        if first != name:
+            out.append(
+                f"{record.entry.file}: {name} has the same samples as {first}, which adds no "
+                "information and shows sensors without noise"
+            )
+    return out
+
+
 def _warnings_of_entry(rig: Rig, r: _Imported) -> list[str]:
     """Say what a record's entry states that its samples contradict, or that leaves it no use."""
     file, samples = r.entry.file, len(next(iter(r.channels.values())))
@@ -346,6 +369,12 @@ def _warnings_of_entry(rig: Rig, r: _Imported) -> list[str]:
     if r.entry.bandwidth is not None and r.entry.bandwidth >= 0.5 * r.sample_rate:
         width, half = r.entry.bandwidth, 0.5 * r.sample_rate
         out.append(f"{file}: bandwidth of {width:g} Hz, expected below half the rate, {half:g} Hz")
+    if r.entry.lines and not r.entry.period:
+        out.append(f"{file}: lines without a period are multiples of nothing; state period as well")
+    elif r.entry.lines and 2 * max(r.entry.lines) >= r.entry.period:
+        line = max(r.entry.lines)
+        stated = f"line {line} is {line * r.sample_rate / r.entry.period:g} Hz"
+        out.append(f"{file}: {stated}, expected below half the rate, {0.5 * r.sample_rate:g} Hz")
     return out
 
 

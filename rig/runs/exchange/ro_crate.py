@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from rig.model.parse import InputError
+from rig.model.trips import RecordingFailed
 from rig.runs import store
 from rig.runs.files import new_folder
 from rig.runs.runstate import ABORTED, DONE, EVENTS, HEADER, read_events
@@ -53,7 +53,7 @@ def export_crate(run: Path, out: Path, licence: str = "") -> list[Path]:
 
     `licence` is the URL of the data's licence; without one the crate says that none was given.
     Raises InputError for a run that cannot be read, samples that were changed since they were
-    written, or a folder that is occupied.
+    written, or a folder that is occupied, RecordingFailed if the crate cannot be written.
     """
     from rig.runs.archive_reader import verify  # noqa: PLC0415 - h5py loads slowly
 
@@ -70,7 +70,7 @@ def export_crate(run: Path, out: Path, licence: str = "") -> list[Path]:
             text = json.dumps(describe(folder, head, header, names, licence), indent=2) + "\n"
             (folder / CRATE_METADATA).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{out}: the crate cannot be written: {error.strerror}") from error
+        raise RecordingFailed(f"{out}: the crate cannot be written: {error.strerror}") from error
     return [out / name for name in (*names, CRATE_METADATA)]
 
 
