@@ -17,10 +17,12 @@ from rig.bench.session import Bench
 from rig.cli.main import command_line
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.model.trips import RecordingFailed
 from rig.runs.recorder import Recorder
 from rig.runs.recover import recover
 from rig.runs.store import load_run
 from tests.cli.bench import bramah_here
+from tests.full_disk import largest_file
 from tests.services.children import RIG, finish
 from tests.services.fake_driver import FakeDriver
 
@@ -161,4 +163,10 @@ def test_damaged_samples_are_not_archived_as_the_right_ones(run: Path, group: st
     with pytest.raises(InputError, match=f"{group}, channel piston_2: .*checksum") as refused:
         export(run)
     assert str(path) in str(refused.value)
+    assert not run.with_name("monday-ro-crate").exists()
+
+
+def test_a_full_disk_is_no_bad_usage_and_leaves_no_half_crate(run: Path) -> None:
+    with largest_file(2_000), pytest.raises(RecordingFailed, match="crate cannot be written"):
+        export(run)
     assert not run.with_name("monday-ro-crate").exists()
