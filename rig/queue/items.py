@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 import re
 import unicodedata
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -84,10 +84,13 @@ def _split(text: str, option: str, example: str) -> re.Match[str]:
     return match
 
 
-def channel_condition(text: str, measured: Sequence[str] = ()) -> StartCondition:
+def channel_condition(
+    text: str, measured: Mapping[str, tuple[float, float]] | None = None
+) -> StartCondition:
     """Read ``oil_temperature > 40 degC``; raises InputError for an unknown channel or unit.
 
-    With `measured`, the channels of a bench, also for one that it does not measure.
+    With `measured`, the readable range of each channel of a bench, also for a channel that it does
+    not measure and a bound that no reading can pass.
     """
     parts = _split(text, "--when", "'oil_temperature > 40 degC'")
     name = parts["name"]
@@ -100,12 +103,19 @@ def channel_condition(text: str, measured: Sequence[str] = ()) -> StartCondition
         bound = to_si(float(parts["number"]), parts["unit"], unit)
     except ValueError as error:
         raise InputError(f"--when {text!r}: {error}") from error
-    if measured and name not in measured:
+    if measured is not None and name not in measured:
         raise InputError(
             f"--when {text!r}: the bench does not measure {name}; expected one of: "
             f"{' '.join(measured)}"
         )
-    return StartCondition(name, "", parts["sign"], bound)
+    condition = StartCondition(name, "", parts["sign"], bound)
+    if measured is not None and not any(map(condition.holds, measured[name])):
+        low, high = measured[name]
+        raise InputError(
+            f"--when {text!r}: no reading can be so; expected a bound within the sensor's range, "
+            f"{low:g} to {high:g} {unit}"
+        )
+    return condition
 
 
 def result_condition(text: str) -> StartCondition:
@@ -113,7 +123,10 @@ def result_condition(text: str) -> StartCondition:
     parts = _split(text, "--if", "'b.rsd < 0.5 %'")
     part = parts["part"] or "value"
     if part != "rsd" and parts["unit"]:
-        raise InputError(f"--if {text!r}: a parameter is compared in SI, without a unit")
+        raise InputError(
+            f"--if {text!r}: a parameter is compared in SI, without a unit; its relative standard "
+            f"error, {parts['name']}.rsd, may have %"
+        )
     if parts["unit"] not in ("", "%"):
         raise InputError(f"--if {text!r}: the unit is {parts['unit']!r}; expected % or none")
     scale = 0.01 if parts["unit"] else 1.0
@@ -129,12 +142,13 @@ def check_wanted(text: str, known: Collection[str]) -> None:
         return
     if re.fullmatch(r"[a-z ]+", text):
         raise InputError(f"--if {text!r}: expected one of: {', '.join((ENDED, *OVER))}")
-    name = result_condition(text).name
+    name = _split(text, "--if", "'b.rsd < 0.5 %'")["name"]
     if name not in known:
         raise InputError(
             f"--if {text!r}: {name!r} is no parameter of that item's rig; expected one of: "
             f"{' '.join(known)}"
         )
+    result_condition(text)
 
 
 def parse_time(text: str, now: datetime, option: str) -> datetime:

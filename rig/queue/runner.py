@@ -324,7 +324,7 @@ class Runner:
             return
         if outcome.latched:
             self._queue.release(item.id, f"not started: {outcome.reason}")
-            self._notify("trip", item, outcome.reason)
+            self._notify("trip", self._queue.item(item.id), outcome.reason)  # queued again
             raise _Ending(3, outcome.reason)
         if outcome.state == it.INTERRUPTED:
             outcome = self._make_safe(item, outcome)

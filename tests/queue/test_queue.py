@@ -23,6 +23,8 @@ from rig.runs.store import load_run
 from tests.queue.nights import LONG, Night, reset, until
 from tests.variants import kept
 
+RIG = load_rig("shinshu-2dof")
+
 
 @pytest.fixture
 def night(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Night:
@@ -153,6 +155,19 @@ def test_a_trip_stops_the_queue_and_what_waits_stays_queued_until_it_is_cleared(
     reset()
     assert night.run().code == 0
     assert night.item(2).run.endswith("run2")
+
+
+def test_a_notification_of_an_item_that_found_the_bench_tripped_has_it_queued(
+    night: Night,
+) -> None:
+    notes = night.folder / "notes"
+    night.add("trip-20")
+    night.add("done")
+    night.run()
+    assert night.run("sh", "-c", f"cat >> {notes}").code == 3
+    first = json.loads(notes.read_text().splitlines()[0])
+    assert (first["event"], first["item"]["id"], first["item"]["state"]) == ("trip", 2, "queued")
+    assert first["counts"] == {"tripped": 1, "queued": 1}
 
 
 def test_a_lost_device_is_one_item_s_bad_luck_twice_in_a_row_it_is_the_bench(
@@ -312,6 +327,14 @@ def test_a_condition_of_no_channel_or_unit_is_refused(text: str) -> None:
         channel_condition(text)
 
 
+@pytest.mark.parametrize("text", ["> 300 degC", ">= 101 degC", "< 0 degC", "> 100 degC"])
+def test_a_condition_that_no_reading_of_the_bench_can_meet_is_refused(text: str) -> None:
+    ranges = {name: RIG.range_of(name) for name in RIG.channels}
+    with pytest.raises(InputError, match="expected a bound within the sensor's range, 0 to 100"):
+        channel_condition(f"oil_temperature {text}", ranges)
+    assert channel_condition("oil_temperature > 99 degC", ranges).bound == pytest.approx(99.0)
+
+
 @pytest.mark.parametrize("text", ["finished", "b.rsd", "b < 2 m", "M1 > x", "b.rsd < 1 mm"])
 def test_a_wanted_result_that_none_can_be_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="--if"):
@@ -320,8 +343,11 @@ def test_a_wanted_result_that_none_can_be_is_refused(text: str) -> None:
 
 def test_a_parameter_that_is_misspelt_is_refused_with_those_that_there_are() -> None:
     check_wanted("C_pp_1.rsd < 5 %", parameter_names(2))
-    with pytest.raises(InputError, match=r"'B' is no parameter .* expected one of: M1 M2 R12 .* b"):
-        check_wanted("B.rsd < 0.5 %", parameter_names(2))
+    for text in ("B.rsd < 0.5 %", "B < 5 %"):
+        with pytest.raises(InputError, match=r"'B' is no parameter .* one of: M1 M2 R12 .* b"):
+            check_wanted(text, parameter_names(2))
+    with pytest.raises(InputError, match=r"compared in SI, .* b\.rsd, may have %"):
+        check_wanted("b < 5 %", parameter_names(2))
 
 
 @given(st.floats(-300, 300), st.sampled_from(["<", "<=", ">", ">="]))

@@ -155,7 +155,7 @@ def add(
         )
     bench = bench_at(rig, endpoint)
     if when is not None:
-        channel_condition(when, bench.channels)
+        channel_condition(when, {name: bench.range_of(name) for name in bench.channels})
     times = _times(not_before, not_after, when, datetime.now(UTC))
     with _open_queue(queue, create=True) as store:
         title = name or Path(protocol).stem
