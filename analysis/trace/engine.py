@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.effects.base import Effect, ordered
+from analysis.effects.disturbance import PeriodicDisturbance
 from analysis.effects.mechanics import Payload
 from analysis.identify import checks as ck
 from analysis.identify.coupled import with_identified_bulk_modulus
@@ -23,7 +24,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows, refuse_repeated_records
 from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.data.trace_rows import TraceRuns, trace_rows, with_other_motions_apart
-from analysis.trace.finding import Finding
+from analysis.trace.finding import Finding, remaining_fraction
 from analysis.trace.fitted_model import FittedModel, identified, model_with_effects
 from analysis.trace.in_motion import find, held_out_ratios, joints_with_friction, rest_phase_notes
 from analysis.trace.judge import gates, held_out
@@ -48,6 +49,7 @@ from analysis.trace.notes import (
     shared_parameters,
     undetermined_notes,
     unseen_load_notes,
+    wider_rows_note,
 )
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, Gate, Trace
 from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set
@@ -115,8 +117,10 @@ def trace(
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
     progress = _without_steps_back(progress or (lambda _: None))
     result = _traced(records, options, progress)
-    narrower = _traced_in_narrower_rows(records, options, result, progress)
-    result = _with_stated_rig(rig, narrower or result)
+    in_other_rows = _traced_in_narrower_rows(
+        records, options, result, progress
+    ) or _traced_in_wider_rows(records, options, result, progress)
+    result = _with_stated_rig(rig, in_other_rows or result)
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
     may_be_load &= all(used.term.name != Payload.name for used in known)
@@ -326,7 +330,7 @@ def _concluded(prepared: _Prepared, options: _Options, finding: Finding) -> Trac
     runs_before, runs_after = free_runs
     remaining = 0.0
     if verdict != CLEAN and not finding.trained_on_noise:
-        remaining = _remaining_fraction(hypotheses, winner, prepared.as_recorded)
+        remaining = remaining_fraction(hypotheses, winner, prepared.as_recorded)
     result = Trace(
         verdict, fitted.effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, baseline, model,
@@ -410,6 +414,33 @@ def _traced_in_narrower_rows(
     return replace(again, notes=(narrower_rows_note(narrower, width), *again.notes))
 
 
+def _traced_in_wider_rows(
+    records: TraceRuns, options: _Options, result: Trace, progress: Callable[[float], None]
+) -> Trace | None:
+    """Return a clean result with torques above the motion's frequencies named, None without any.
+
+    Repeats show them in wider rows. The errors are of these, where an inertia may be attenuated by
+    noise; model and free runs stay, which leave out torques of another phase in each record.
+    """
+    width = records.bandwidth
+    if result.verdict != CLEAN or width is None or width >= TRACE.wider_bandwidth:
+        return None
+    wider = records.of_bandwidth(TRACE.wider_bandwidth)
+    lines = unlocked_lines(trace_rows(wider).train)
+    if not lines:
+        return None
+    again = _traced(wider, replace(options, look_ahead=False), progress)
+    if not again.effects or any(e.name != PeriodicDisturbance.name for e in again.effects):
+        return None
+    result = replace(
+        result, verdict=EXPLAINED, effects=again.effects, noise_floor=again.noise_floor,
+        before=again.before, after=again.after, size=again.size, rows_before=again.rows_before,
+        rows_after=again.rows_after,
+        notes=(wider_rows_note(width), *phase_notes(again.effects, lines), *result.notes),
+    )  # fmt: skip
+    return replace(result, sentence=sentence(result))
+
+
 def _final_verdict(
     records: TraceRuns, finding: Finding, winner: Hypothesis
 ) -> tuple[str, list[str]]:
@@ -451,22 +482,6 @@ def judging_rows_above_band(
     remaining = [(e, figure) for e, figure in above if e not in within_curves.beyond]
     notes = [f"{e}: {figure} in the records that judge" for e, figure in remaining]
     return {e for e, _ in remaining}, [*notes, *within_curves.notes]
-
-
-def _remaining_fraction(
-    hypotheses: HypothesisSet, winner: Hypothesis, as_recorded: RegressionData
-) -> float:
-    """Return the share of the training energy above noise under the baseline that remains.
-
-    `as_recorded` are the training rows before any sine was taken out of them.
-    """
-    noise = {(f.group, f.equation): f.noise for f in as_recorded.floors}
-    sine_energy = sum(
-        s.count * max(0.0, (noise[s.group, s.equation] / s.noise) ** 2 - 1)
-        for s in hypotheses.train_data.segments
-    )
-    start = hypotheses.empty.total + sine_energy
-    return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
 def _lacking_candidates(

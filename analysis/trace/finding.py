@@ -150,3 +150,19 @@ def without_unnamed_effects(finding: Finding) -> Finding:
     remaining = remainders(hypotheses, winner, finding.rows.choosing) if named_effects else ()
     notes = remainder_notes(finding.verdict, remaining, in_noise=False, named=bool(named_effects))
     return replace(finding, winner=winner, remainders=remaining, notes=notes)
+
+
+def remaining_fraction(
+    hypotheses: HypothesisSet, winner: Hypothesis, as_recorded: RegressionData
+) -> float:
+    """Return the share of the training energy above noise under the baseline that remains.
+
+    `as_recorded` are the training rows before any sine was taken out of them.
+    """
+    noise = {(f.group, f.equation): f.noise for f in as_recorded.floors}
+    sine_energy = sum(
+        s.count * max(0.0, (noise[s.group, s.equation] / s.noise) ** 2 - 1)
+        for s in hypotheses.train_data.segments
+    )
+    start = hypotheses.empty.total + sine_energy
+    return float(min(1.0, winner.total / start)) if start > 0 else 0.0

@@ -241,6 +241,14 @@ def narrower_rows_note(narrower: float, width: float) -> str:
     )
 
 
+def wider_rows_note(width: float) -> str:
+    """State that a torque lies above the frequencies of the rows for a bandwidth [Hz]."""
+    return (
+        f"the motion is below {plain(width, 2)} Hz, and the model is that of rows for it; the "
+        "errors are of wider rows, which show a torque at a higher frequency"
+    )
+
+
 def not_judged_notes(
     remaining: Sequence[Remainder], noise: Mapping[str, float], after: Mapping[str, float]
 ) -> list[str]:

@@ -275,6 +275,11 @@ class Trace:
         return self.model_after.terms != self.model_before.terms
 
     @property
+    def errors_changed(self) -> bool:
+        """Whether the effects change an error, also those that no model has (`Line`)."""
+        return self.changed or self.after != self.before
+
+    @property
     def tied_at(self) -> list[tuple[str, str]]:
         """Name and catalogue place (with sensor or chamber) of the rivals of `tied`."""
         return sorted({(r.name, r.at or r.where) for r in self._tied_rivals})

@@ -86,6 +86,9 @@ class TraceSettings:
     """Bandwidth of records whose residual is unexplained, over the measured one, with which they
     are traced again: the noise of an acceleration grows with frequency and hides slow effects
     (tuned: a spring left 1.6 noise floors in rows up to 14 Hz, 4.7 in those up to 6 Hz)."""
+    wider_bandwidth: float = 10.0
+    """Bandwidth [Hz] of the rows in which repeats of a clean result are searched for torques that
+    do not follow the motion: rows up to 15 Hz (convention)."""
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
     motion_ratio: float = 0.65

@@ -268,10 +268,10 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))
         axes.set_ylim(-0.6, len(names) - 0.4)
-        colours = " (grey before, blue after)" if result.changed else ""
+        colours = " (grey before, blue after)" if result.errors_changed else ""
         axes.set_xlabel(f"held-out error over the noise floor{colours}")
         canvas.tight_layout()
-        title = f"Held-out error over the noise floor{_compared(result.changed)}"
+        title = f"Held-out error over the noise floor{_compared(result.errors_changed)}"
         return svg(canvas, key, title)
 
 

@@ -52,8 +52,8 @@ def trace_text(result: Trace) -> str:
 
 
 def _errors(result: Trace) -> str:
-    """Return the held-out errors as a table, once where nothing was added to the model."""
-    models = (result.before, result.after)[: 2 if result.changed else 1]
+    """Return the held-out errors as a table, once where no effect changes them."""
+    models = (result.before, result.after)[: 2 if result.errors_changed else 1]
     rows = [
         [
             name, _number(result.noise_floor.get(name, math.nan), 2),
@@ -63,8 +63,8 @@ def _errors(result: Trace) -> str:
         ]
         for name in result.before
     ]  # fmt: skip
-    words = ["before", "after"] if result.changed else ["rms"]
-    relative = ["relative before", "after"] if result.changed else ["relative"]
+    words = ["before", "after"] if result.errors_changed else ["rms"]
+    relative = ["relative before", "after"] if result.errors_changed else ["relative"]
     return table(["held-out error", "noise floor", *words, "unit", *relative], rows)
 
 

@@ -28,12 +28,13 @@ from analysis.trace.data.conditioned_record import ConditionedRecord, conditione
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.judge import gates, held_out, inference
-from analysis.trace.result import UNEXPLAINED, Trace
+from analysis.trace.result import EXPLAINED, UNEXPLAINED, Trace
 from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended, extended_in
+from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
-from rig.model.records import Run, of_bandwidth
+from rig.model.records import Record, Run, of_bandwidth
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 from tests.analysis import carriage, small_bench
@@ -502,6 +503,32 @@ def slow_rows_show_what_noise_of_the_acceleration_hides(b: Benches) -> None:
     assert "up to 2.5 Hz" in again.notes[0]
 
 
+def a_torque_above_the_motions_frequencies_is_named(b: Benches) -> None:
+    """The records state a motion below 1.5 Hz; a pump at 9 Hz, of any phase, brakes piston 2."""
+    frequency = 9.1  # [Hz]
+
+    def braked(record: Record) -> NDArray[np.float64]:
+        turns = frequency * np.asarray(record.time) + 0.62 * record.repeat
+        return np.asarray(8.0 * np.sin(2 * np.pi * turns))
+
+    runs = b.kept("no effect", lambda: foreign_bench.pair_of_runs(b.rig, foreign_bench.Hidden()))
+    unstated = (
+        replace(run, records=tuple(replace(r, period=0, lines=()) for r in run.records))
+        for run in runs
+    )
+    train, held_out = of_bandwidth([with_force(run, braked) for run in unstated], 1.5)
+    result = b.traced((train, held_out), "internal_leakage", "coulomb_friction")
+    assert [(result.verdict, e.name) for e in result.effects] == [
+        (EXPLAINED, "periodic_disturbance")
+    ]
+    low, high = result.effects[0].parameters["frequency_2"].ci95
+    assert low < frequency < high
+    assert result.after["torque_2"] < 0.5 * result.before["torque_2"]
+    assert result.model_after.terms == result.model_before.terms
+    assert "the motion is below 1.5 Hz" in result.notes[0]
+    assert "relative before" in trace_text(result)
+
+
 def noise_of_torque_rows(_: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
     """Return the rms of the residual of torque rows, as if neighbouring states showed it."""
     return float(np.sqrt(np.mean(residual**2))) if rows.equation.startswith("torque") else None
@@ -818,6 +845,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_above_the_measured_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (noise_that_falls_with_frequency_is_noise_where_nothing_repeats, ("noise above the rows",)),
     (slow_rows_show_what_noise_of_the_acceleration_hides, ("narrower rows",)),
+    (a_torque_above_the_motions_frequencies_is_named, ("wider rows",)),
     (noise_of_a_position_leaves_a_level_as_it_is, ("filtered path",)),
     (a_leak_is_not_refused_for_a_friction_that_would_drive, ("unphysical companion",)),
     (thinner_oil_on_the_held_out_day_is_no_effect, ("oil of another day",)),

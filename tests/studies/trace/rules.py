@@ -233,6 +233,8 @@ RULES: Final = (
          ((judging.Judge, "_unphysical_of", lambda *_: []),)),
     Rule("narrower rows", "what rows of all frequencies leave unexplained stays so",
          ((engine, "_traced_in_narrower_rows", lambda *_: None),)),
+    Rule("wider rows", "what rows for the motion show clean is clean",
+         ((engine, "_traced_in_wider_rows", lambda *_: None),)),
     Rule("filtered path", "friction reverses along the path as it is measured, noise included",
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
