@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from rig.cli.text.output import progress
+
 if TYPE_CHECKING:
     from pathlib import Path
 
     from drivers.base import Driver
+    from rig.cli.text.output import Say
     from rig.model.rig import Rig
 
 
@@ -47,6 +50,14 @@ def bench_at(name: str, endpoint: str | None, *, on_twin: bool = False) -> Rig:
         where = _place_of(name, str(error)) if in_file else f"rig {bench.name!r}"
         raise InputError(f"{where}: {error}") from error
     return bench
+
+
+def warn_of_limits(rig: Rig, say: Say = progress) -> None:
+    """State each limit that no reading can pass, before anything moves."""
+    from rig.bench.checks.unreachable import unreachable_limits
+
+    for sentence in unreachable_limits(rig):
+        say(f"WARNING: {sentence}")
 
 
 def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:

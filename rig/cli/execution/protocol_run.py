@@ -25,7 +25,13 @@ from rig.bench.latch import known_rigs, reset_bench, tripped_rigs
 from rig.bench.screens.snapshot import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
-from rig.cli.execution.device import bench_at, device_of, only_bench, refuse_endpoint_alone
+from rig.cli.execution.device import (
+    bench_at,
+    device_of,
+    only_bench,
+    refuse_endpoint_alone,
+    warn_of_limits,
+)
 from rig.cli.proof.proofs import proved
 from rig.cli.proof.twin_choice import twin_source
 from rig.cli.text.output import Countdown, Say, clock_text, is_terminal
@@ -198,6 +204,7 @@ def _provenance(job: ProtocolJob, plan: Plan) -> dict[str, Any]:
 def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol and return its run folder; raises the error that ended it, outputs at zero."""
     rig, overrides = bench_at(job.rig, job.endpoint), job.overrides
+    warn_of_limits(rig, say)
     plan = resolve(library.load(job.protocol, overrides.parameters), rig, overrides)
     refuse_occupied(job.out)
     run_machine = StateMachine()

@@ -40,13 +40,14 @@ def check(
     """
     from protocols.files import library
     from protocols.files.plan import resolve
-    from rig.cli.execution.device import bench_at
+    from rig.cli.execution.device import bench_at, warn_of_limits
     from rig.cli.proof.proofs import proved
     from rig.cli.proof.twin_choice import twin_source
     from rig.cli.text.sheets import check_text
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
     bench = bench_at(rig, None, on_twin=True)
+    warn_of_limits(bench)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
     source = twin_source(bench, model, nominal)
     proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)

@@ -32,10 +32,11 @@ def manual(
     from rig.bench.screens.sockets import AttachError, Publisher
     from rig.bench.session import Bench
     from rig.cli.errors import WorkError
-    from rig.cli.execution.device import device_of
+    from rig.cli.execution.device import device_of, warn_of_limits
     from rig.runs.recorder import Recorder
 
     described, driver = device_of(rig, endpoint)
+    warn_of_limits(described)
     try:
         publisher = Publisher(described.name)
     except AttachError as error:
