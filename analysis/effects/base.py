@@ -250,6 +250,10 @@ class Effect(Term):
         """Return `inseparable`, with those that hold beside the `others` of a set on a rig."""
         return self.inseparable(shape)
 
+    def alike_together(self, rig: Rig) -> tuple[tuple[str, str], ...]:
+        """Return two effects, as (name, where), that together nearly act as this one; else ()."""
+        return ()
+
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every `where` of this effect on a rig; none without the oil it acts on."""

@@ -63,6 +63,14 @@ class TimingError(Sensor):
         value, half = self.shape_of(rig, shape)[0], 0.5 / rig.sample_rate
         return {self.shape_names()[0]: (max(value - half, 0.0), value + half)}
 
+    def alike_together(self, rig: Rig) -> tuple[tuple[str, str], ...]:
+        """Return the lag of both spools of a rig beside one time of all its pistons.
+
+        A spool that lags its signal, as its command does in its place, makes the piston late.
+        """
+        both_late = self.shared == "piston" and len(rig.joints) == 2
+        return (("spool_lag", "joint 1"), ("spool_lag", "joint 2")) if both_late else ()
+
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State that a position half a sample late may be a command that is held, and recorded so.
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shapes_of
 from analysis.regression.least_squares import shortest
 from analysis.terms.base import Used, family_of
-from analysis.trace.data.candidates import effect_in, effects_among
+from analysis.trace.data.candidates import at_start, effect_in, effects_among
 from analysis.trace.data.conditioned_record import families_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import held_out, inference, rivals
@@ -109,6 +109,7 @@ def judge_effects(
         tie_test = rivals.TieTest(holdout_data, changes, after, without)
         pairs, others = [], []
         if changes:  # an effect that removes nothing leaves no equation to compare others in
+            _fit_alike_together(hypotheses, winner, used)
             pairs = rivals.tied_pairs(hypotheses, winner, used, tie_test)
             others = rivals.rivals_of(hypotheses, winner, used, alternative, tie_test, pairs)
         removed = held_out.removal_of(holdout_data, changes, without, after)
@@ -156,6 +157,14 @@ def judge_effects(
             )
         )  # fmt: skip
     return tuple(out)
+
+
+def _fit_alike_together(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> None:
+    """Fit the set with two effects that together act alike in place of one, if it is not yet."""
+    rig, others = hypotheses.train_data.rig, winner.without(used)
+    pair = effect_in(used).alike_together(rig)
+    if pair and not winner.keys & set(pair):
+        hypotheses.refined([*others, *(at_start(rig, effect_of(*key)) for key in pair)], winner)
 
 
 def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:

@@ -11,7 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis.terms import make
 from analysis.trace import judging
+from analysis.trace.data.candidates import at_start
 from analysis.trace.finding import Finding, remainders
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.gates import judged_beside_unknown_cause
@@ -80,6 +82,21 @@ def test_an_effect_that_removes_nothing_is_compared_with_no_other(
     assert not gates.passes_gates(judged)
     assert "it removes nothing" in words[gates.NO_RIVAL]
     assert not any("nan" in text for text in words.values())
+
+
+def test_the_lag_of_all_spools_is_compared_with_one_delay_of_all_pistons(rig: Rig) -> None:
+    """Commands in place of two spools: one number for the pistons was named, without this rival."""
+    s = gate_cases.searched(rig, *pair_of_runs(rig), "channel_delay")
+    data = s.hypotheses.train_data
+    delay = replace(at_start(rig, make("channel_delay", "bench piston")), shape=(2e-3,))
+    late = replace(s.hypotheses.refined([delay]), excess_energy=s.hypotheses.empty.excess_energy)
+    early = {e: v + 1e3 for e, v in late.excess_energy.items()}
+    s.hypotheses.empty = replace(s.hypotheses.empty, excess_energy=early)
+    gates.judge_effects(s.hypotheses, late, s.holdout_data, np.random.default_rng(0))
+    pair = make("channel_delay", "bench piston").alike_together(data.rig)
+    assert pair == (("spool_lag", "joint 1"), ("spool_lag", "joint 2"))
+    assert frozenset(pair) in s.hypotheses.fitted
+    assert make("channel_delay", "joint 1 piston").alike_together(data.rig) == ()
 
 
 def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect(rig: Rig) -> None:
