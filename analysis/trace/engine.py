@@ -423,7 +423,8 @@ def _traced_in_wider_rows(
     noise; model and free runs stay, which leave out torques of another phase in each record.
     """
     width = records.bandwidth
-    if result.verdict != CLEAN or width is None or width >= TRACE.wider_bandwidth:
+    repeated = any(record.repeat > 1 for run in records.train for record in run.records)
+    if result.verdict != CLEAN or not repeated or width is None or width >= TRACE.wider_bandwidth:
         return None
     wider = records.of_bandwidth(TRACE.wider_bandwidth)
     lines = unlocked_lines(trace_rows(wider).train)
