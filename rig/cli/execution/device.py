@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import typer
-
 from rig.cli.text.output import progress
 
 if TYPE_CHECKING:
@@ -105,7 +103,6 @@ def _place_of(name: str, problem: str) -> str:
     return f"{source}:{next((line for line in known if line is not None), 1)}"
 
 
-def print_pressure(places: list[str], *, to_stderr: bool = False) -> None:
-    """Print the places still under pressure, if any; `to_stderr`: to standard error."""
-    if places:
-        typer.echo(f"still under pressure: {', '.join(places)}", err=to_stderr)
+def pressure_text(places: list[str], bench: str = "") -> str:
+    """Return the places still under pressure as text, of a `bench` where several may be meant."""
+    return f"still under pressure{f', {bench}' if bench else ''}: {', '.join(places)}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from rig.cli.execution.device import device_of, print_pressure
+from rig.cli.execution.device import device_of, pressure_text
 from rig.cli.options import EndpointOption, JsonOption, RigOption
 from rig.cli.text.output import print_result, table
 from rig.model.units import READINGS, display_unit
@@ -55,7 +55,8 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
             f"tripped: {'; '.join(trips)}; clear it with `{reset_command(described)}`",
             err=to_stderr,
         )
-    print_pressure(bench.pressurised(readings), to_stderr=to_stderr)
+    if places := bench.pressurised(readings):
+        typer.echo(pressure_text(places), err=to_stderr)
     implausible = [reading.channel for reading in readings if reading.mark != bench.GOOD]
     if implausible:
         raise WorkError(f"not plausible: {', '.join(implausible)}; the last column says why")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 from rig.cli.errors import alarm, code_and_message, print_error
-from rig.cli.execution.device import device_of, refuse_endpoint_alone
+from rig.cli.execution.device import device_of, pressure_text, refuse_endpoint_alone
 from rig.cli.options import EndpointOption, KnownRigOption
 from rig.cli.text.output import progress
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 News = SimpleQueue[str | BaseException | None]
 
 NOT_IN_USE: Final = "no process of this computer drives a bench"
-# Without an answer for so long the operator is told to use the emergency stop.
+# Without an answer for so long the operator is asked to use the emergency stop.
 SILENCE: Final = 1.0  # [s]
 # A stopped run records its outputs at zero, for at most 6 s and two answer times.
 RECORDS_ZERO: Final = 15.0  # [s]
@@ -55,7 +55,7 @@ def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     for one in stops:
         one.start()
     _warn_of_silence(stops)
-    errors = _told(news, len(stops))
+    errors = _printed_news(news, len(stops))
     if errors and len(stops) == 1:
         raise errors[0]
     if errors:
@@ -98,7 +98,7 @@ class BenchStop(threading.Thread):
 
         bench_rig, driver = device_of(self._rig, self._endpoint)
         self.place = _place(bench_rig)
-        holder = _told_to_end(bench_rig.wire)
+        holder = _signalled_holder(bench_rig.wire)
         try:
             self._zero(driver, bench_rig.wire, holder)
         except DeviceError as error:
@@ -116,9 +116,8 @@ class BenchStop(threading.Thread):
         except DeviceError as error:
             progress(f"pressures not read, {self.place}: {error}")
         else:
-            if pressurised := bench.pressurised(readings):
-                places = ", ".join(pressurised)
-                self._news.put(f"still under pressure, {self.place}: {places}")
+            if places := bench.pressurised(readings):
+                self._news.put(pressure_text(places, self.place))
 
     def _zero(self, driver: Driver, wire: Wire, holder: Holder | None) -> None:
         """Zero the outputs, several times where a run of another computer may still set them.
@@ -156,7 +155,7 @@ def _warn_of_silence(stops: list[BenchStop]) -> None:
             progress(alarm(f"bramah: {why}"))
 
 
-def _told(news: News, benches: int) -> list[BaseException]:
+def _printed_news(news: News, benches: int) -> list[BaseException]:
     """Print what the stops of so many benches report, failures first; return the errors.
 
     Errors of several benches are printed, that of one is left to the caller.
@@ -184,7 +183,7 @@ def _place(rig: Rig) -> str:
     return f"{rig.name} at {rig.wire.endpoint}"
 
 
-def _told_to_end(wire: Wire) -> Holder | None:
+def _signalled_holder(wire: Wire) -> Holder | None:
     """Tell the process of this computer that drives the bench to end; return it, None if none.
 
     Its next law would move joints again.
