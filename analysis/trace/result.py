@@ -276,7 +276,7 @@ class Trace:
 
     @property
     def errors_changed(self) -> bool:
-        """Whether the effects change an error, also those that no model has (`Line`)."""
+        """Whether the effects change an error, also of a torque that is in no model."""
         return self.changed or self.after != self.before
 
     @property

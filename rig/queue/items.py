@@ -112,7 +112,7 @@ def channel_condition(
     if measured is not None and not any(map(condition.holds, measured[name])):
         low, high = measured[name]
         raise InputError(
-            f"--when {text!r}: no reading can be so; expected a bound within the sensor's range, "
+            f"--when {text!r}: no reading fulfils it; expected a bound within the sensor's range, "
             f"{low:g} to {high:g} {unit}"
         )
     return condition

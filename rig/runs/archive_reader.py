@@ -17,7 +17,7 @@ from rig.runs.runstate import BETWEEN
 from rig.runs.sections import Written
 
 FORMAT = 1
-STRETCH: Final = 1_000_000  # samples of a channel in memory at a time
+CHUNK: Final = 1_000_000  # samples of a channel in memory at a time
 _HEAD = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
 
 
@@ -83,8 +83,8 @@ def verify(path: Path) -> None:
         records = ((f"record {name}", group) for name, group in file.items() if name != BETWEEN)
         for place, group in (*records, *((f"{BETWEEN}/{name}", group) for name, group in between)):
             for channel, data in group.items():
-                for first in range(0, len(data), STRETCH):
-                    _samples(group, channel, place, slice(first, first + STRETCH))
+                for first in range(0, len(data), CHUNK):
+                    _samples(group, channel, place, slice(first, first + CHUNK))
 
 
 @contextmanager

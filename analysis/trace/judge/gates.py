@@ -131,9 +131,11 @@ def judge_effects(
         ]
         removes = removed.share >= TRACE.least_removed and not disturbed
         significance = f"family-wise p = {p:.3g}" + (ZERO_IN_INTERVAL if unknown_size else "")
-        rival_words = rivals.rivals_in_words([*inseparable, *others])
-        if not changes:
-            rival_words = "it removes nothing that another effect could remove"
+        rival_words = (
+            rivals.rivals_in_words([*inseparable, *others])
+            if changes
+            else "it removes nothing that another effect could remove"
+        )
         separated = not (inseparable or any(r.tied for r in others))
         if separated:
             rival_words += rivals.pair_in_words(pairs)

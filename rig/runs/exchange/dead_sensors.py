@@ -26,7 +26,7 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
     """Return a sentence for each constant, stuck, clipped or far too small channel (n,); else [].
 
     Also for one beyond its sensor's range. Spool and piston of `locked` joints (1-based) may stand
-    still, and so may the oil's temperature; what a value can never be is said of them as well.
+    still, and so may the oil's temperature; of them only impossible values are reported.
     """
     sentences = []
     for name, values in channels.items():
@@ -52,7 +52,7 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
 
 
 def _impossible_at_rest(rig: Rig, kind: str, name: str, values: Array) -> list[str]:
-    """Return a sentence for a channel (n,) of a joint at rest, or of the oil, that cannot be so."""
+    """Return a sentence on impossible values of a channel (n,) of a joint at rest or the oil."""
     low, high = float(values.min()), float(values.max())
     bottom, top = rig.sensors.of(kind).range
     margin = EXCHANGE.end_share * (top - bottom)
