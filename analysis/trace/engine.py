@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from analysis.effects.base import Effect, ordered
 from analysis.effects.disturbance import PeriodicDisturbance
@@ -58,6 +58,7 @@ from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.settings import SEARCH, TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
+from analysis.workers.pool import Pool, Serial
 from rig.model.parse import InputError
 from rig.model.records import Run, refuse_malformed, with_common_bandwidth, with_loads_stated
 from rig.model.rig import Rig
@@ -79,6 +80,7 @@ def trace(
     free_forms: bool = True,
     progress: Callable[[float], None] | None = None,
     judge: Sequence[Run] = (),
+    pool: Pool | None = None,
 ) -> Trace:
     """Return the effects that the baseline lacks on `runs`, with their errors on other records.
 
@@ -95,6 +97,8 @@ def trace(
     `terms`: a model's terms in place of the baseline's; shapes of its effects are not searched.
     `free_forms`: try mechanisms whose curve the data give where no named effect explains.
     `progress`: is called with the share of the work done, during the search with the same again.
+    `pool`: computes the fits, by default in this process; results are the same with any pool that
+    takes closures.
 
     Raises InputError for records of different rigs, for no held-out records, for held-out or
     judging records that are equal to others, and for records that are too short.
@@ -106,7 +110,7 @@ def trace(
     refuse_repeated_records(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
     effects = catalogue(rig) if effects is None else effects
-    options = _Options(effects, seed, look_ahead, free_forms)
+    options = _Options(effects, seed, look_ahead, free_forms, pool or Serial())
     separated, notes = with_other_motions_apart(
         with_common_bandwidth(with_loads_stated([*runs, *holdout, *judge]))
     )
@@ -163,6 +167,7 @@ class _Options:
     seed: int
     look_ahead: bool
     free_forms: bool
+    pool: Pool = field(default_factory=Serial)
 
 
 @dataclass(frozen=True)
@@ -200,6 +205,7 @@ def _prepared(records: TraceRuns, options: _Options) -> _Prepared:
         _lacking_candidates(options.effects, known, moving),
         _lacking_candidates(free_mechanisms(rig), known) if options.free_forms else [],
         options.seed,
+        options.pool,
     )
     return _Prepared(records, rows, as_recorded.train, candidates, baseline.model, notes)
 
@@ -227,7 +233,9 @@ def _with_free_runs(
 
     fitted = fit(finding)
     simulated = held_out.completed(fitted.model, baseline)
-    runs_before, runs_after = held_out.free_runs(records.unseen, baseline, simulated)
+    runs_before, runs_after = held_out.free_runs(
+        records.unseen, baseline, simulated, prepared.candidates.pool
+    )
     if simulated is fitted.model and (worse := held_out.worse_free_run(runs_before, runs_after)):
         finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
         fitted, runs_after = fit(finding), runs_before

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from analysis.trace.search.forward_search import search
 from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH
+from analysis.workers.pool import Pool, Serial
 
 Array = NDArray[np.float64]
 
@@ -44,12 +45,13 @@ ONLY_HELD_OUT_MISSED = (
 class Candidates:
     """What is searched: `named` effects, and `free` mechanisms tried where none of them explains.
 
-    `seed` draws the sign flips.
+    `seed` draws the sign flips; `pool` computes the fits.
     """
 
     named: Sequence[Effect]
     free: Sequence[Effect]
     seed: int
+    pool: Pool = field(default_factory=Serial)
 
 
 def search_and_judge(
@@ -59,7 +61,8 @@ def search_and_judge(
 
     `progress` is called as by `HypothesisSet`.
     """
-    hypotheses, choosing = HypothesisSet(rows.train, candidates.named, progress), rows.choosing
+    choosing = rows.choosing
+    hypotheses = HypothesisSet(rows.train, candidates.named, progress, candidates.pool)
     in_noise = hypotheses.within_noise(hypotheses.empty)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)

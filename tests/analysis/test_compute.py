@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count, islice
+from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
 from analysis.identify.result import PLAIN
 from analysis.identify.streams.out_of_core import identify_folders
 from analysis.workers.cluster import DaskCluster
+from analysis.workers.forked import Forked
 from analysis.workers.pool import Pool, Processes, Serial
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -40,9 +45,9 @@ def alive(pid: int) -> bool:
     return True
 
 
-@pytest.fixture(scope="module")
-def processes() -> Iterator[Pool]:
-    with Processes(2) as pool:
+@pytest.fixture(scope="module", params=[Processes, Forked])
+def processes(request: pytest.FixtureRequest) -> Iterator[Pool]:
+    with request.param(2) as pool:
         yield pool
 
 
@@ -51,9 +56,10 @@ def test_processes_give_what_this_process_gives(processes: Pool) -> None:
     assert list(processes.map(noise, range(20))) == expected
 
 
-def test_items_may_be_endless(processes: Pool) -> None:
-    for pool in (Serial(), processes):
-        assert list(islice(pool.map(square, count()), 5)) == [0, 1, 4, 9, 16]
+def test_items_may_be_endless() -> None:
+    with Processes(2) as processes:
+        for pool in (Serial(), processes):
+            assert list(islice(pool.map(square, count()), 5)) == [0, 1, 4, 9, 16]
 
 
 def test_an_error_comes_back_as_it_was(processes: Pool) -> None:
@@ -76,6 +82,52 @@ def test_processes_are_others_have_one_thread_each_and_end_with_the_block() -> N
 def test_a_process_that_dies_ends_the_work_with_a_reason() -> None:
     with Processes(1) as pool, pytest.raises(ChildProcessError, match="a worker process died"):
         list(pool.map(gone, [1]))
+
+
+def test_copies_of_this_process_share_its_data_and_end_with_the_map() -> None:
+    pool, large = Forked(2), np.zeros(1_000_000)
+    met = get_context("fork").Barrier(2)
+
+    def work(number: int) -> tuple[int, list[int], float]:
+        if number < 2:  # neither process can take both
+            met.wait(END_SECONDS)
+        large[number] = 1.0
+        return os.getpid(), list(pool.map(lambda _: os.getpid(), range(3))), large.sum()
+
+    done = list(pool.map(work, range(4)))
+    pids = {pid for pid, _, _ in done}
+    assert len(pids) == 2
+    assert os.getpid() in pids
+    # A map within a map starts no further copies.
+    assert all(within == [pid] * 3 for pid, within, _ in done)
+    assert large.sum() == sum(pid == os.getpid() for pid, _, _ in done) < 4
+    (copy,) = pids - {os.getpid()}
+    assert not alive(copy)
+
+
+def test_what_a_copy_does_not_finish_is_done_here(caplog: pytest.LogCaptureFixture) -> None:
+    """Out of memory, the system kills one of the processes."""
+    here, taken = os.getpid(), get_context("fork").Event()
+
+    def work(number: int) -> int:
+        if os.getpid() != here:
+            taken.set()
+            os.kill(os.getpid(), signal.SIGKILL)
+        assert taken.wait(END_SECONDS)
+        return number
+
+    assert list(Forked(2).map(work, range(4))) == [0, 1, 2, 3]
+    assert "a process that shared the work died" in caplog.text
+
+
+def test_other_threads_forbid_copies() -> None:
+    """A lock that another thread holds would stay locked in the copy."""
+    end = threading.Event()
+    other = threading.Thread(target=end.wait)
+    other.start()
+    assert Forked().workers == 1
+    end.set()
+    other.join()
 
 
 @contextmanager

@@ -38,6 +38,7 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.settings import DATA, TRACE
+from analysis.workers.pool import Pool, Serial
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -305,11 +306,12 @@ def signals_of(data: RegressionData) -> list[Signals]:
 def variant_columns(
     data: RegressionData, chosen: Sequence[Used],
     progress: Callable[[float], None] | None = None, equations: Collection[str] = (),
+    pool: Pool | None = None,
 ) -> list[VariantColumns]:  # fmt: skip
     """Return the columns of every candidate `chosen` that acts in the data, in their order.
 
     `progress` is called after each with the share of them done. With `equations`, columns
-    are computed in their rows only and are zero elsewhere.
+    are computed in their rows only and are zero elsewhere. `pool` computes them.
     """
     searched = equations or {s.equation for s in data.segments}
     families = {family_of(e) for e in searched}
@@ -319,8 +321,12 @@ def variant_columns(
     segments = [s for s in data.segments if s.equation in searched]
     signals_of_records = signals_of(data)
     columns = []
-    for used in chosen:
-        columns.append(_columns_of(data, records, segments, used, signals_of_records))
+
+    def of_candidate(used: Used) -> VariantColumns | None:
+        return _columns_of(data, records, segments, used, signals_of_records)
+
+    for entry in (pool or Serial()).map(of_candidate, chosen):
+        columns.append(entry)
         if progress is not None:
             progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]

@@ -100,10 +100,12 @@ def judge_effects(
     )
     before, after = (held_out_residual(holdout_data, o.fit) for o in (hypotheses.empty, winner))
     shift = form_shift(train_data, winner.fit)
+    alternatives = hypotheses.each(
+        lambda sets, used: _set_without(sets, winner, used), winner.effects
+    )
     out = []
-    for used in winner.effects:
+    for used, alternative in zip(winner.effects, alternatives, strict=True):
         effect = effect_in(used)
-        alternative = _set_without(hypotheses, winner, used)
         without = held_out_residual(holdout_data, alternative.fit)
         changes = held_out.removed_energy(winner, alternative)
         tie_test = rivals.TieTest(holdout_data, changes, after, without)

@@ -32,6 +32,7 @@ from analysis.trace.search.exact_fit import DesignMatrix, ExactFit, design_matri
 from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH, TRACE
+from analysis.workers.pool import Pool
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -255,11 +256,12 @@ def free_curves(before: FreeRunErrors, after: FreeRunErrors) -> FreeCurves | Non
 
 
 def free_runs(
-    holdout: Sequence[Run], before: Model, after: Model
+    holdout: Sequence[Run], before: Model, after: Model, pool: Pool
 ) -> tuple[FreeRunErrors, FreeRunErrors]:
     """Return the free runs of both models, driven by the measured spool or drive alone."""
-    first = _free_runs(holdout, before)
-    return first, first if after is before else _free_runs(holdout, after)
+    models = [before] if after is before else [before, after]
+    runs = list(pool.map(lambda model: _free_runs(holdout, model), models))
+    return runs[0], runs[-1]
 
 
 def completed(after: Model, before: Model) -> Model:

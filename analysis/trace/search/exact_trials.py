@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterator, Sequence
+from functools import partial
 
+from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import effect_in
 from analysis.trace.search.exact_fit import fit_coefficients
@@ -34,10 +36,8 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> 
     """
     band = hypotheses.noise_band
     while above := {e for e, v in current.excess_energy.items() if v > band[e]}:
-        tried = [
-            hypotheses.refined_below(energy, effects, current)
-            for energy, effects in _best_trials(hypotheses, current, above)
-        ]
+        trials = _best_trials(hypotheses, current, above)
+        tried = hypotheses.each(partial(_refined_below, current), trials)
         pruned = hypotheses.prune(hypotheses.best([current, *tried]))
         better = exchanged(hypotheses, pruned)
         to_noise = hypotheses.within_noise(better)
@@ -47,6 +47,10 @@ def improved_by_exact_trials(hypotheses: HypothesisSet, current: Hypothesis) -> 
             break
         current = better
     return current
+
+
+def _refined_below(rival: Hypothesis, hypotheses: HypothesisSet, trial: _Trial) -> Hypothesis:
+    return hypotheses.refined_below(*trial, rival)
 
 
 def _best_trials(
@@ -68,15 +72,23 @@ def _best_additions(
 ) -> list[_Trial]:
     """Return the physical sets with one effect beside `start` that leave least on its grid."""
     data = hypotheses.train_data
+
+    def may_join(effect: Effect) -> bool:
+        new = effect.key not in current.keys and not effect.free
+        return new and may_act(hypotheses, effect, current, equations)
+
+    def energy(used: Used) -> float:
+        return fit_coefficients(data, (*hypotheses.base, *start, used)).energy
+
+    points = [
+        used
+        for used in hypotheses.variants_of(data, current.fit.residual)
+        if may_join(effect_in(used))
+    ]
     best_trial: dict[Key, _Trial] = {}
-    for used in hypotheses.variants_of(data, current.fit.residual):
-        effect = effect_in(used)
-        may_join = effect.key not in current.keys and not effect.free
-        if may_join and may_act(hypotheses, effect, current, equations):
-            effects = (*start, used)
-            energy = fit_coefficients(data, (*hypotheses.base, *effects)).energy
-            if energy < best_trial.get(effect.key, (float("inf"), ()))[0]:
-                best_trial[effect.key] = energy, effects
+    for used, left in zip(points, hypotheses.pool.map(energy, points), strict=True):
+        if left < best_trial.get(used.term.key, (float("inf"), ()))[0]:
+            best_trial[used.term.key] = left, (*start, used)
     ordered = sorted(best_trial.values(), key=lambda trial: trial[0])
     possible = (
         trial for trial in ordered

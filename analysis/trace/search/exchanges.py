@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import complexity
 from analysis.trace.search import linear_fit
@@ -20,9 +23,9 @@ def exchanged(hypotheses: HypothesisSet, current: Hypothesis) -> Hypothesis:
     """
     tried = {current.keys}
     while current.effects:
-        sets = _with_another(hypotheses, current)
-        for used in current.effects:
-            sets += _with_two_for_one(hypotheses, current, used)
+        pairs = [p for u in current.effects for p in _with_two_for_one(hypotheses, current, u)]
+        fit = partial(_refined_against, current)
+        sets = [*_with_another(hypotheses, current), *hypotheses.each(fit, pairs)]
         pruned = hypotheses.prune(hypotheses.best([current, *sets]))
         other = hypotheses.best([current, pruned])  # one that lost an effect again may be worse
         if other.keys in tried:
@@ -32,10 +35,16 @@ def exchanged(hypotheses: HypothesisSet, current: Hypothesis) -> Hypothesis:
     return hypotheses.fitted.get(current.keys, current)  # a later start may have better shapes
 
 
+def _refined_against(
+    rival: Hypothesis, hypotheses: HypothesisSet, effects: Sequence[Used]
+) -> Hypothesis:
+    return hypotheses.refined(effects, rival)
+
+
 def _with_two_for_one(
     hypotheses: HypothesisSet, current: Hypothesis, used: Used
-) -> list[Hypothesis]:
-    """Return the sets with two other effects in the place of one, the best by their columns.
+) -> list[tuple[Used, ...]]:
+    """Return the sets to fit with two other effects in the place of one, the best by their columns.
 
     The pairs and the effect are compared by their columns of first order, under the baseline: to
     compute them anew for each set takes long. Pairs that leave more than the effect by more than
@@ -62,7 +71,7 @@ def _with_two_for_one(
     ]  # fmt: skip
     affordable = current.total + SEARCH.number_price * sum(current.size)
     return [
-        hypotheses.refined(effects, current)
+        effects
         for effects in sets
         if SEARCH.number_price * sum(complexity(data.rig, effects)) <= affordable
     ]
@@ -81,18 +90,19 @@ def _with_another(hypotheses: HypothesisSet, current: Hypothesis) -> list[Hypoth
     columns = [c for c in hypotheses.columns if c.used.term.key not in current.keys]
     alone = [o for o in hypotheses.fitted.values() if o.size[0] == 1 and not o.keys & current.keys]
     alone.sort(key=lambda o: o.total)
-    sets = []
-    for used in current.effects:
-        smaller = hypotheses.refined_anew(current.without(used), current)
+    starts: list[tuple[Hypothesis, tuple[Used, ...]]] = []
+    both: list[tuple[Used, ...]] = []
+    for smaller in hypotheses.each(
+        lambda sets, effects: sets.refined_anew(effects, current),
+        map(current.without, current.effects),
+    ):
         data = rebased(hypotheses.train_data, smaller.fit)
-        starts = best_additions(hypotheses, data, smaller, columns)
-        sets += [
-            extended(hypotheses, smaller, effects, current)
-            for effects in starts[: SEARCH.replacements]
-        ]
-        shown = {effects[-1].term.key for effects in starts}
+        larger = best_additions(hypotheses, data, smaller, columns)
+        starts += [(smaller, effects) for effects in larger[: SEARCH.replacements]]
+        shown = {effects[-1].term.key for effects in larger}
         hidden = [o for o in alone if not o.keys & shown and not hypotheses.physical_problem(o)]
-        for single in hidden[:1]:
-            both = (*smaller.effects, *single.effects)
-            sets.append(hypotheses.refined(both, current, both))
-    return sets
+        both += [(*smaller.effects, *single.effects) for single in hidden[:1]]
+    return [
+        *hypotheses.each(lambda sets, start: extended(sets, *start, current), starts),
+        *hypotheses.each(lambda sets, effects: sets.refined(effects, current, effects), both),
+    ]

@@ -44,16 +44,17 @@ def extensions(
     `equations` restricts the search to their rows, `free` to free mechanisms. `rival` is the set
     that they may replace (`HypothesisSet.refined`).
     """
-    larger = [
-        extended(hypotheses, current, effects, rival)
-        for effects in _starts_by_columns(hypotheses, current, equations, free)
-    ]
+
+    def fit(sets: HypothesisSet, effects: tuple[Used, ...]) -> Hypothesis:
+        return extended(sets, current, effects, rival)
+
+    larger = hypotheses.each(fit, _starts_by_columns(hypotheses, current, equations, free))
     if free:
         return larger
     hidden: dict[frozenset[Key], tuple[Used, ...]] = {}
     for effects in _starts_that_columns_hide(hypotheses, current, larger, equations):
         hidden.setdefault(keys_of(effects), effects)
-    return larger + [extended(hypotheses, current, effects, rival) for effects in hidden.values()]
+    return larger + hypotheses.each(fit, hidden.values())
 
 
 def _starts_by_columns(
@@ -77,7 +78,10 @@ def _starts_by_columns(
 
     points = hypotheses.variants_of(data, current.fit.residual)
     columns = variant_columns(
-        data, [used for used in points if possible(effect_in(used))], equations=equations
+        data,
+        [used for used in points if possible(effect_in(used))],
+        equations=equations,
+        pool=hypotheses.pool,
     )
     mask = data.in_equations(equations or data.row_counts).astype(np.float64)
     return best_additions(hypotheses, data, current, columns, mask)[: SEARCH.refined_extensions]

@@ -31,17 +31,19 @@ def _searched(
 ) -> Hypothesis:
     """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
     band = hypotheses.noise_band
-    singles = [hypotheses.refined(effects) for effects in _best_singles(hypotheses, candidates, r)]
+    singles = hypotheses.each(HypothesisSet.refined, _best_singles(hypotheses, candidates, r))
     current = hypotheses.prune(hypotheses.best([hypotheses.empty, *singles]))
     if hypotheses.within_noise(current):
         return current
-    pairs: list[Hypothesis] = []
-    for pair in (
-        *linear_fit.best_pairs(candidates, r), *linear_fit.pairs_of_chambers(candidates, r)
-    ):  # fmt: skip
-        rival = min((current, *pairs), key=lambda o: o.total)
-        members = [candidates.entries[m].used for m in pair.members]
-        pairs.append(hypotheses.refined(members, rival))
+    trials = [
+        [candidates.entries[m].used for m in pair.members]
+        for pair in (
+            *linear_fit.best_pairs(candidates, r), *linear_fit.pairs_of_chambers(candidates, r)
+        )
+    ]  # fmt: skip
+    pairs = [hypotheses.refined(trial, current) for trial in trials[:1]]
+    rival = min((current, *pairs), key=lambda o: o.total)
+    pairs += hypotheses.each(lambda sets, trial: sets.refined(trial, rival), trials[1:])
     if hypotheses.within_form_tolerance(current):
         others = [o for o in pairs if not current.keys & o.keys]
         far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]

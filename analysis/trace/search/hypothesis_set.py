@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Collection, Iterator, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +44,12 @@ from analysis.trace.search.hypothesis import (
 )
 from analysis.trace.search.refinement import refine
 from analysis.trace.settings import SEARCH
+from analysis.workers.pool import Pool, Serial
 from rig.model.channels import place_in_words
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
+_Fitted = tuple[Hypothesis, bool]  # and whether its effects have kept their forms
 
 
 class HypothesisSet:
@@ -54,11 +59,12 @@ class HypothesisSet:
     names and places, `empty` the set without effects (the baseline), `noise_band` the energy that
     counts as noise. `columns` and `candidates` are set by `compute_columns`. `progress` is called
     with the share of the candidates' columns that is computed, and again after each fitted set.
+    `pool` computes what `each` is given.
     """
 
     def __init__(
         self, train_data: RegressionData, effects: Sequence[Effect],
-        progress: Callable[[float], None] = lambda _: None,
+        progress: Callable[[float], None] = lambda _: None, pool: Pool | None = None,
     ) -> None:  # fmt: skip
         self.train_data = train_data
         self.base = tuple(train_data.terms)
@@ -67,12 +73,42 @@ class HypothesisSet:
         self.fitted: dict[frozenset[Key], Hypothesis] = {}
         self._in_form: set[frozenset[Key]] = set()
         self._progress = progress
+        self.pool = pool or Serial()
         self.empty = self.at_given_shapes(())
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.train_data.rig
         excess_energy = energy_above_noise(self.train_data, fit.residual)
         return Hypothesis(effects, fit, excess_energy, complexity(rig, effects))
+
+    def each(
+        self, function: Callable[[HypothesisSet, T], Hypothesis], items: Iterable[T]
+    ) -> list[Hypothesis]:
+        """Return the fitted sets function(sets, item) of all items, computed by the pool.
+
+        `sets` is a copy of this object with the sets fitted so far, so that the results do not
+        depend on the number of processes. What an item fits is kept; of two fits of one set the
+        better one.
+        """
+        fitted, here = dict(self.fitted), os.getpid()
+
+        def fitted_by(item: T) -> tuple[frozenset[Key], dict[frozenset[Key], _Fitted]]:
+            sets = copy.copy(self)
+            sets.fitted, sets._in_form = dict(fitted), set(self._in_form)
+            if os.getpid() != here:  # another process does not report
+                sets._progress = lambda _: None
+            keys = function(sets, item).keys
+            new = {k: (o, k in sets._in_form) for k, o in sets.fitted.items()}
+            return keys, {k: entry for k, entry in new.items() if entry[0] is not fitted.get(k)}
+
+        results = list(self.pool.map(fitted_by, items))
+        for _, new in results:
+            for key, (hypothesis, in_form) in new.items():
+                known = self.fitted.get(key)
+                if known is None or known is fitted.get(key) or hypothesis.total < known.total:
+                    self.fitted[key] = hypothesis
+                    (self._in_form.add if in_form else self._in_form.discard)(key)
+        return [self.fitted[keys] if keys else self.empty for keys, _ in results]
 
     def at_given_shapes(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the fit of a set of effects with the shapes that they have."""
@@ -83,14 +119,15 @@ class HypothesisSet:
         """Compute the candidates' columns under the baseline."""
         data = self.train_data
         candidates = self.variants_of(data, data.mean_residual)
-        self.columns = variant_columns(data, candidates, self._progress)
+        self.columns = variant_columns(data, candidates, self._progress, pool=self.pool)
         self.candidates = self.candidate_columns(data, self.columns)
 
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
         """Return a copy with further candidates, which shares the sets fitted so far."""
         extended, data = copy.copy(self), self.train_data
         extended.effects = tuple(effects)
-        further = variant_columns(data, extended.variants_of(data, data.mean_residual))
+        candidates = extended.variants_of(data, data.mean_residual)
+        further = variant_columns(data, candidates, pool=self.pool)
         extended.columns = [*self.columns, *further]
         extended.candidates = self.candidate_columns(data, extended.columns)
         extended.effects = (*self.effects, *effects)
@@ -298,10 +335,10 @@ class HypothesisSet:
         """Return the set without effects that are not needed or remove too little."""
         band = self.noise_band
         while len(hypothesis.effects) > 1:
-            smaller = [
-                self.in_best_forms(self.refined_anew(hypothesis.without(used)))
-                for used in hypothesis.effects
-            ]
+            smaller = self.each(
+                lambda sets, effects: sets.in_best_forms(sets.refined_anew(effects)),
+                map(hypothesis.without, hypothesis.effects),
+            )
             smaller = [o for o in smaller if not self.physical_problem(o)]
             simpler = [
                 o

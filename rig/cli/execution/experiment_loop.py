@@ -18,6 +18,7 @@ import yaml
 from analysis.trace.engine import trace
 from analysis.trace.loop_rounds import Round, achieved
 from analysis.trace.result import CLEAN, EXPLAINED, UNEXPLAINED
+from analysis.workers.forked import Forked
 from protocols.design.check import check
 from protocols.engine.states import ProtocolAborted
 from protocols.files import library
@@ -123,7 +124,7 @@ class Loop:
         self.say(f"round {number}: tracing {sum(len(r.records) for r in self.train)} records")
         result = trace(
             self.train, self.judge, seed=self.request.seed,
-            progress=Countdown(f"round {number}: tracing", self.say),
+            progress=Countdown(f"round {number}: tracing", self.say), pool=Forked(),
         )  # fmt: skip
         gain = None
         if experiment is not None:

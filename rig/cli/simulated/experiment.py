@@ -20,6 +20,7 @@ from analysis.simulation.validate import RecordValidation, validate
 from analysis.simulation.validate import to_json as validation_json
 from analysis.trace.engine import trace
 from analysis.trace.result import to_json as trace_json
+from analysis.workers.forked import Forked
 from protocols.files.plan import Overrides
 from rig.cli.execution.experiment_loop import HELD_OUT, PROTOCOL
 from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
@@ -87,7 +88,9 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     write_json(folder / "identify.json", identification_json(done.identification))
     write_json(folder / "validate.json", validation_json(done.validation))
     progress("tracing missing effects, judged on held-out runs")
-    traced = trace([done.run], done.held_out, seed=seed, progress=Countdown("tracing"))
+    traced = trace(
+        [done.run], done.held_out, seed=seed, progress=Countdown("tracing"), pool=Forked()
+    )
     write_json(folder / "trace.json", trace_json(traced))
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"

@@ -51,6 +51,7 @@ def trace(
     from analysis.simulation.model import terms_like
     from analysis.trace.engine import trace as trace_runs
     from analysis.trace.result import to_json
+    from analysis.workers.forked import Forked
     from rig.cli.proof.twin_choice import save_identified
     from rig.cli.text.trace_text import trace_text
     from rig.cli.verbs.identify import load_runs
@@ -79,7 +80,7 @@ def trace(
     progress(f"tracing {sum(len(r.records) for r in training)} records")
     result = trace_runs(
         training, chosen_by, seed=seed, families=families, terms=known,
-        progress=Countdown("tracing"), judge=judged_by,
+        progress=Countdown("tracing"), judge=judged_by, pool=Forked(),
     )  # fmt: skip
     with printed_at_end(json, lambda: trace_text(result)):
         write_json(json, to_json(result))

@@ -24,6 +24,7 @@ from analysis.trace.search.forward_search import search
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns
+from analysis.workers.pool import Pool
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -83,12 +84,14 @@ class Searched:
         return out
 
 
-def searched(rig: Rig, train: Run, held_out: Run, *names: str) -> Searched:
+def searched(
+    rig: Rig, train: Run, held_out: Run, *names: str, pool: Pool | None = None
+) -> Searched:
     """Lay out records and search the named candidates."""
     terms = tuple(map(Used, baseline_of(rig)))
     data = regression_data(rig, terms, conditioned_records(rig, [train]))
     judged = regression_data(rig, terms, conditioned_records(rig, [held_out]), data.beta)
-    hypotheses = HypothesisSet(data, at_joint_2(rig, *names))
+    hypotheses = HypothesisSet(data, at_joint_2(rig, *names), pool=pool)
     return Searched(hypotheses, exchanged(hypotheses, search(hypotheses)), judged)
 
 

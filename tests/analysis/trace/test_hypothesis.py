@@ -19,6 +19,8 @@ from analysis.trace.search.hypothesis import (
     may_grow,
     negative_body,
 )
+from analysis.workers.forked import Forked
+from analysis.workers.pool import Serial
 from rig.model.rig import Rig
 from tests.analysis.trace.gate_cases import LEAK, searched
 from tests.analysis.trace.hidden import pair_of_runs
@@ -54,6 +56,20 @@ def test_an_inclination_of_either_sign_is_tried_for_a_spring(rig: Rig, inclinati
     found = {u.term.name: u.shape for u in again.effects}
     assert set(found) == {"base_inclination", "internal_leakage"}
     assert found["base_inclination"][0] == pytest.approx(inclination, rel=0.02)
+
+
+def test_a_search_by_two_processes_gives_the_same(rig: Rig) -> None:
+    """Sets that one process fits must not be known to some of the others only."""
+    names = ("internal_leakage", "spool_offset", "torque_offset", "sensor_gain", "dead_volume")
+    runs = pair_of_runs(rig, c_internal=LEAK, u_null=3e-3)
+    alone, shared = (searched(rig, *runs, *names, pool=pool) for pool in (Serial(), Forked(2)))
+    assert shared.winner.keys == alone.winner.keys
+    assert {u.term.name for u in alone.winner.effects} == {"internal_leakage", "spool_offset"}
+    expected, fitted = (s.hypotheses.fitted for s in (alone, shared))
+    assert fitted.keys() == expected.keys()
+    assert {k: o.total for k, o in fitted.items()} == {k: o.total for k, o in expected.items()}
+    # Sets are compared by identity: a result of another process is kept only once.
+    assert shared.hypotheses.refined(shared.winner.effects) is shared.winner
 
 
 def test_an_effect_is_exchanged_for_one_that_does_not_resemble_it(rig: Rig) -> None:
