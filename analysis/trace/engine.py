@@ -43,6 +43,7 @@ from analysis.trace.notes import (
     geometry_note,
     narrower_rows_note,
     not_judged_notes,
+    quicker_motion_notes,
     record_condition_notes,
     refitted_notes,
     rival_notes,
@@ -60,7 +61,7 @@ from analysis.trace.settings import SEARCH, TRACE
 from analysis.trace.words import sentence, tolerated_error_notes
 from analysis.workers.pool import Pool, Serial
 from rig.model.parse import InputError
-from rig.model.records import Run, refuse_malformed, with_common_bandwidth, with_loads_stated
+from rig.model.records import Run, bandwidth_of, of_bandwidth, refuse_malformed, with_loads_stated
 from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
@@ -111,9 +112,11 @@ def trace(
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
     effects = catalogue(rig) if effects is None else effects
     options = _Options(effects, seed, look_ahead, free_forms, pool or Serial())
-    separated, notes = with_other_motions_apart(
-        with_common_bandwidth(with_loads_stated([*runs, *holdout, *judge]))
-    )
+    quicker = quicker_motion_notes(runs, (*holdout, *judge))
+    all_runs = [*runs, *holdout, *judge]
+    # Training records with excited lines have no bandwidth, and do not limit that of the others.
+    width = bandwidth_of(runs) or bandwidth_of(all_runs)
+    separated, apart = with_other_motions_apart(of_bandwidth(with_loads_stated(all_runs), width))
     in_order = iter(separated)
     train, unseen, judging = (tuple(next(in_order) for _ in x) for x in (runs, holdout, judge))
     train, unseen, judging = with_identified_bulk_modulus(train, known, unseen, judging)
@@ -125,6 +128,7 @@ def trace(
         records, options, result, progress
     ) or _traced_in_wider_rows(records, options, result, progress)
     result = _with_stated_rig(rig, in_other_rows or result)
+    notes = (*quicker, *apart)
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
     may_be_load &= all(used.term.name != Payload.name for used in known)

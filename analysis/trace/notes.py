@@ -30,7 +30,7 @@ from analysis.trace.search.geometry import Geometry
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
-from rig.model.records import Run
+from rig.model.records import Run, bandwidth_of
 from rig.model.rig import Rig
 from rig.model.units import plain
 
@@ -239,6 +239,18 @@ def narrower_rows_note(narrower: float, width: float) -> str:
         f"the measured bandwidth of {plain(width, 2)} Hz, which they explain to within the noise, "
         "noise of the accelerations hides them (`bandwidth` of the manifest)"
     )
+
+
+def quicker_motion_notes(train: Sequence[Run], unseen: Sequence[Run]) -> list[str]:
+    """Say where held-out motion is quicker than the training's, for which rows are filtered."""
+    fitted, held_out = bandwidth_of(train), bandwidth_of(unseen)
+    if fitted is None or held_out is None or held_out < TRACE.quicker_motion * fitted:
+        return []
+    return [
+        f"the held-out motion reaches {plain(held_out, 2)} Hz, the training's "
+        f"{plain(fitted, 2)} Hz: rows are filtered for the training's, and what is quicker is not "
+        "judged; train on motion as quick to judge it"
+    ]
 
 
 def wider_rows_note(width: float) -> str:

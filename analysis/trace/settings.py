@@ -89,6 +89,9 @@ class TraceSettings:
     wider_bandwidth: float = 10.0
     """Bandwidth [Hz] of the rows in which repeats of a clean result are searched for torques that
     do not follow the motion: rows up to 15 Hz (convention)."""
+    quicker_motion: float = 1.5
+    """Bandwidth of the held-out motion over the training's, from which a note says that what is
+    quicker is not judged (convention)."""
     rest_speed: float = 0.02
     """Speed of a joint over its rms speed in a record, below which it counts as at rest."""
     motion_ratio: float = 0.65
