@@ -68,19 +68,22 @@ def _rounding_amplitudes(sensor: AnySensor) -> Array:
     return np.asarray(step / (np.pi * k) * scale)
 
 
-def with_added_noise(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
+def with_added_noise(
+    rig: Rig, record: Record, rng: np.random.Generator, as_measured: bool = False
+) -> Record:
     """Return the record with noise of the rig file's sensors added, rounding included.
 
     Where a sensor's samples hold more than `REGRESSION.stated_ratio` times that as white noise
-    (`white_variance`), noise of that size is added. Inputs are left out: what a loop puts out at
-    random is no error of measurement.
+    (`white_variance`), noise of that size is added, and `as_measured` where they hold less.
+    Inputs may hold more: what a loop puts out at random is no error of measurement.
     """
 
     def noise(name: str, sensor: AnySensor, x: Array) -> Array:
-        variance = sensor_variance(sensor)
-        if ch.kind_of(name)[0] not in (ch.SPOOL, ch.DRIVE):
-            white = white_variance(bridged(x))
-            variance = white if white > REGRESSION.stated_ratio**2 * variance else variance
+        variance, white = sensor_variance(sensor), white_variance(bridged(x))
+        is_input = ch.kind_of(name)[0] in (ch.SPOOL, ch.DRIVE)
+        larger = white > REGRESSION.stated_ratio**2 * variance and not is_input
+        if larger or (as_measured and white < variance):
+            variance = white
         return np.asarray(np.sqrt(variance) * rng.standard_normal(len(x)))
 
     return _with_errors(rig, record, noise)

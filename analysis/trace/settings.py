@@ -221,6 +221,10 @@ class DataSettings:
     unrepeated_ratio: float = 5.0
     """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
     note says that something else acts (tuned: clean benches stay below 2)."""
+    coloured_ratio: float = 3.0
+    """Noise of repeats in the rows' band over that in the octave above, both over the stated noise,
+    up to which it counts as sensor noise that is not white (noise behind a pole at 5 to 60 Hz stays
+    below 2.7)."""
     unstated_ratio: float = 2.5
     """What the model leaves over the stated noise, up to which it counts as noise where nothing
     repeats and it follows no variable of the records (convention: twice, and its scatter)."""

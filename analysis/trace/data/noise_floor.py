@@ -9,7 +9,9 @@ there are no periods either, but the motion comes back to states x where it was 
 rig's stated sensor noise, propagated to the same rows, is used, times the ratio of measured to
 stated noise in other steps: in repeats and periods, else between neighbours. Without these that
 ratio is taken from the octave above the rows' band, where a model's residual is mostly noise:
-effects of the motion fall with frequency, and the noise of a differentiated channel grows.
+effects of the motion fall with frequency, and the noise of a differentiated channel grows. Where
+repeats of other steps scatter by up to `DATA.coloured_ratio` times that ratio, theirs is used:
+sensor noise need not be white.
 
 The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
 data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
@@ -115,9 +117,15 @@ def floors(
             rounded = partial(with_added_rounding, smoother=smoother)
             draws = DATA.rounding_draws
             rounding = stated_noise(rig, terms, first, group_rows[0], beta, rounded, draws)
+        of_group = []
         for equation, rms in stated.items():
             parts = [r[equation] for r in group_rows if equation in r]
-            out.append(_floor(first, parts, beta, rms, rounding.get(equation, 0.0)))
+            of_group.append(_floor(first, parts, beta, rms, rounding.get(equation, 0.0)))
+        if any(floor.source == NEIGHBOURS for floor in of_group):
+            disturbed = partial(with_added_noise, as_measured=True)
+            least = stated_noise(rig, terms, first, group_rows[0], beta, disturbed)
+            of_group = [_at_least(floor, least) for floor in of_group]
+        out += of_group
     by_repeats = _measured_over_stated([*out, *others], (REPEATS,))
     scale = _measured_over_stated([*out, *others], (NEIGHBOURS,))
     scale |= _measured_over_stated([*out, *others], (REPEATS, PERIODS))
@@ -129,7 +137,16 @@ def floors(
         group: noise_above_rows(rig, terms, members[groups[group][0]], beta)
         for group in {f.group for f in split if f.source == STATED and f.total > 0.0}
     }
-    return [_scaled(floor, above.get(floor.group, {}), ABOVE) for floor in split]
+    repeated = _measured_over_stated([*out, *others], (REPEATS,), np.inf)
+
+    def without_repeats(floor: Floor) -> Floor:
+        ratios = above.get(floor.group, {})
+        ratio, measured = (r.get(floor.equation, 1.0) for r in (ratios, repeated))
+        if ratio < measured < DATA.coloured_ratio * ratio:
+            return _scaled(floor, repeated, OTHER_STEPS)
+        return _scaled(floor, ratios, ABOVE)
+
+    return [without_repeats(floor) for floor in split]
 
 
 def noise_above_rows(
@@ -178,6 +195,17 @@ def _floor(
     return floor.unrepeated(max(noise, DATA.least_noise * stated), NEIGHBOURS)
 
 
+def _at_least(floor: Floor, least: Mapping[str, float]) -> Floor:
+    """Return a floor by neighbouring states, at least the white noise of the record's sensors.
+
+    States are taken for neighbours by their noise too, which is that of their rows: the difference
+    of these is smaller than that of two independent ones.
+    """
+    if floor.source != NEIGHBOURS or floor.noise >= least[floor.equation]:
+        return floor
+    return floor.unrepeated(least[floor.equation], NEIGHBOURS)
+
+
 def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
     """Return a floor, by stated noise where periods scatter more than repeats of other steps do.
 
@@ -189,16 +217,18 @@ def _without_aperiodic(floor: Floor, by_repeats: Mapping[str, float]) -> Floor:
     return floor.unrepeated(floor.stated, STATED)
 
 
-def _measured_over_stated(split: Sequence[Floor], sources: Collection[str]) -> dict[str, float]:
+def _measured_over_stated(
+    split: Sequence[Floor], sources: Collection[str], most_ratio: float = DATA.unrepeated_ratio
+) -> dict[str, float]:
     """Return by equation the rms ratio of noise measured from `sources` to stated noise.
 
-    Each group counts by the degrees of freedom of its repeats. Ratios above `DATA.unrepeated_ratio`
-    are left out: they show a cause that does not follow the excitation, not sensor noise.
+    Each group counts by the degrees of freedom of its repeats. Ratios above `most_ratio` are left
+    out: they may show a cause that does not follow the excitation, not sensor noise.
     """
     ratios: dict[str, list[float]] = {}
     weights: dict[str, list[int]] = {}
     for floor in split:
-        most = DATA.unrepeated_ratio * floor.stated
+        most = most_ratio * floor.stated
         if floor.source in sources and floor.stated > NO_ROWS and floor.noise <= most:
             ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
             weights.setdefault(floor.equation, []).append(max(1, floor.count - 1))
