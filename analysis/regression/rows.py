@@ -305,17 +305,23 @@ def right_parts(
         kind, number = name.rsplit("_", 1)
         i = int(number) - 1
         # Inertia couples the joints: a clipped piston of any joint affects every torque row.
-        joints = slice(None) if family == "mechanical" else slice(i, i + 1)
+        joints = range(signals.joints) if family == "mechanical" else (i,)
         raw = {"": right_side(rig, signals, kind, i)}
         side = low_passed(weighted(raw, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
-        sensors = np.asarray(signals.valid[:, joints].all(axis=1))
+        sensors = _over_joints(np.logical_and, signals.valid, joints)
         if family == "fluid":  # below zero the oil cavitates, and the flow balance does not hold
-            sensors &= (signals.p_cap if kind == "flow_cap" else signals.p_rod)[:, i] >= 0.0
+            p = (signals.p_cap if kind == "flow_cap" else signals.p_rod)[:, i]
+            sensors = sensors & (p >= 0.0)
         sines = filtered_sines(signals, filtering, name)
-        lost = np.asarray(signals.lost[:, joints].any(axis=1))
+        lost = _over_joints(np.logical_or, signals.lost, joints)
         out[name] = RightPart(side, time, sensors, lost, sines)
     return out
+
+
+def _over_joints(ufunc: np.ufunc, mask: Mask, joints: Sequence[int]) -> Mask:
+    """Return a mask (n,) of some joints' columns (n, N); a reduction along short rows is slow."""
+    return np.asarray(functools.reduce(ufunc, (mask[:, joint] for joint in joints)))
 
 
 def filtered_sines(signals: Signals, filtering: Filtering, name: str) -> Array:
