@@ -390,13 +390,13 @@ def _traced_within_tolerances(
     ]
     if moved.verdict == UNEXPLAINED or (explained and sizes[0] >= sizes[1]):
         return None
+    after = held_out_ratios(moved.rows, moved.winner)
+    for equation, ratio in held_out_ratios(finding.rows, finding.winner).items():
+        if after[equation] > max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio):
+            return None
     again = _concluded(prepared, options, moved)
     if again.verdict == UNEXPLAINED:
         return None
-    for equation, ratio in held_out_ratios(finding.rows, finding.winner).items():
-        largest = max(TRACE.noted_ratio, SEARCH.simpler_ratio * ratio)
-        if again.after[equation] > largest * again.noise_floor[equation]:
-            return None
     note = geometry_note(geometry, finding.named, explained)
     return replace(again, notes=(note, *again.notes))
 
