@@ -140,11 +140,15 @@ def floors(
     repeated = _measured_over_stated([*out, *others], (REPEATS,), np.inf)
 
     def without_repeats(floor: Floor) -> Floor:
+        if floor.source != STATED:
+            return floor
         ratios = above.get(floor.group, {})
         ratio, measured = (r.get(floor.equation, 1.0) for r in (ratios, repeated))
         if ratio < measured < DATA.coloured_ratio * ratio:
             return _scaled(floor, repeated, OTHER_STEPS)
-        return _scaled(floor, ratios, ABOVE)
+        # The residual holds the noise: more of it above the rows is not in them.
+        most = max(1.0, floor.total / max(floor.stated, NO_ROWS))
+        return _scaled(floor, {e: min(r, most) for e, r in ratios.items()}, ABOVE)
 
     return [without_repeats(floor) for floor in split]
 

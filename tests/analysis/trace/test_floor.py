@@ -181,6 +181,22 @@ def test_rows_show_filtered_noise_above_the_motion_beside_an_effect(rig: Rig) ->
     assert leaking["flow_cap_2"].total > 2.0 * sound["flow_cap_2"].total
 
 
+def test_what_lies_above_the_rows_alone_is_no_noise_of_the_rows(rig: Rig) -> None:
+    """A pump shakes the piston at 33 Hz: rows up to 15 Hz do not hold it."""
+    run = with_filtered_noise(pair_of_runs(rig)[0], 1.0, corner=1e4)
+    (once,) = run.records[:1]
+    shake = 5e-5 * np.sin(2 * np.pi * 33.0 * np.asarray(once.time))
+    shaken = replace(
+        once, channels={**once.channels, "piston_2": once.channels["piston_2"] + shake}
+    )
+    records = conditioned_records(rig, [replace(run, records=(shaken,))])
+    data = regression_data(rig, tuple(map(Used, baseline_of(rig))), records)
+    above = noise_floor.noise_above_rows(rig, data.terms, records[0], data.beta)
+    for floor in data.floors:
+        assert above[floor.equation] > 1.5
+        assert floor.noise <= max(floor.total, floor.stated)
+
+
 def test_noise_that_is_not_white_is_measured_by_the_repeats_of_other_steps(rig: Rig) -> None:
     """It is larger in the rows than in the octave above, and far above the stated white noise."""
     terms = tuple(map(Used, baseline_of(rig)))
