@@ -245,7 +245,7 @@ class Effect(Term):
         return ()
 
     def inseparable_beside(
-        self, rig: Rig, shape: Sequence[float], others: Sequence[Effect]
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Used]
     ) -> tuple[tuple[str, str], ...]:
         """Return `inseparable`, with those that hold beside the `others` of a set on a rig."""
         return self.inseparable(shape)

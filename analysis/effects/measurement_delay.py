@@ -20,9 +20,12 @@ from analysis.effects.base import Array, Shape, between_samples, longest_lag
 from analysis.effects.measurement import ELECTRIC, Sensor, detail_of
 from analysis.signals.conditioning import Signals
 from analysis.signals.filters import align, channel_filter
+from analysis.terms.base import Used
 from rig.model.rig import Rig
 
 EQUAL_POLES: Final = 0.25  # of tau^2: two poles of the same time constant
+ALIKE: Final = 0.1  # relative difference of times up to which they are taken to be equal
+LATE: Final = {"piston", "pressure"}  # all channels of these kinds late: the spools are early
 HALF: Final = 0.1  # [samples] error of half a sample
 MARGIN: Final = 16  # [samples] reach of the interpolation of a shift
 
@@ -70,6 +73,24 @@ class TimingError(Sensor):
         """
         both_late = self.shared == "piston" and len(rig.joints) == 2
         return (("spool_lag", "joint 1"), ("spool_lag", "joint 2")) if both_late else ()
+
+    def inseparable_beside(
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Used]
+    ) -> tuple[tuple[str, str], ...]:
+        """Return the lags of all spools beside equal times of all pistons and all pressures.
+
+        Only the order of the channels in time shows: all but the spools late are the spools early.
+        """
+        time = self.shape_of(rig, shape)[0]
+        equal = [
+            other.term.shared
+            for other in others
+            if isinstance(other.term, TimingError)
+            and abs(other.term.shape_of(rig, other.shape)[0] - time) < ALIKE * time
+        ]
+        if self.shared not in LATE or not {self.shared, *equal} >= LATE:
+            return ()
+        return tuple(("spool_lag", f"joint {i}") for i in range(1, len(rig.joints) + 1))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State that a position half a sample late may be a command that is held, and recorded so.

@@ -16,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import SUPPLY, Array, Effect, Evidence, Shape, SignalEffect
+from analysis.effects.base import SUPPLY, Array, Evidence, Shape, SignalEffect
 from analysis.effects.valve import lagged
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
@@ -26,6 +26,7 @@ from analysis.terms.base import (
     P_TANK,
     PREPARE,
     U,
+    Used,
     equation,
     kernel,
 )
@@ -185,7 +186,7 @@ class LineDrop(PortEffect):
         )
 
     def inseparable_beside(
-        self, rig: Rig, shape: Sequence[float], others: Sequence[Effect]
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Used]
     ) -> tuple[tuple[str, str], ...]:
         """Return the metering of a single joint's valve, beside the other port's turbulent line.
 
@@ -193,7 +194,7 @@ class LineDrop(PortEffect):
         sqrt(1 + k C^2 u^2): the flow of an edge that opens less and less with the spool.
         """
         turbulent = self.line(rig, shape)[1] != LAMINAR
-        both_ports = any(isinstance(other, LineDrop) for other in others)
+        both_ports = any(isinstance(other.term, LineDrop) for other in others)
         alone = len(rig.joints) == 1 and turbulent and both_ports
         return (("metering_curve", "joint 1"),) if alone else ()
 

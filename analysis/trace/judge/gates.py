@@ -128,7 +128,7 @@ def judge_effects(
         inseparable = [
             Rival(name, effect_of(name, at).place, 1.0, 1.0, True, at)
             for name, at in effect.inseparable_beside(
-                train_data.rig, used.shape, effects_among(winner.without(used))
+                train_data.rig, used.shape, winner.without(used)
             )
         ]
         removes = removed.share >= TRACE.least_removed and not disturbed

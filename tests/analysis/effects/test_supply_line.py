@@ -192,10 +192,11 @@ def test_lines_at_both_ports_of_one_valve_have_the_flow_of_an_edge_that_opens_le
     lone = rig.model_copy(update={"joints": rig.joints[:1]})
     sag, back = SupplySag("bench"), ReturnLine("bench")
     turbulent = (DROP, 0.01)
-    assert sag.inseparable_beside(lone, turbulent, [back]) == (("metering_curve", "joint 1"),)
-    assert back.inseparable_beside(lone, turbulent, [sag]) == (("metering_curve", "joint 1"),)
-    assert not sag.inseparable_beside(rig, turbulent, [back])
-    assert not sag.inseparable_beside(lone, (DROP, 0.0), [back])  # laminar throughout
+    with_sag, with_back = [Used(sag, turbulent)], [Used(back, turbulent)]
+    assert sag.inseparable_beside(lone, turbulent, with_back) == (("metering_curve", "joint 1"),)
+    assert back.inseparable_beside(lone, turbulent, with_sag) == (("metering_curve", "joint 1"),)
+    assert not sag.inseparable_beside(rig, turbulent, with_back)
+    assert not sag.inseparable_beside(lone, (DROP, 0.0), with_back)  # laminar throughout
     assert not sag.inseparable_beside(lone, turbulent, [])
     gain, k = 6e-7, DROP / rig.supply.flow**2
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from analysis.terms import make
+from analysis.terms.base import Used
 from analysis.trace import judging
 from analysis.trace.data.candidates import at_start
 from analysis.trace.finding import Finding, remainders
@@ -97,6 +98,21 @@ def test_the_lag_of_all_spools_is_compared_with_one_delay_of_all_pistons(rig: Ri
     assert pair == (("spool_lag", "joint 1"), ("spool_lag", "joint 2"))
     assert frozenset(pair) in s.hypotheses.fitted
     assert make("channel_delay", "joint 1 piston").alike_together(data.rig) == ()
+
+
+def test_equal_delays_of_pistons_and_pressures_are_not_separated_from_lags_of_the_spools(
+    rig: Rig,
+) -> None:
+    """Commands in place of the spools, once more: everything else is late by the same time."""
+    pistons, pressures = (make("channel_delay", f"bench {k}") for k in ("piston", "pressure"))
+    lags = (("spool_lag", "joint 1"), ("spool_lag", "joint 2"))
+    for one, other in ((pistons, pressures), (pressures, pistons)):
+        alike, unlike = (Used(other, (time,)) for time in (5.2e-3, 9e-3))
+        assert one.inseparable_beside(rig, (5e-3,), [alike]) == lags
+        assert one.inseparable_beside(rig, (5e-3,), [unlike]) == ()
+        assert one.inseparable_beside(rig, (5e-3,), [Used(one, (5e-3,))]) == ()
+    single = make("channel_delay", "joint 1 piston")
+    assert single.inseparable_beside(rig, (5e-3,), [Used(pressures, (5e-3,))]) == ()
 
 
 def test_what_held_out_records_lose_in_another_equation_counts_against_an_effect(rig: Rig) -> None:
