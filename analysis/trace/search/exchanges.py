@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 
 from analysis.terms.base import Used
@@ -24,7 +23,7 @@ def exchanged(hypotheses: HypothesisSet, current: Hypothesis) -> Hypothesis:
     tried = {current.keys}
     while current.effects:
         pairs = [p for u in current.effects for p in _with_two_for_one(hypotheses, current, u)]
-        fit = partial(_refined_against, current)
+        fit = partial(HypothesisSet.refined, rival=current)
         sets = [*_with_another(hypotheses, current), *hypotheses.each(fit, pairs)]
         pruned = hypotheses.prune(hypotheses.best([current, *sets]))
         other = hypotheses.best([current, pruned])  # one that lost an effect again may be worse
@@ -33,12 +32,6 @@ def exchanged(hypotheses: HypothesisSet, current: Hypothesis) -> Hypothesis:
         current = other
         tried.add(current.keys)
     return hypotheses.fitted.get(current.keys, current)  # a later start may have better shapes
-
-
-def _refined_against(
-    rival: Hypothesis, hypotheses: HypothesisSet, effects: Sequence[Used]
-) -> Hypothesis:
-    return hypotheses.refined(effects, rival)
 
 
 def _with_two_for_one(
@@ -92,10 +85,8 @@ def _with_another(hypotheses: HypothesisSet, current: Hypothesis) -> list[Hypoth
     alone.sort(key=lambda o: o.total)
     starts: list[tuple[Hypothesis, tuple[Used, ...]]] = []
     both: list[tuple[Used, ...]] = []
-    for smaller in hypotheses.each(
-        lambda sets, effects: sets.refined_anew(effects, current),
-        map(current.without, current.effects),
-    ):
+    fit_anew = partial(HypothesisSet.refined_anew, rival=current)
+    for smaller in hypotheses.each(fit_anew, map(current.without, current.effects)):
         data = rebased(hypotheses.train_data, smaller.fit)
         larger = best_additions(hypotheses, data, smaller, columns)
         starts += [(smaller, effects) for effects in larger[: SEARCH.replacements]]

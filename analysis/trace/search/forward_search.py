@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ def _searched(
     ]  # fmt: skip
     pairs = [hypotheses.refined(trial, current) for trial in trials[:1]]
     rival = min((current, *pairs), key=lambda o: o.total)
-    pairs += hypotheses.each(lambda sets, trial: sets.refined(trial, rival), trials[1:])
+    pairs += hypotheses.each(partial(HypothesisSet.refined, rival=rival), trials[1:])
     if hypotheses.within_form_tolerance(current):
         others = [o for o in pairs if not current.keys & o.keys]
         far = [o for o in others if log_energy_ratio(o, current, band) < -SEARCH.far_log_gain]
