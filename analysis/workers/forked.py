@@ -63,9 +63,10 @@ class Forked:
             return
         workers, self.workers = self.workers, 1
         try:
-            yield from self._shared(function, items, workers)
+            values = self._shared(function, items, workers)
         finally:
             self.workers = workers
+        yield from values
 
     def _shared(self, function: Callable[[T], U], items: Sequence[T], workers: int) -> list[U]:
         """Return function(item) of all items, each taken by whichever process is free."""
