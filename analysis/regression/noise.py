@@ -79,11 +79,13 @@ def with_added_noise(
     """
 
     def noise(name: str, sensor: AnySensor, x: Array) -> Array:
-        variance, white = sensor_variance(sensor), white_variance(bridged(x))
+        variance = sensor_variance(sensor)
         is_input = ch.kind_of(name)[0] in (ch.SPOOL, ch.DRIVE)
-        larger = white > REGRESSION.stated_ratio**2 * variance and not is_input
-        if larger or (as_measured and white < variance):
-            variance = white
+        if as_measured or not is_input:
+            white = white_variance(bridged(x))
+            larger = white > REGRESSION.stated_ratio**2 * variance and not is_input
+            if larger or (as_measured and white < variance):
+                variance = white
         return np.asarray(np.sqrt(variance) * rng.standard_normal(len(x)))
 
     return _with_errors(rig, record, noise)
