@@ -114,8 +114,7 @@ def trace(
     options = _Options(effects, seed, look_ahead, free_forms, pool or Serial())
     quicker = quicker_motion_notes(runs, (*holdout, *judge))
     all_runs = [*runs, *holdout, *judge]
-    # Training records with excited lines have no bandwidth, and do not limit that of the others.
-    width = bandwidth_of(runs) or bandwidth_of(all_runs)
+    width = _bandwidth_of_rows(runs, all_runs)
     separated, apart = with_other_motions_apart(of_bandwidth(with_loads_stated(all_runs), width))
     in_order = iter(separated)
     train, unseen, judging = (tuple(next(in_order) for _ in x) for x in (runs, holdout, judge))
@@ -244,6 +243,14 @@ def _with_free_runs(
         finding = finding.refused_by(Gate(gates.FREE_RUN, False, worse))
         fitted, runs_after = fit(finding), runs_before
     return finding, fitted, (runs_before, runs_after)
+
+
+def _bandwidth_of_rows(train: Sequence[Run], all_runs: Sequence[Run]) -> float | None:
+    """Return the bandwidth [Hz] that the rows are filtered for: that of the training records.
+
+    Training records with excited lines have none, and do not limit that of the others.
+    """
+    return bandwidth_of(train) or bandwidth_of(all_runs)
 
 
 def _traced(records: TraceRuns, options: _Options, progress: Callable[[float], None]) -> Trace:

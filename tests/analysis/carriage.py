@@ -6,13 +6,14 @@ bristles that bend and slip (LuGre) and may fall with speed; nothing of it is th
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numba import njit
 
-from rig.model.records import Record
+from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.runs.rigs import load_rig
 
 KP, KV = 160.0, 240.0  # [1/s], [V s/m]
 FINE = 10  # steps a sample
@@ -79,3 +80,16 @@ def record(
         "drive_1": drive + noise[1] * rng.standard_normal(n),
     }
     return Record(f"{step}_r{repeat}", step, (), repeat, rate, channels)
+
+
+def to_and_fro(turns: int, repeats: int = 1, times: float = 10.0) -> Run:
+    """Return a carriage's records, its drive several times as noisy as its rig file states."""
+    rig, rng = load_rig("emps"), np.random.default_rng(1)
+    reference = np.tile(moves(rig.sample_rate, 4.0, 0.05, 0.25), turns)
+    noise = times * rig.sensors.drive.noise
+    records = []
+    for repeat in range(1, repeats + 1):
+        one = record(rig, Carriage(), reference, rng, "moves", repeat)
+        drive = one.channels["drive_1"] + noise * rng.standard_normal(one.samples)
+        records.append(replace(one, channels={**one.channels, "drive_1": drive}))
+    return Run(rig, tuple(records))

@@ -146,9 +146,7 @@ def floors(
         ratio, measured = (r.get(floor.equation, 1.0) for r in (ratios, repeated))
         if ratio < measured < DATA.coloured_ratio * ratio:
             return _scaled(floor, repeated, OTHER_STEPS)
-        # The residual holds the noise: more of it above the rows is not in them.
-        most = max(1.0, floor.total / max(floor.stated, NO_ROWS))
-        return _scaled(floor, {e: min(r, most) for e, r in ratios.items()}, ABOVE)
+        return _scaled(floor, _within_residual(floor, ratios), ABOVE)
 
     return [without_repeats(floor) for floor in split]
 
@@ -170,6 +168,15 @@ def noise_above_rows(
         if stated[e] > NO_ROWS
     }
     return {e: ratio for e, ratio in ratios.items() if ratio > 1.0}
+
+
+def _within_residual(floor: Floor, ratios: Mapping[str, float]) -> dict[str, float]:
+    """Return ratios of noise to the stated one, at most that of a floor's whole residual.
+
+    The residual holds the noise: what more lies above the rows' frequencies is not in the rows.
+    """
+    most = max(1.0, floor.total / max(floor.stated, NO_ROWS))
+    return {equation: min(ratio, most) for equation, ratio in ratios.items()}
 
 
 def _floor(

@@ -16,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from analysis.effects.friction import CoulombFriction
 from analysis.effects.valve import ValveDeadband
 from analysis.regression.rows import Rows
 from analysis.simulation.synthetic import multisine, synthetic_run
@@ -32,6 +33,7 @@ from analysis.trace.result import EXPLAINED, UNEXPLAINED, Trace
 from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended, extended_in
+from analysis.trace.settings import DATA
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Record, Run, of_bandwidth
@@ -60,6 +62,11 @@ MANY: Final = (
     "internal_leakage", "external_leakage", "spool_offset", "torque_offset", "joint_spring",
     "tank_pressure", "dead_volume", "sensor_gain",
 )  # fmt: skip
+
+
+def baseline_terms(rig: Rig) -> tuple[Used, ...]:
+    """Return the terms of the model without effects."""
+    return tuple(map(Used, baseline_of(rig)))
 
 
 class Benches:
@@ -459,6 +466,96 @@ def noise_that_falls_with_frequency_is_noise_where_nothing_repeats(b: Benches) -
         assert result.verdict == verdict
 
 
+def noise_that_is_not_white_is_measured_by_the_repeats_of_other_steps(b: Benches) -> None:
+    """It is larger in the rows than in the octave above, and far above the stated white noise."""
+
+    def floors_of_both(run: Run) -> list[dict[str, noise_floor.Floor]]:
+        train, once = (
+            conditioned_records(b.rig, [replace(run, records=part)])
+            for part in (run.records[:3], run.records[3:])
+        )
+        data = regression_data(b.rig, baseline_terms(b.rig), train)
+        held_out = regression_data(b.rig, data.terms, once, data.beta, others=data.floors)
+        return [{f.equation: f for f in d.floors} for d in (data, held_out)]
+
+    quiet = b.runs()[0]
+    known, unknown = floors_of_both(with_filtered_noise(quiet, 2.0, corner=10.0))
+    for equation, floor in known.items():
+        assert floor.noise > DATA.unrepeated_ratio * floor.stated
+        assert unknown[equation].source == noise_floor.OTHER_STEPS
+        assert unknown[equation].noise == pytest.approx(unknown[equation].total, rel=0.2)
+        assert unknown[equation].noise == pytest.approx(floor.noise, rel=0.1)
+    # A torque with another phase in each repeat scatters far more than the noise above the rows.
+    records = []
+    for k, r in enumerate(with_filtered_noise(quiet, 2.0).records):
+        wave = 1e5 * np.sin(2 * np.pi * 1.3 * np.asarray(r.time) + 2.0 * k)
+        pressure = {"cap_pressure_2": r.channels["cap_pressure_2"] + wave}
+        records.append(replace(r, channels={**r.channels, **pressure}))
+    known, unknown = floors_of_both(replace(quiet, records=tuple(records)))
+    assert known["torque_2"].noise > 5.0 * unknown["torque_2"].noise
+    assert unknown["torque_2"].source == noise_floor.ABOVE
+
+
+def what_lies_above_the_rows_alone_is_no_noise_of_the_rows(b: Benches) -> None:
+    """A pump shakes the piston at 33 Hz: rows up to 15 Hz do not hold it."""
+    run = with_filtered_noise(b.runs()[0], 1.0, corner=1e4)
+    (once,) = run.records[:1]
+    shake = 5e-5 * np.sin(2 * np.pi * 33.0 * np.asarray(once.time))
+    shaken = replace(
+        once, channels={**once.channels, "piston_2": once.channels["piston_2"] + shake}
+    )
+    records = conditioned_records(b.rig, [replace(run, records=(shaken,))])
+    data = regression_data(b.rig, baseline_terms(b.rig), records)
+    above = noise_floor.noise_above_rows(b.rig, data.terms, records[0], data.beta)
+    for floor in data.floors:
+        assert above[floor.equation] > 1.5
+        assert floor.noise <= max(floor.total, floor.stated)
+
+
+def neighbouring_states_show_no_less_than_the_white_noise_of_the_sensors(_: Benches) -> None:
+    """Where noise makes states neighbours, the difference of their rows is too small."""
+
+    def floor_of(run: Run) -> noise_floor.Floor:
+        terms = (*baseline_terms(run.rig), Used(CoulombFriction("joint 1"), (1e-5, 0.0, 0.0)))
+        (floor,) = regression_data(run.rig, terms, conditioned_records(run.rig, [run])).floors
+        return floor
+
+    run = carriage.to_and_fro(3, times=0.0)
+    encoder = run.rig.sensors.position
+    louder = encoder.model_copy(update={"noise": 8.0 * encoder.noise})
+    sensors = run.rig.sensors.model_copy(update={"position": louder})
+    too_similar = Rule("", "", ((noise_floor, "noise_by_neighbours", lambda *_: 1e-9),))
+    with switched_off(too_similar):
+        as_stated = floor_of(run)
+        better = floor_of(replace(run, rig=run.rig.model_copy(update={"sensors": sensors})))
+    assert as_stated.source == noise_floor.NEIGHBOURS
+    assert as_stated.noise == pytest.approx(as_stated.stated, rel=0.2)
+    # Of an encoder far better than its data sheet, the noise of its samples counts.
+    assert better.stated > 3.0 * as_stated.stated
+    assert better.noise == pytest.approx(as_stated.noise, rel=0.4)
+
+
+def a_quicker_motion_on_another_day_does_not_widen_the_rows(b: Benches) -> None:
+    """In rows that the training's motion does not fill, its inertia is lost in noise."""
+    runs = b.runs(c_internal=LEAK)
+    train, held_out = (with_filtered_noise(run, 1.0) for run in runs)
+    (slow,) = of_bandwidth([train], 1.5)
+    alike, quick = (of_bandwidth([held_out], width)[0] for width in (1.5, 9.0))
+    names = ("internal_leakage", "external_leakage", "spool_offset")
+    results = [b.traced((slow, other), *names) for other in (alike, quick)]
+    for parameter in ("M2", "Fv2", "b"):
+        alone, beside = (r.model_after.parameters[parameter] for r in results)
+        assert beside == alone
+    assert results[1].after == results[0].after
+    words = "the held-out motion reaches 9 Hz, the training's 1.5 Hz"
+    assert [any(words in note for note in r.notes) for r in results] == [False, True]
+    wide = b.traced((of_bandwidth([train], 9.0)[0], quick), *names)
+    assert wide.after != results[0].after
+    # A training with excited lines is filtered by these, the others by their own bandwidth.
+    narrow, wider = (b.traced((runs[0], other), *names).noise_floor for other in (alike, quick))
+    assert narrow != wider
+
+
 def noise_of_a_position_leaves_a_level_as_it_is(b: Benches) -> None:
     """It moves the contact to and fro at rest, as long as its path is not filtered."""
     runs = [with_filtered_noise(run, 10.0, 300.0) for run in b.runs(Fc=60.0)]
@@ -488,7 +585,7 @@ def slow_rows_show_what_noise_of_the_acceleration_hides(b: Benches) -> None:
         for run in b.kept("soft", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
     )
     train, held_out = of_bandwidth((train, held_out), 10.0)
-    terms = tuple(map(Used, baseline_of(b.rig)))
+    terms = baseline_terms(b.rig)
     records = TraceRuns(b.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
     candidates = gate_cases.at_joint_2(b.rig, "joint_spring", "base_inclination")
     options = engine._Options(candidates, 0, look_ahead=False, free_forms=False)
@@ -844,6 +941,11 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_a_cubic_spring_adds_is_no_error_of_an_offsets_form, ("exact forms",)),
     (noise_above_the_measured_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (noise_that_falls_with_frequency_is_noise_where_nothing_repeats, ("noise above the rows",)),
+    (noise_that_is_not_white_is_measured_by_the_repeats_of_other_steps, ("noise with a memory",)),
+    (what_lies_above_the_rows_alone_is_no_noise_of_the_rows, ("noise in the residual",)),
+    (neighbouring_states_show_no_less_than_the_white_noise_of_the_sensors,
+     ("noise of the samples",)),
+    (a_quicker_motion_on_another_day_does_not_widen_the_rows, ("training's bandwidth",)),
     (slow_rows_show_what_noise_of_the_acceleration_hides, ("narrower rows",)),
     (a_torque_above_the_motions_frequencies_is_named, ("wider rows",)),
     (noise_of_a_position_leaves_a_level_as_it_is, ("filtered path",)),

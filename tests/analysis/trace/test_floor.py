@@ -23,7 +23,6 @@ from analysis.signals.filters import row_filter
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data import noise_floor
 from analysis.trace.data.conditioned_record import conditioned_records, moving_filtering
 from analysis.trace.data.noise_floor import (
     ABOVE,
@@ -46,7 +45,7 @@ from rig.model.records import Record, Run
 from rig.model.rig import Rig
 from rig.model.wire.codes import decode_input, encode_input
 from rig.runs.rigs import load_rig
-from tests.analysis.carriage import Carriage, moves, record
+from tests.analysis.carriage import Carriage, moves, record, to_and_fro
 from tests.analysis.trace.hidden import pair_of_runs, with_filtered_noise
 
 
@@ -108,19 +107,6 @@ def test_white_noise_is_measured_beside_a_motion_a_thousand_times_as_large() -> 
     assert white_variance(noise[:100]) == 0.0
 
 
-def to_and_fro(turns: int, repeats: int = 1, times: float = 10.0) -> Run:
-    """Return a carriage's records, its drive several times as noisy as its rig file states."""
-    rig, rng = load_rig("emps"), np.random.default_rng(1)
-    reference = np.tile(moves(rig.sample_rate, 4.0, 0.05, 0.25), turns)
-    noise = times * rig.sensors.drive.noise
-    records = []
-    for repeat in range(1, repeats + 1):
-        one = record(rig, Carriage(), reference, rng, "moves", repeat)
-        drive = one.channels["drive_1"] + noise * rng.standard_normal(one.samples)
-        records.append(replace(one, channels={**one.channels, "drive_1": drive}))
-    return Run(rig, tuple(records))
-
-
 def floors_of(*runs: Run, others: Sequence[Floor] = ()) -> dict[str, Floor]:
     """Return the floors of a carriage's torque by step."""
     rig = runs[0].rig
@@ -144,24 +130,6 @@ def test_a_motion_that_comes_back_shows_noise_that_the_rig_file_does_not_state()
     assert thrice.noise == pytest.approx(known.noise, rel=0.35)
 
 
-def test_neighbouring_states_show_no_less_than_the_white_noise_of_the_sensors(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where noise makes states neighbours, the difference of their rows is too small."""
-    monkeypatch.setattr(noise_floor, "noise_by_neighbours", lambda *_: 1e-9)
-    run = to_and_fro(3, times=0.0)
-    as_stated = floor_of(run)
-    assert as_stated.source == NEIGHBOURS
-    assert as_stated.noise == pytest.approx(as_stated.stated, rel=0.2)
-    # Of an encoder far better than its data sheet, the noise of its samples counts.
-    encoder = run.rig.sensors.position
-    louder = encoder.model_copy(update={"noise": 8.0 * encoder.noise})
-    sensors = run.rig.sensors.model_copy(update={"position": louder})
-    better = floor_of(replace(run, rig=run.rig.model_copy(update={"sensors": sensors})))
-    assert better.stated > 3.0 * as_stated.stated
-    assert better.noise == pytest.approx(as_stated.noise, rel=0.4)
-
-
 def test_rows_show_filtered_noise_above_the_motion_beside_an_effect(rig: Rig) -> None:
     """Four times the stated noise, and a leak that leaves twice as much in the flows."""
 
@@ -179,54 +147,6 @@ def test_rows_show_filtered_noise_above_the_motion_beside_an_effect(rig: Rig) ->
         assert floor.noise == pytest.approx(floor.total, rel=0.2)  # nothing but noise is left
         assert leaking[equation].noise == pytest.approx(floor.noise, rel=0.05)
     assert leaking["flow_cap_2"].total > 2.0 * sound["flow_cap_2"].total
-
-
-def test_what_lies_above_the_rows_alone_is_no_noise_of_the_rows(rig: Rig) -> None:
-    """A pump shakes the piston at 33 Hz: rows up to 15 Hz do not hold it."""
-    run = with_filtered_noise(pair_of_runs(rig)[0], 1.0, corner=1e4)
-    (once,) = run.records[:1]
-    shake = 5e-5 * np.sin(2 * np.pi * 33.0 * np.asarray(once.time))
-    shaken = replace(
-        once, channels={**once.channels, "piston_2": once.channels["piston_2"] + shake}
-    )
-    records = conditioned_records(rig, [replace(run, records=(shaken,))])
-    data = regression_data(rig, tuple(map(Used, baseline_of(rig))), records)
-    above = noise_floor.noise_above_rows(rig, data.terms, records[0], data.beta)
-    for floor in data.floors:
-        assert above[floor.equation] > 1.5
-        assert floor.noise <= max(floor.total, floor.stated)
-
-
-def test_noise_that_is_not_white_is_measured_by_the_repeats_of_other_steps(rig: Rig) -> None:
-    """It is larger in the rows than in the octave above, and far above the stated white noise."""
-    terms = tuple(map(Used, baseline_of(rig)))
-
-    def floors_of_both(run: Run) -> tuple[dict[str, Floor], dict[str, Floor]]:
-        train, once = (
-            conditioned_records(rig, [replace(run, records=part)])
-            for part in (run.records[:3], run.records[3:])
-        )
-        data = regression_data(rig, terms, train)
-        held_out = regression_data(rig, terms, once, data.beta, others=data.floors)
-        known, unknown = ({f.equation: f for f in d.floors} for d in (data, held_out))
-        return known, unknown
-
-    quiet = pair_of_runs(rig)[0]
-    known, unknown = floors_of_both(with_filtered_noise(quiet, 2.0, corner=10.0))
-    for equation, floor in known.items():
-        assert floor.noise > DATA.unrepeated_ratio * floor.stated
-        assert unknown[equation].source == OTHER_STEPS
-        assert unknown[equation].noise == pytest.approx(unknown[equation].total, rel=0.2)
-        assert unknown[equation].noise == pytest.approx(floor.noise, rel=0.1)
-    # A torque with another phase in each repeat scatters far more than the noise above the rows.
-    records = []
-    for k, r in enumerate(with_filtered_noise(quiet, 2.0).records):
-        wave = 1e5 * np.sin(2 * np.pi * 1.3 * np.asarray(r.time) + 2.0 * k)
-        pressure = {"cap_pressure_2": r.channels["cap_pressure_2"] + wave}
-        records.append(replace(r, channels={**r.channels, **pressure}))
-    known, unknown = floors_of_both(replace(quiet, records=tuple(records)))
-    assert known["torque_2"].noise > 5.0 * unknown["torque_2"].noise
-    assert unknown["torque_2"].source == ABOVE
 
 
 @pytest.mark.parametrize("in_motion", [(), (0,)])

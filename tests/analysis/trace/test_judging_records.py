@@ -272,26 +272,6 @@ def test_records_too_short_for_narrower_rows_keep_their_answer(rig: Rig) -> None
     assert (result.verdict, result.effects) == ("unexplained", ())
 
 
-def test_a_quicker_motion_on_another_day_does_not_widen_the_rows(rig: Rig) -> None:
-    """In rows that the training's motion does not fill, its inertia is lost in noise."""
-    runs = pair_of_runs(rig, c_internal=LEAK)
-    train, held_out = (with_filtered_noise(run, 1.0) for run in runs)
-    (slow,) = of_bandwidth([train], 1.5)
-    alike, quick = (of_bandwidth([held_out], width)[0] for width in (1.5, 9.0))
-    results = [traced(rig, slow, other) for other in (alike, quick)]
-    for parameter in ("M2", "Fv2", "b"):
-        alone, beside = (r.model_after.parameters[parameter] for r in results)
-        assert beside == alone
-    assert results[1].after == results[0].after
-    words = "the held-out motion reaches 9 Hz, the training's 1.5 Hz"
-    assert [any(words in note for note in r.notes) for r in results] == [False, True]
-    wide = traced(rig, of_bandwidth([train], 9.0)[0], quick)
-    assert wide.after != results[0].after
-    # A training with excited lines is filtered by these, the others by their own bandwidth.
-    narrow, wider = (traced(rig, runs[0], other).noise_floor for other in (alike, quick))
-    assert narrow != wider
-
-
 def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
     data = regression_data(rig, terms, conditioned_records(rig, [leaky[0]]))

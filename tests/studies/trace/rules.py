@@ -27,6 +27,7 @@ from analysis.trace.judge import alternatives, gates, held_out, inference, rival
 from analysis.trace.search import exchanges, extensions, forward_search, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
+from rig.model.records import bandwidth_of
 
 Array = NDArray[np.float64]
 Change = tuple[Any, str, Any]
@@ -239,6 +240,14 @@ RULES: Final = (
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
          ((noise_floor, "noise_above_rows", lambda *_: {}),)),
+    Rule("noise with a memory", "only noise above the rows counts where repeats show far more",
+         ((DATA, "coloured_ratio", 0.0),), refits=True),
+    Rule("noise in the residual", "noise above the rows counts where the rows hold less",
+         ((noise_floor, "_within_residual", lambda _, ratios: ratios),)),
+    Rule("noise of the samples", "neighbouring states may show less than the samples' noise",
+         ((noise_floor, "_at_least", lambda floor, _: floor),)),
+    Rule("training's bandwidth", "rows are filtered for the quickest motion of all records",
+         ((engine, "_bandwidth_of_rows", lambda _, all_runs: bandwidth_of(all_runs)),)),
     Rule("without a form", "a name that has no form may miss as much as one that has",
          ((free_forms, "_within_form_tolerance", lambda h, o: h.within_form_tolerance(o)),)),
     Rule("line no noise", "a torque in time counts as noise by neighbouring states",
