@@ -243,14 +243,14 @@ def _without_implausible(p: FamilyBlocks) -> tuple[FamilyBlocks, list[Check]]:
         prior = next((b for b in nu.priors(p.names, fit.beta) if b.name == name), None)
         if prior is None:
             continue
-        if not nu.implausible(prior, fit.beta, error.covariance):
-            checks.append(nuisance_statement(prior, p.names, fit.beta, error, None))
+        if not nu.implausible(prior, fit, error):
+            checks.append(nuisance_statement(prior, p.names, fit, error, None))
             continue
         reduced = _without_column(p, name)
         refitted = least_squares(reduced.blocks)
         shift = shift_without(fit.beta, refitted.beta, error, p.parameters)
         moved = largest_shift(p.names[: p.parameters], fit.beta[: p.parameters], shift)
-        checks.append(nuisance_statement(prior, p.names, fit.beta, error, moved))
+        checks.append(nuisance_statement(prior, p.names, fit, error, moved))
         p = replace(reduced, omitted=(*p.omitted, shift))
         fit, error = refitted, spread([pieces(refitted)], refitted.inverse)
     return p, checks

@@ -14,6 +14,7 @@ from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, le
 from analysis.identify.estimators.instruments import hausman, instrumental_variables
 from analysis.identify.estimators.nuisance import (
     BETWEEN,
+    KAPPA,
     TAU,
     Prior,
     implausible,
@@ -33,6 +34,7 @@ from analysis.identify.estimators.shifts import (
     significant_shift,
 )
 from analysis.identify.identify import identify
+from analysis.identify.settings import IDENTIFY
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 from tests.analysis.straight_line import line
@@ -122,6 +124,39 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
     assert np.median(narrower) < 0.3
 
 
+def test_two_repeats_that_agree_by_chance_do_not_outweigh_what_is_known_of_oils() -> None:
+    """Bulk compliance and its slope over half a kelvin, each of 400 experiments of two repeats."""
+    rng = np.random.default_rng(6)
+    t, parts = np.arange(200) / 100.0, np.arange(200) // 25
+    x = np.sin(np.pi * t)
+    X = np.column_stack((x, x * np.linspace(0.0, 0.5, 200)))
+    truth = np.array([1.0, -0.004])
+    hits, outside, stated, contradicted = [], [], [], []
+    for _ in range(400):
+        blocks = tuple(
+            RepeatBlock(0, "a", r, f"a_r{r}", "flow_cap_1", X,
+                        X @ truth + 0.1 * np.repeat(rng.standard_normal(40), 5), t, parts, parts)
+            for r in range(2)
+        )  # fmt: skip
+        names = ("b", KAPPA)
+        fit = least_squares(blocks)
+        error = spread([pieces(fit)], fit.inverse)
+        (prior,) = priors(names, fit.beta)
+        rows = prior_rows(fit, [prior])
+        joined = with_prior_rows(fit, rows)
+        both = spread_with_priors(joined, rows)
+        hits.append(abs(joined.beta[0] - truth[0]) < both.half[0])
+        slope = joined.beta[1] / joined.beta[0]
+        outside.append(abs(slope - IDENTIFY.bulk_slope) > 4.0 * IDENTIFY.bulk_slope_std)
+        detail = nuisance_statement(prior, names, fit, error, None).detail
+        stated.append("hardly varied" not in detail)
+        contradicted.append(implausible(prior, fit, error))
+    assert np.mean(hits) > 0.9
+    assert np.mean(contradicted) < 0.05
+    assert not any(outside)
+    assert not any(stated)
+
+
 def test_draws_of_repeats_keep_the_weight_of_what_is_known_beforehand(rig: Rig) -> None:
     """A path between samples whose column is much like the gain's, known to +- 0.05."""
     rng = np.random.default_rng(7)
@@ -161,12 +196,12 @@ def test_an_impossible_law_of_flow_speaks_against_a_gain_that_it_moves_only(
     fit = least_squares(blocks)
     error = spread([pieces(fit)], fit.inverse)
     prior = Prior(TAU, np.array([0.0, 1.0]), 1e-3)
-    assert implausible(prior, fit.beta, error.covariance)
+    assert implausible(prior, fit, error)
     without = least_squares([replace(b, X=b.X[:, :1]) for b in blocks])
     names = ("C_pp_1", TAU)
     shift = shift_without(fit.beta, without.beta, error, 1)
     moved = largest_shift(names[:1], fit.beta[:1], shift)
-    said = nuisance_statement(prior, names, fit.beta, error, moved)
+    said = nuisance_statement(prior, names, fit, error, moved)
     assert said.ok is ok
     assert ("no parameter moves by more than" in said.detail) is ok
     # The gain takes up the share of the left-out column that is like its own.

@@ -44,6 +44,16 @@ class CovarianceParts:
         """The half widths (k,) of the 95 % intervals."""
         return half_width(np.sqrt(np.diag(self.covariance)), self.dof)
 
+    @property
+    def normal(self) -> Array:
+        """The covariance (k, k) of the normal distribution with the same 95 % intervals.
+
+        The scatter of two repeats may be far too small by chance; its interval is not.
+        """
+        ones = np.ones(len(self.dof))
+        scale = half_width(ones, self.dof) / half_width(ones, np.full_like(self.dof, np.inf))
+        return np.asarray(self.covariance * np.outer(scale, scale))
+
 
 def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
     """Return V_repeats plus lack of fit (k, k); the first grouping is by parts of the period.

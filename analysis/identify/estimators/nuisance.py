@@ -29,7 +29,10 @@ with standard deviation s is one more row with the weight 1 / s^2, where the oth
 weight 1 / sigma^2: A becomes A + rho h h', rho = sigma^2 / s^2, and beta and A^-1 follow by the
 formula of Sherman and Morrison. sigma^2 is the variance that the rows' residuals have for h, V =
 sigma^2 A^-1 in its direction: residuals of neighbouring rows correlate, so that their mean square
-would be too small. The same rows belong to least squares and to instruments: what only a prior
+would be too small. It is that of a normal distribution with the 95 % interval of the repeats'
+scatter, and at least that of residuals without correlation: of two repeats, the scatter alone is
+often a tenth of the true one, and a slope over a fraction of a kelvin would outweigh all that is
+known of oils. The same rows belong to least squares and to instruments: what only a prior
 determines, such as the slope over a temperature that hardly varied, would otherwise be left to the
 noise there. Source: Theil and Goldberger (1961), On Pure and Mixed Statistical Estimation in
 Economics, International Economic Review 2.
@@ -232,10 +235,24 @@ def priors(names: Sequence[str], value: Array) -> list[Prior]:
     return out
 
 
-def implausible(prior: Prior, beta: Array, covariance: Array) -> bool:
+def variance_by_rows(fit: EquationFit, error: CovarianceParts, h: Array) -> float:
+    """Return the variance of h'beta, h (k,): that of the 95 % interval by the spread `error`.
+
+    It is at least that by residuals without correlation (White, 1980): repeats may happen to agree.
+    """
+    influence = fit.inverse.T @ h
+    squares = (
+        float(np.sum(((z @ influence) * weight * e) ** 2))
+        for z, weight, e in zip(fit.Z, fit.w, fit.residuals(), strict=True)
+    )
+    return max(float(h @ error.normal @ h), sum(squares))
+
+
+def implausible(prior: Prior, fit: EquationFit, error: CovarianceParts) -> bool:
     """Return whether the data contradict prior knowledge, as another effect in the column does."""
-    variance = prior.std**2 + float(prior.h @ covariance @ prior.h)
-    return bool(abs(prior.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
+    h, deviations = prior.h, IDENTIFY.implausible_deviations
+    of_both = deviations**2 * (prior.std**2 + float(h @ error.covariance @ h))
+    return bool((h @ fit.beta) ** 2 > max(of_both, 4.0 * variance_by_rows(fit, error, h)))
 
 
 @dataclass(frozen=True)
@@ -257,8 +274,8 @@ def prior_rows(fit: EquationFit, priors: Sequence[Prior]) -> tuple[PriorRow, ...
         joined = with_prior_rows(fit, rows)
         share = float(prior.h @ joined.inverse @ prior.h)
         if share > 0.0:
-            variance = prior.h @ spread_with_priors(joined, rows).covariance @ prior.h
-            rows.append(PriorRow(prior.h, prior.std, float(variance) / share / prior.std**2))
+            variance = variance_by_rows(joined, spread_with_priors(joined, rows), prior.h)
+            rows.append(PriorRow(prior.h, prior.std, variance / share / prior.std**2))
     return tuple(rows)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.covariance import CovarianceParts
-from analysis.identify.estimators.equations import FamilyBlocks
+from analysis.identify.estimators.equations import EquationFit, FamilyBlocks
 from analysis.identify.estimators.instruments import Hausman
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import Solution
@@ -137,7 +137,7 @@ def including(error: CovarianceParts, shift: Array) -> CovarianceParts:
 def nuisance_statement(
     prior: nu.Prior,
     names: Sequence[str],
-    beta: Array,
+    fit: EquationFit,
     error: CovarianceParts,
     moved: tuple[str, float] | None,
 ) -> Check:
@@ -146,7 +146,7 @@ def nuisance_statement(
     `moved` of an impossible one is the parameter that moves most without it, and how much
     (relative); the check is ok if that is too little to matter.
     """
-    check = _prior_check(prior, names, beta, error, moved is not None)
+    check = _prior_check(prior, names, fit, error, moved is not None)
     if moved is None or moved[1] > shift_limit(moved[0]):
         return check
     size = f"{100 * moved[1]:.2g} %"
@@ -158,12 +158,17 @@ def nuisance_statement(
 
 
 def _prior_check(
-    prior: nu.Prior, names: Sequence[str], beta: Array, error: CovarianceParts, implausible: bool
+    prior: nu.Prior,
+    names: Sequence[str],
+    fit: EquationFit,
+    error: CovarianceParts,
+    implausible: bool,
 ) -> Check:
     i = list(names).index(prior.name)
-    value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
+    value = float(fit.beta[i])
+    std = np.sqrt(nu.variance_by_rows(fit, error, np.eye(len(names))[i]))
     if prior.name == nu.KAPPA:
-        compliance = float(beta[list(names).index("b")])
+        compliance = float(fit.beta[list(names).index("b")])
         alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
         statement = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
         if spread_ > 100 * IDENTIFY.bulk_slope_std:
