@@ -242,6 +242,7 @@ class TcpConnection(ModbusConnection):
 
     def _receive(self, number: int, timeout: float) -> bytes:
         deadline = time.monotonic() + timeout
+        dropped = 0
         if not self._buffer:
             self._buffer = self._receive_bytes(timeout)
         while True:
@@ -255,8 +256,13 @@ class TcpConnection(ModbusConnection):
             self._buffer = self._buffer[frame.used :]
             if frame.transaction == number and frame.unit == self._unit:
                 return frame.pdu
-            if frame.transaction != self._abandoned:
+            if frame.transaction == self._abandoned:
+                continue
+            if not dropped:
                 logger.warning("a late answer from %s is dropped", self.where)
+            dropped += frame.used  # bytes
+            if time.monotonic() > deadline:  # answers to others arrive without a pause
+                raise self._no_answer(dropped)
 
     def _receive_bytes(self, timeout: float) -> bytes:
         """Return the bytes that arrive within `timeout` [s]."""

@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from importlib.metadata import EntryPoint, EntryPoints
 from importlib.resources import files
 from itertools import pairwise
@@ -271,10 +271,12 @@ class Answers:
 
     def _serve(self) -> None:
         with closing(self._listener), closing(self._listener.accept()[0]) as wire:
+            self.wire = wire
             wire.settimeout(20)
-            for answer in self._answers:
-                wire.sendall(answer(wire.recv(300)))
-            wire.recv(1)  # until the host closes
+            with suppress(ConnectionError):  # the host may close with answers unread
+                for answer in self._answers:
+                    wire.sendall(answer(wire.recv(300)))
+                wire.recv(1)  # until the host closes
 
     def join(self) -> None:
         self._thread.join(20)
@@ -311,6 +313,27 @@ def test_an_answer_with_another_transaction_number_is_not_taken() -> None:
     for number in (0, 2, 0xFFFF):  # the request has number 1
         with pytest.raises(DeviceSilent, match=r"does not answer \(0.5 s\)"):
             fetched(lambda _, number=number: words(number, [111, 111]))
+
+
+def test_answers_to_others_without_a_pause_end_the_request_in_time(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def without_a_pause(request: bytes) -> bytes:
+        began = time.monotonic()
+        with suppress(OSError):  # the host closes
+            while time.monotonic() < began + 20.0:
+                server.wire.sendall(50 * words(numbered(request) + 7, [111, 111]))
+        return b""
+
+    server = Answers(without_a_pause)
+    link = UnitConnection("127.0.0.1", server.port, 0.3, unit=7)
+    link.open()
+    with pytest.raises(DeviceError, match=r"bytes that are no Modbus answer to the request"):
+        link.read(0, 2)
+    assert not link.is_open
+    assert [r.message for r in caplog.records if "late answer" in r.message] == [
+        f"a late answer from 127.0.0.1:{server.port} is dropped"
+    ]
 
 
 def test_the_first_unanswered_request_ends_the_connection() -> None:
