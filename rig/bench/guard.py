@@ -243,8 +243,9 @@ class Guard:
             if column is None:
                 continue
             name = self.rig.recorded[column]
-            allowed = (-math.inf, self.settings.frozen_after)
-            value = float(window[-1, column])
-            frozen_sensor = Violation(FROZEN, value, allowed, ch.unit_of(name), joint, name, last)
+            frozen_sensor = Violation(
+                FROZEN, float(window[-1, column]), (-math.inf, math.inf), ch.unit_of(name), joint,
+                name, last, within=self.settings.frozen_after,
+            )  # fmt: skip
             return self._act([frozen_sensor], last)
         return []

@@ -33,7 +33,8 @@ _LARGEST = 1e300  # an end beyond this counts as open
 class Violation:
     """A limit and the sample that exceeded it, in SI; `joint` is 1-based, None for the bench.
 
-    `seconds` is the sample's time since the run began, None where nothing is recorded.
+    `seconds` is the sample's time since the run began, None where nothing is recorded. `within` [s]
+    is the time in which the value must have changed, None for a limit of the value itself.
     """
 
     limit: str
@@ -44,6 +45,7 @@ class Violation:
     channel: str
     tick: int
     seconds: float | None = None
+    within: float | None = None
 
 
 def show(value: float, unit: str, digits: int = 4) -> str:
@@ -71,8 +73,8 @@ def _allowed(violation: Violation) -> str:
     low, high = violation.allowed
     if violation.limit == DEVICE:
         return "nothing but running"
-    if violation.limit == FROZEN:
-        return f"only values that change within {high:g} s while the joint moves"
+    if violation.within is not None:
+        return f"only values that change within {violation.within:g} s while the joint moves"
     if violation.limit == FINITE:
         return "finite numbers only"
     if _open(high):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import fcntl
+import json
+import math
 import os
 import shutil
 import tempfile
@@ -10,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from rig.model.parse import InputError
 
@@ -54,6 +57,26 @@ def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
         raise InputError(
             f"{path}:{line}: byte {error.start} is not UTF-8; save {what} as UTF-8 text"
         ) from error
+
+
+def json_text(data: Any, indent: int | None = None) -> str:
+    """Return data as JSON; numbers that are not finite, which JSON has none of, become null.
+
+    Keys become text, numbers of numpy plain ones, all else its text.
+    """
+    return json.dumps(_plain(data), indent=indent, allow_nan=False, default=str)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def sync_to_disk(path: Path) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.model.trips import RecordingFailed
-from rig.runs.files import replace_text
+from rig.runs.files import json_text, replace_text
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +161,7 @@ class EventLog:
     def append(self, event: str, tick: int | None, fields: Mapping[str, Any]) -> None:
         """Write one event, on the disk when this returns."""
         entry = {"time": utc_now(), "event": event, "tick": tick, **fields}
-        line = json.dumps(entry, default=str) + "\n"
+        line = json_text(entry) + "\n"
         try:
             self._stream.write(line.encode())
             self._stream.flush()

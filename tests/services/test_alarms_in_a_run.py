@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -211,6 +212,12 @@ def test_two_seconds_before_and_after_a_trip_are_beside_the_run(tmp_path: Path) 
     assert [(e["check"], e["tick"], e["state"]) for e in events] == [
         ("frozen sensor", trip.tick, "latched")
     ]
+    # A line of a log is JSON for any reader: an open end of a limit is null.
+    lines = (run / "events.jsonl").read_text().splitlines()
+    limits = [json.loads(line, parse_constant=pytest.fail).get("limit") for line in lines]
+    assert [None, None] in limits
+    (tripped,) = (e for e in read_events(run) if e["event"] == "trip")
+    assert tripped["within"] == 0.25
     path.unlink()
     assert write_trip_window(run) == path
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import sys
 import time
@@ -92,29 +90,16 @@ class Countdown:
             self._say(f"{percent} for {clock_text(now - self._reached)}, time left unknown")
 
 
-def _plain(value: Any) -> Any:
-    # JSON has no NaN; other languages cannot read Python's.
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def write_json(path: Path | None, data: Any) -> None:
     """Write `data` as JSON to `path` (``-``: standard output; None: nowhere); NaN becomes null."""
     if path is None:
         return
-    text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
+    from rig.runs.files import json_text, write_text
+
+    text = json_text(data, indent=2) + "\n"
     if str(path) == "-":
         print(text, end="")  # to nowhere where standard output is closed
         return
-    from rig.runs.files import write_text
-
     write_text(path, text)
 
 

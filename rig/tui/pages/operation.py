@@ -54,6 +54,8 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     form = shown(alarm.unit)
     low, high = (limit(end) if math.isfinite(end) else None for end in alarm.limit)
     allowed = " … ".join(form.short(end) or "any" for end in (low, high))
+    unlimited = low is None and high is None  # a sensor that keeps one value
+    allowed = "" if unlimited else f", allowed {allowed} {form.unit}"
     if alarm.state == "latched":
         acts = "k acknowledges"
         acts += ", r resets with a reason" if alarm.acknowledged else "; only then r resets it"
@@ -63,7 +65,7 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     fields = [
         ("cause", alarm.check),
         ("where", f"{alarm.channel or '–'} of {where}"),
-        ("value", f"{form.number(alarm.value)} {form.unit}, allowed {allowed} {form.unit}"),
+        ("value", f"{form.number(alarm.value)} {form.unit}{allowed}"),
         ("when", f"{run_time(view.frame, alarm.time):.3f} s since the run began"),
         ("state", f"{alarm.state}, {'acknowledged' if alarm.acknowledged else 'UNACKNOWLEDGED'}"
                   + (f", came {alarm.count} times" if alarm.count > 1 else "")),
