@@ -40,7 +40,10 @@ T = TypeVar("T", Record, RecordHead)
 
 ARCHIVE = "records.h5"
 CRATE_METADATA = "ro-crate-metadata.json"  # in the copy of a run for an archive
-_OWN_FILES = (HEADER, ARCHIVE, JOURNAL, EVENTS, "state", "trip.csv")
+PROOF = "proof.json"  # the proof of the protocol on the twin
+TRACKED = "tracked.json"  # the estimates at the end of a run that tracked parameters
+TRIP_WINDOW = "trip.csv"  # the samples around a trip
+_OWN_FILES = (HEADER, ARCHIVE, JOURNAL, EVENTS, "state", TRIP_WINDOW, PROOF, TRACKED)
 _FORMAT = 1
 _NOTE = "# How this run was taken. Numbers are SI: m, Pa, V, s, Hz, rad, degC.\n"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -13,6 +14,7 @@ from asammdf import MDF
 from pyarrow import parquet
 from scipy.io import loadmat
 
+from rig.bench.session import Bench
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.runs.archive import write_run
@@ -20,10 +22,12 @@ from rig.runs.exchange import export
 from rig.runs.exchange.export import export_run, library_missing
 from rig.runs.exchange.importer import import_records
 from rig.runs.listing.index import indexed_runs
+from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import STREAM, EventLog, read_events
 from rig.runs.store import load_run
-from tests.services.fake_driver import samples
+from tests.cli.bench import bramah_here
+from tests.services.fake_driver import FakeDriver, samples
 
 RIG = load_rig("shinshu-2dof")
 DATA = samples(RIG, np.arange(60))
@@ -119,6 +123,20 @@ def test_lost_samples_stay_lost_and_import_says_where(run: Path, tmp_path: Path)
     export_run(tmp_path / "holed", tmp_path / "out", "csv")
     with pytest.raises(InputError, match=r"step1_r1\.csv.*row 9"):
         import_records(tmp_path / "out" / "manifest.yaml", tmp_path / "back")
+
+
+def test_a_record_that_was_cut_short_is_named_where_it_is_left_out(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run", RIG)
+    with Bench(RIG, FakeDriver(RIG), recorder, signals=False) as bench:
+        bench.exchange()
+        with bench.record(step="s", repeat=1):
+            bench.run_for(0.3)
+        with suppress(RuntimeError), bench.record(step="s", repeat=2):
+            bench.run_for(0.1)
+            raise RuntimeError
+    done = bramah_here("export", tmp_path / "run", "--format", "csv")
+    assert "left out, not recorded to the end: s_r2 (--format ro-crate contains" in done.stderr
+    assert not (tmp_path / "run-csv" / "s_r2.csv").exists()
 
 
 def test_refusals_come_before_anything_is_written(

@@ -120,6 +120,17 @@ def test_the_crate_s_records_are_those_of_the_run(run: Path) -> None:
         assert (values == again.channels[name]).all()
 
 
+def test_what_a_run_keeps_beside_its_samples_is_archived_too(run: Path) -> None:
+    kept = {"proof.json": '{"key": "k"}', "tracked.json": "{}", "trip.csv": "time [s],tick"}
+    for name, text in kept.items():
+        (run / name).write_text(text)
+    (run / "trace.html").write_text("a report that is made anew")
+    crate = export(run)
+    checked(crate)
+    assert {name: (crate / name).read_text() for name in kept} == kept
+    assert not (crate / "trace.html").exists()
+
+
 def test_a_crate_beside_its_run_is_not_counted_as_another_run(run: Path) -> None:
     before = bramah_here("runs", run.parent, "--json", "-")
     names = [Path(entry["path"]).name for entry in json.loads(before.stdout)]

@@ -36,12 +36,12 @@ from rig.model.units import with_interval
 from rig.runs.files import scratch_folder
 from rig.runs.recorder import RecordMeta
 from rig.runs.runstate import EventLog
+from rig.runs.store import TRACKED
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 RECENT_SECONDS = 5.0  # [s] of samples kept from before a record is announced
-NAME = "tracked.json"
 QUEUE_LENGTH = 30_000  # messages in the tracker's queue: five minutes of blocks, 40 MB
 REPORT_EVERY = 2.0  # [s] of wall time between two reports of the estimates
 FINISH_SECONDS = 20.0  # [s] allowed for the tracker to finish after the run
@@ -206,7 +206,7 @@ class Tracking:
         self._send("stop")
         missing = self._await_last()
         if missing:
-            kept = f"the last ones before are in {NAME}" if self.parameters else f"no {NAME}"
+            kept = f"the last ones before are in {TRACKED}" if self.parameters else f"no {TRACKED}"
             missing = (
                 f"the tracker {missing}: estimates are missing ({kept}), the records are whole"
             )
@@ -219,7 +219,7 @@ class Tracking:
         if self.parameters:
             memory = self._memory if math.isfinite(self._memory) else None
             data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
-            write_json(self._out / NAME, data)
+            write_json(self._out / TRACKED, data)
             for entry in self._history[written:]:  # the delayed messages of a slow tracker
                 events.append("tracked", None, entry)
         if missing:

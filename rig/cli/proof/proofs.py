@@ -25,9 +25,9 @@ from rig.cli.text.output import write_json
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.files import cache_folder
+from rig.runs.store import PROOF
 
 Progress = Callable[[float], None]
-NAME = "proof.json"
 CACHE_SIZE = 200  # largest number of proofs; the oldest are removed
 _ROOT = Path(__file__).parents[3]
 _SOURCES = (
@@ -73,7 +73,7 @@ class PlanProof:
 
     def keep(self, folder: Path) -> None:
         """Write the proof into a run's folder."""
-        write_json(folder / NAME, self.as_dict())
+        write_json(folder / PROOF, self.as_dict())
 
 
 def proved(

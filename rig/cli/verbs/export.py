@@ -76,6 +76,12 @@ def export(
     extra = None if model is None else channel_simulator(model, read_run_head(run).rig, str(run))
     files = export_run(run, target, kind, extra)
     progress(f"{len(files)} files")
+    unfinished = [
+        r for r in read_run_head(run, partial=True).records if not r.attributes["complete"]
+    ]
+    if unfinished:
+        names = " ".join(record.name for record in unfinished)
+        progress(f"left out, not recorded to the end: {names} (--format ro-crate contains them)")
     typer.echo(str(target))
 
 

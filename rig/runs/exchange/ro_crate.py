@@ -18,7 +18,7 @@ from rig.model.trips import RecordingFailed
 from rig.runs import store
 from rig.runs.files import new_folder
 from rig.runs.runstate import ABORTED, DONE, EVENTS, HEADER, read_events
-from rig.runs.store import ARCHIVE, CRATE_METADATA, Header
+from rig.runs.store import ARCHIVE, CRATE_METADATA, PROOF, TRACKED, TRIP_WINDOW, Header
 from rig.runs.stream import RunHead, read_run_head
 
 CONTEXT: Final = "https://w3id.org/ro/crate/1.1/context"
@@ -29,6 +29,9 @@ _FILES: Final = {
     ARCHIVE: ("application/x-hdf5", "Every record and what lies between, SI units as attributes"),
     EVENTS: ("application/jsonl", "What happened, one line an event"),
     "state": ("text/plain", "How the run ended"),
+    TRIP_WINDOW: ("text/csv", "The samples around the trip"),
+    PROOF: ("application/json", "The proof of the protocol on the twin, a figure for each limit"),
+    TRACKED: ("application/json", "The parameters estimated during the run"),
 }
 # UN/CEFACT common codes, as required by schema.org.
 _UNIT_CODES: Final = {"V": "VLT", "m": "MTR", "Pa": "PAL", "degC": "CEL", "rad": "C81", "N": "NEW"}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Final
 
 import h5py
 import numpy as np
@@ -21,8 +20,6 @@ from rig.runs.runstate import BETWEEN, read_events
 
 log = logging.getLogger(__name__)
 
-NAME: Final = "trip.csv"
-
 
 def write_trip_window(folder: Path) -> Path | None:
     """Write the samples around a finished run's trip; returns the file, None if there is none.
@@ -33,7 +30,7 @@ def write_trip_window(folder: Path) -> Path | None:
     trips = [e for e in read_events(folder) if e.get("event") == "trip"]
     if not trips or not isinstance(trips[-1].get("tick"), int):
         return None
-    path = folder / NAME
+    path = folder / store.TRIP_WINDOW
     try:
         with readable(folder / store.ARCHIVE), open_archive(folder / store.ARCHIVE) as file:
             names, table = _around(file, trips[-1]["tick"])
