@@ -60,6 +60,22 @@ class ReportsDoubts(Protocol):
         """Return the suspected setting by channel; reads, moves nothing. Raises DeviceError."""
 
 
+@runtime_checkable
+class MayLackWatchdog(Protocol):
+    """A driver of devices of which some do not zero their outputs by themselves."""
+
+    @property
+    def lacks_watchdog(self) -> bool:
+        """Whether nothing zeroes the outputs when the host or the wire fails."""
+
+
+def zeroed_without_host(driver: Driver, watchdog: float) -> str:
+    """Say what zeroes the outputs of a device that the host cannot reach, after `watchdog` [s]."""
+    if isinstance(driver, MayLackWatchdog) and driver.lacks_watchdog:
+        return "this device has no watchdog: NOTHING ELSE zeroes its outputs"
+    return f"a watchdog of the device, if it is set, zeroes them in {watchdog:g} s"
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """The connected device: identity, size and clock."""

@@ -8,6 +8,7 @@ number is dropped; after any timeout the connection ends.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from pydantic import Field
 from drivers.base import Array, DeviceError, DeviceLost, WireSettings
 from drivers.bench_protocol import DeviceRefused
 from drivers.modbus_frames import READ_HOLDING
-from drivers.modbus_transport import TcpConnection, registers_in_words
+from drivers.modbus_transport import DeviceAsksAgain, TcpConnection, registers_in_words
 from drivers.polled import Pacing, PolledDriver
 from drivers.register_types import (
     RegisterType,
@@ -247,7 +248,20 @@ def spans(points: Iterable[Point], most: int = MAX_READ) -> tuple[Span, ...]:
 
 
 class UnitConnection(TcpConnection):
-    """A connection to one unit of an address, closed at the first unanswered request."""
+    """A connection to one unit of an address, closed at the first unanswered request.
+
+    A request that a busy module refuses is sent again until the time limit of an answer.
+    """
+
+    def _exchange(self, request: bytes) -> bytes:
+        deadline = time.monotonic() + self._timeout
+        while True:
+            try:
+                return super()._exchange(request)
+            except DeviceAsksAgain:
+                if time.monotonic() > deadline:
+                    raise
+            time.sleep(DRIVER.busy_pause)
 
     def _finish_request(self, number: int, limit: float | None) -> bytes:
         try:
@@ -283,9 +297,13 @@ class MappedModule:
         return None if entry is None else entry.milliseconds * 1e-3
 
     def open(self) -> str:
-        """Connect, set the module's watchdog and read it back; return address and unit."""
+        """Connect, zero the outputs, set the watchdog and read it back; return address and unit.
+
+        The outputs first: a module that refuses the watchdog may still be driving a valve.
+        """
         self._link.open()
         try:
+            self.write(np.zeros(len(self._map.outputs)))
             self._set_watchdog()
         except DeviceError:
             self._link.close()
@@ -332,6 +350,14 @@ class MappedModule:
     def close(self) -> None:
         """End the connection."""
         self._link.close()
+
+    def zero_beside_host(self) -> None:
+        """Put every output to zero without setting the watchdog; closes the connection."""
+        self._link.open()
+        try:
+            self.write(np.zeros(len(self._map.outputs)))
+        finally:
+            self._link.close()
 
     @contextmanager
     def _naming_registers(self, registers: str) -> Iterator[None]:

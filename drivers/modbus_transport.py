@@ -26,6 +26,11 @@ logger = logging.getLogger(__name__)
 
 _CHUNK = 4096
 _SHORTEST = 1e-3  # [s] of waiting for bytes
+_ASK_AGAIN = (5, 6)  # exceptions: acknowledge, server device busy
+
+
+class DeviceAsksAgain(DeviceRefused):
+    """The device is busy: it asks for the request to be sent again later."""
 
 
 class ModbusConnection(ABC):
@@ -135,7 +140,8 @@ class ModbusConnection(ABC):
         answer = self._receive(number, self._factor * timeout)
         self._answered = True
         if answer[0] & REFUSED:
-            raise DeviceRefused(
+            refused = DeviceAsksAgain if answer[1] in _ASK_AGAIN else DeviceRefused
+            raise refused(
                 f"device at {self.where} refused function {answer[0] & ~REFUSED} "
                 f"with Modbus exception {answer[1]}"
             )

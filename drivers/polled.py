@@ -75,7 +75,10 @@ class InputsOutputs(Protocol):
 
 @runtime_checkable
 class ZeroesBesideHost(Protocol):
-    """A device whose outputs a host can put to zero while another host drives them."""
+    """A device whose outputs can be put to zero although it cannot be opened.
+
+    Another host may drive them, or a watchdog may be missing.
+    """
 
     def zero_beside_host(self) -> None:
         """Put every output to zero and end the other host's control; closes the device.
@@ -165,6 +168,11 @@ class PolledDriver:
         """Counts of ticks served, late and missing so far."""
         return replace(self._timing, missing=self._resampler.missing)
 
+    @property
+    def lacks_watchdog(self) -> bool:
+        """Whether nothing zeroes the outputs when the host or the wire fails."""
+        return self._device.watchdog is None
+
     # -- session ----------------------------------------------------------------------------
 
     def connect(self) -> DeviceInfo:
@@ -224,10 +232,12 @@ class PolledDriver:
         self._close_device()
         try:
             self._safely(self._device.open)
-        except DeviceBusy:
+        except DeviceError as error:
             if not isinstance(self._device, ZeroesBesideHost):
                 raise
             self._safely(self._device.zero_beside_host)
+            if not isinstance(error, DeviceBusy):
+                logger.warning("the outputs are at zero, but the device cannot be used: %s", error)
             return
         self._open, self._lost_cause = True, None
         try:

@@ -19,6 +19,7 @@ class DriverSettings:
     late_blocks: int = 16  # number of past blocks to which a late answer may belong
     quiet: float = 0.05  # [s] without a byte, after which a late answer on a line is over
     babble: float = 1.0  # [s] of bytes without a pause, after which the line counts as lost
+    busy_pause: float = 0.01  # [s] before a request is sent again to a module that was busy
     resolved: float = 1e-7  # of a sensor's range: a smaller value is read in the wrong word order
 
     # Messages over serial lines and CAN.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -19,6 +20,7 @@ from drivers.base import (
     LatchesTrip,
     OutputLaw,
     SampleBlock,
+    zeroed_without_host,
 )
 from rig.bench.settings import BENCH
 from rig.model.rig import Rig
@@ -65,8 +67,9 @@ class Outputs:
         self._armed_from = None
         if not self._connected:
             return False
-        problem: BaseException | None = None
-        for _ in range(1 if self._silent else BENCH.zero_attempts):
+        attempts = 1 if self._silent else BENCH.zero_attempts
+        deadline = time.monotonic() + BENCH.zero_patience
+        while True:
             try:
                 self.driver.zero_outputs()
             except (Exception, SystemExit) as error:
@@ -75,14 +78,20 @@ class Outputs:
                 self._silent = self._logged = False
                 self._at_zero = True
                 return True
+            attempts -= 1
+            if isinstance(problem, DeviceError) and not isinstance(problem, DeviceLost):
+                if time.monotonic() > deadline:
+                    break
+                time.sleep(BENCH.zero_pause)  # it answers, and may be ready soon
+            elif attempts <= 0:
+                break
         self._at_zero = False
         if not self._logged:
             log.error(
-                "%s (%s); the device's own watchdog should zero them in %g s: keep away from the "
-                "machine, use its emergency stop",
+                "%s (%s); %s: keep away from the machine, use its emergency stop",
                 UNSURE,
                 problem,
-                self._rig.wire.watchdog,
+                zeroed_without_host(self.driver, self._rig.wire.watchdog),
                 extra={"alarm": True},
             )
         self._silent = self._logged = True

@@ -11,6 +11,9 @@ class BenchSettings:
     """Times and attempts of zeroing, and thresholds of the probe and of the clocks."""
 
     zero_attempts: int = 2  # attempts to zero the outputs; the second one reopens the wire
+    # A device that refuses, as a busy one does, is asked again after a pause, for so long.
+    zero_patience: float = 1.0  # [s]
+    zero_pause: float = 0.02  # [s]
     zero_seconds: float = 2.0  # of device time with every command at zero, recorded as proof
     queued_seconds: float = 4.0  # of older samples that a device may still hold in its queue
     empty_pressure: float = 0.1e6  # [Pa] gauge below which a chamber counts as without pressure

@@ -9,6 +9,7 @@ holding registers (functions 3, 6, 16)
     100 valve 1, 101 valve 2 int16 5 mV
     200 watchdog [ms], 0 is off       210, 211 the voltages put out, int16 mV; ignores writes
     300 a write of n lets the next read of register 0 wait for n ms
+    301 a write of n lets the next n requests be refused as busy (exception 6)
 input registers (function 4)
     10 piston_2 int32 um      12 spool_2 int16 1 mV
     13 cap_2 uint32 1 Pa above -1 bar                 15 rod_2 uint16 1 kPa above -1 bar
@@ -72,6 +73,7 @@ class Module:
         self.piston = [0.0, 0.0]
         self.watchdog = 0
         self.wait = 0.0
+        self.busy = 0
         self._written = time.monotonic()
 
     async def access(
@@ -84,6 +86,9 @@ class Module:
         values: list[int] | None,
     ) -> ExcCodes | None:
         """Serve one request: keep what is written, bring up to date what is read."""
+        if self.busy and address != 301:
+            self.busy -= 1
+            return ExcCodes.DEVICE_BUSY
         if self.watchdog and time.monotonic() - self._written > self.watchdog * 1e-3:
             self.volts = [0.0, 0.0]
         if values is not None:
@@ -108,6 +113,8 @@ class Module:
             self.watchdog = words[0]
         elif address == 300:
             self.wait = words[0] * 1e-3
+        elif address == 301:
+            self.busy = words[0]
         elif address not in (210, 211):
             return ExcCodes.ILLEGAL_ADDRESS
         return None
@@ -135,7 +142,7 @@ async def serve(parent: int) -> None:
     """Serve until the parent process is gone."""
     module = Module()
     bits = [SimData(0, values=[False] * 16, datatype=DataType.BITS)]
-    holding = [plain(0, 6), plain(100, 102), plain(200, 201), plain(210, 212), plain(300, 301)]
+    holding = [plain(0, 6), plain(100, 102), plain(200, 201), plain(210, 212), plain(300, 302)]
     device = SimDevice(7, simdata=(bits, bits, holding, [plain(10, 19)]), action=module.access)
     server = ModbusTcpServer(device, address=("127.0.0.1", 0))
     await server.serve_forever(background=True)

@@ -27,6 +27,7 @@ from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.store import load_run
+from tests.cli.bench import bramah_here
 from tests.drivers.plain_module import SPEED_PER_VOLT, STEP, WIRE, module_process
 from tests.drivers.polled_bench import FakeClock
 
@@ -76,10 +77,15 @@ def put_out(port: int) -> list[float]:
     return [1e-3 * mv for mv in struct.unpack(">hh", answer[9:13])]
 
 
-def delay_next_answer(port: int, milliseconds: int) -> None:
+def put_into(port: int, register: int, value: int) -> None:
+    """Write a register over a connection of our own, as another program may."""
     with closing(socket.create_connection(("127.0.0.1", port), 10)) as wire:
-        wire.sendall(struct.pack(">HHHBBHH", 9, 0, 6, 7, 6, 300, milliseconds))
+        wire.sendall(struct.pack(">HHHBBHH", 9, 0, 6, 7, 6, register, value))
         assert len(wire.recv(64)) == 12
+
+
+def delay_next_answer(port: int, milliseconds: int) -> None:
+    put_into(port, 300, milliseconds)
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +179,63 @@ def test_a_host_that_vanishes_leaves_the_zeroing_to_the_modules_watchdog(port: i
         time.sleep(0.05)
     assert put_out(port) == [0.0, 0.0]
     driver.close()
+
+
+WRONG_WATCHDOG = ("watchdog_register: 200", "watchdog_register: 210")  # reads back as 0
+
+
+def test_outputs_are_zeroed_although_the_watchdog_cannot_be_set(
+    port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A host that hung has left 2.5 V at a valve; the module has a new firmware."""
+    put_into(port, 100, 500)
+    assert put_out(port) == [2.5, 0.0]
+    driver = in_fake_time(rig_of(port, WRONG_WATCHDOG))
+    driver.zero_outputs()
+    assert put_out(port) == [0.0, 0.0]
+    assert "the outputs are at zero, but the device cannot be used: register 210" in caplog.text
+    with pytest.raises(DeviceError, match="register 210"):
+        driver.connect()
+    put_into(port, 101, 500)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(rig_text(WIRE.format(port=port).replace(*WRONG_WATCHDOG)))
+    stopped = bramah_here("stop", "--rig", rig)
+    assert stopped.returncode == 0, stopped.stderr
+    assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
+    assert put_out(port) == [0.0, 0.0]
+
+
+def test_a_module_that_is_busy_for_a_moment_is_asked_again(
+    driver: ModbusMapDriver, port: int
+) -> None:
+    driver.start()
+    driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
+    driver.read_block()
+    put_into(port, 301, 8)
+    assert driver.read_block().data[-1, COLUMN["command_1"]] == 1.0
+    put_into(port, 301, 8)
+    driver.zero_outputs()
+    assert put_out(port) == [0.0, 0.0]
+
+
+def test_a_run_zeroes_a_module_that_refuses_for_longer_than_an_answer_takes(
+    port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The module has no watchdog: nothing but the host zeroes its outputs."""
+    alone = "zero_by: none\n  accept_no_watchdog: true"
+    rig = rig_of(port, (NO_WATCHDOG[0], alone))
+    rig = rig.model_copy(update={"wire": rig.wire.model_copy(update={"timeout": 0.2})})
+    with Bench(rig, in_fake_time(rig), signals=False) as bench:
+        bench.exchange()
+        put_into(port, 100, 500)
+        put_into(port, 301, 40)  # each is asked again after 10 ms
+        assert bench.zero_outputs()
+        assert put_out(port) == [0.0, 0.0]
+        put_into(port, 301, 1_000)
+        caplog.clear()
+        assert not bench.zero_outputs()
+        assert "this device has no watchdog: NOTHING ELSE zeroes its outputs" in caplog.text
+        put_into(port, 301, 0)
 
 
 def test_in_real_time_blocks_come_in_order_and_the_clock_is_kept(port: int) -> None:
