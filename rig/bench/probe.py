@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -88,15 +89,35 @@ def readings(block: SampleBlock, rig: Rig) -> list[Reading]:
     return [_reading(name, k, block, rig, supply) for k, name in enumerate(rig.channels)]
 
 
-def pressurised(readings: list[Reading]) -> list[str]:
+def pressurised(readings: Sequence[Reading]) -> list[str]:
     """Return the chambers and the supply still under pressure, as `joint 1 cap 3.50 MPa`."""
-    out = []
+    return [
+        f"{place} {reading.mean / 1e6:.2f} MPa"
+        for place, reading in _pressures(readings)
+        if reading.mean > BENCH.empty_pressure
+    ]
+
+
+def unknown_pressures(readings: Sequence[Reading]) -> list[str]:
+    """Return the chambers and the supply whose sensors do not show whether they are empty.
+
+    A broken wire reads the low end of the converter's range, or is not a number.
+    """
+    return [
+        f"{place} ({reading.mark})"
+        for place, reading in _pressures(readings)
+        if reading.mark != GOOD and not reading.mean > BENCH.empty_pressure
+    ]
+
+
+def _pressures(readings: Sequence[Reading]) -> Iterator[tuple[str, Reading]]:
+    """Yield place and reading of each pressure."""
     for reading in readings:
         kind, joint = ch.kind_of(reading.channel)
-        if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and reading.mean > BENCH.empty_pressure:
-            place = "supply" if kind == ch.SUPPLY else f"joint {joint} {kind.split('_')[0]}"
-            out.append(f"{place} {reading.mean / 1e6:.2f} MPa")
-    return out
+        if kind == ch.SUPPLY:
+            yield "supply", reading
+        elif kind in (ch.CAP, ch.ROD):
+            yield f"joint {joint} {kind.split('_')[0]}", reading
 
 
 def _supply(block: SampleBlock, rig: Rig) -> float:

@@ -11,11 +11,11 @@ import pytest
 
 from drivers import make_driver, wire_at
 from drivers.base import OFF, OutputLaw, SampleBlock
-from rig.bench.probe import GOOD, pressurised, readings
+from rig.bench.probe import GOOD, pressurised, readings, unknown_pressures
 from rig.cli.simulated.simulated_bench import simulated_bench
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
-from tests.cli.bench import bramah_here
+from tests.cli.bench import bramah_here, simulated
 
 RIG = "shinshu-2dof"
 
@@ -111,4 +111,28 @@ def test_what_is_not_plausible_is_marked(channel: str, value: float, says: str) 
 
 def test_a_bench_without_pressure_says_nothing_of_it() -> None:
     rig = load_rig(RIG)
-    assert pressurised(readings(block(rig, supply_pressure=0.0), rig)) == []
+    empty = readings(block(rig, supply_pressure=0.0), rig)
+    assert pressurised(empty) == unknown_pressures(empty) == []
+
+
+def test_a_chamber_that_no_sensor_shows_is_not_taken_for_an_empty_one() -> None:
+    rig = load_rig(RIG)
+    low = rig.sensors.chamber_pressure.range[0]
+    blind = block(rig, supply_pressure=0.0, cap_pressure_1=float("nan"), rod_pressure_2=low)
+    found = readings(blind, rig)
+    assert pressurised(found) == []
+    nan, broken = unknown_pressures(found)
+    assert nan == "joint 1 cap (not a number)"
+    assert broken.startswith("joint 2 rod (at the end of its converter's range: a broken wire")
+
+
+def test_a_broken_wire_is_named_where_pressures_are_listed(tmp_path: Path) -> None:
+    faults = "[{name: broken_wire, channel: cap_pressure_1, end: low, at: 0 s}]"
+    scenario = tmp_path / "broken.yaml"
+    scenario.write_text(f"faults: {faults}\n")
+    with simulated("--scenario", str(scenario)) as (endpoint, _):
+        at = ("--rig", RIG, "--endpoint", endpoint)
+        stopped, left = bramah_here("stop", *at), bramah_here("depressurise", *at)
+    assert "; pressure not known, shinshu-2dof" in stopped.stdout
+    assert "pressure not known: joint 1 cap (at the end of its converter's range" in left.stderr
+    assert left.returncode == 1

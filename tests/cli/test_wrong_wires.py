@@ -147,8 +147,9 @@ def test_a_wrong_word_order_is_suspected_by_probe(tmp_path: Path) -> None:
     (row,) = (line for line in shown.stdout.splitlines() if line.startswith("cap_pressure_1"))
     assert "word order?" in row
     assert "word_order: little" in row
-    others = [line for line in shown.stdout.splitlines() if "pressure" in line and line != row]
+    others = [line for line in shown.stdout.splitlines() if "_pressure" in line and line != row]
     assert not any("word order" in line for line in others)
+    assert "pressure not known: joint 1 cap (word order?" in shown.stdout
     assert "not plausible: cap_pressure_1" in shown.stderr
 
 

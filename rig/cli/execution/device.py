@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 from rig.cli.text.output import progress
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from drivers.base import Driver
+    from rig.bench.probe import Reading
     from rig.cli.text.output import Say
     from rig.model.rig import Rig
 
@@ -103,6 +105,18 @@ def _place_of(name: str, problem: str) -> str:
     return f"{source}:{next((line for line in known if line is not None), 1)}"
 
 
-def pressure_text(places: list[str], bench: str = "") -> str:
-    """Return the places still under pressure as text, of a `bench` where several may be meant."""
-    return f"still under pressure{f', {bench}' if bench else ''}: {', '.join(places)}"
+def pressure_text(readings: Sequence[Reading], bench: str = "") -> str:
+    """Return where pressure is left, and where it is not known, as text; '' for nowhere.
+
+    `bench` is named where several may be meant.
+    """
+    from rig.bench.probe import pressurised, unknown_pressures
+
+    lists = {
+        "still under pressure": pressurised(readings),
+        "pressure not known": unknown_pressures(readings),
+    }
+    where = f", {bench}" if bench else ""
+    return "; ".join(
+        f"{what}{where}: {', '.join(places)}" for what, places in lists.items() if places
+    )

@@ -55,8 +55,8 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
             f"tripped: {'; '.join(trips)}; clear it with `{reset_command(described)}`",
             err=to_stderr,
         )
-    if places := bench.pressurised(readings):
-        typer.echo(pressure_text(places), err=to_stderr)
+    if text := pressure_text(readings):
+        typer.echo(text, err=to_stderr)
     implausible = [reading.channel for reading in readings if reading.mark != bench.GOOD]
     if implausible:
         raise WorkError(f"not plausible: {', '.join(implausible)}; the last column says why")
