@@ -115,6 +115,16 @@ def rigs_in_use() -> list[Path]:
     return [path for path, holder in holders if holder is not None and holder.pid != os.getpid()]
 
 
+def rigs_to_stop() -> list[Path]:
+    """Return the descriptions of the rigs whose benches this computer may have left driven.
+
+    A process drives them, or the last one ended without confirming that their outputs are at zero.
+    """
+    held = (path for path in known_rigs() if path.with_name(_SESSION).exists())
+    own = os.getpid()
+    return [path for path in held if (holder := _holder(path.parent)) is None or holder.pid != own]
+
+
 def holder_at(wire: Wire) -> Holder | None:
     """Return the process of this computer that uses a bench, also under another name of its port.
 
@@ -293,16 +303,24 @@ class BenchState:
             log.warning("%s: cannot store which process uses the bench: %s", self.folder, error)
         self._taken = True
 
-    def release(self) -> None:
-        """Remove the entry made by `take` and the lock of `occupy`; never raises."""
+    def release(self, *, at_zero: bool = True) -> None:
+        """Remove the lock of `occupy` and, with outputs `at_zero`, the entry made by `take`.
+
+        The entry that stays names a bench to stop (`rigs_to_stop`). Never raises.
+        """
         if self._taken:
             self._taken = False
-            with suppress(OSError):
-                (self.folder / _SESSION).unlink(missing_ok=True)
+            if at_zero:
+                self.forget_session()
         handle, self._lock = self._lock, None
         if handle is not None:
             with suppress(OSError):
                 os.close(handle)
+
+    def forget_session(self) -> None:
+        """Remove the entry of a process that used the bench; never raises."""
+        with suppress(OSError):
+            (self.folder / _SESSION).unlink(missing_ok=True)
 
     def holder(self) -> Holder | None:
         """Return the running process of this computer that uses the bench, None if unknown."""

@@ -198,7 +198,7 @@ class Bench:
                 if error is not None:
                     error.add_note(UNSURE)
         finally:
-            self.state.release()
+            self.state.release(at_zero=confirmed)
             try:
                 self._flush(state, message, error)
             finally:

@@ -55,15 +55,19 @@ class StopAnswer(Enum):
     TAKEN = 1
     NONE = 2
     NOWHERE = 3  # there was no session to send it to
+    DEVICE = 4  # the session did not answer: the device itself is asked
+    ZEROED = 5  # the device itself confirmed
+    FAILED = 6  # the device did not confirm either
 
 
 @dataclass(frozen=True)
 class Stop:
-    """A stop requested by the operator: time (monotonic [s]), run, answer."""
+    """A stop requested by the operator: time (monotonic [s]), run, answer, why it failed."""
 
     at: float
     endpoint: Endpoint | None
     answer: StopAnswer = StopAnswer.SENDING
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -225,13 +229,25 @@ def alarm_notices(snapshot: Snapshot) -> list[Notice]:
 
 
 def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
-    """Return the result of the operator's stop; only the run itself confirms it."""
-    if stop.answer is StopAnswer.NOWHERE:
-        return Notice("alarm", "STOP: NOTHING SENT, no run is attached to this screen.")
+    """Return the result of the operator's stop, which the run or its device confirms."""
     if stop.answer is StopAnswer.NONE:
         if frame.snapshot is not None and frame.snapshot.state in ENDED_STATES:
             return Notice("warn", f"STOP: no answer, the run had ended ({frame.snapshot.state})")
         return Notice("alarm", f"STOP: NO ANSWER from the run. {EMERGENCY}")
+    without_run = {
+        StopAnswer.NOWHERE: ("alarm", "STOP: NOTHING SENT, no run is attached to this screen."),
+        StopAnswer.DEVICE: (
+            "alarm",
+            f"STOP: NO ANSWER from the run. {EMERGENCY} Asking its device ...",
+        ),
+        StopAnswer.ZEROED: ("normal", "STOP SENT, OUTPUTS ZEROED: the device confirmed it"),
+        StopAnswer.FAILED: (
+            "alarm",
+            f"STOP: NO ANSWER from the run. {EMERGENCY} Its device: {stop.reason}",
+        ),
+    }
+    if stop.answer in without_run:
+        return Notice(*without_run[stop.answer])
     if stop.endpoint is not None and stop.endpoint != frame.endpoint:
         session = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
         result = "sending ..." if stop.answer is StopAnswer.SENDING else "taken"

@@ -158,6 +158,20 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
     ended_by(stop, endless, run)
 
 
+def test_stop_reaches_the_bench_of_a_killed_run(endless: Path, tmp_path: Path) -> None:
+    """Its device may have no watchdog: nobody has confirmed that its outputs are at zero."""
+    with simulated() as (endpoint, _):
+        with third_record(endless, tmp_path / "killed", endpoint) as process:
+            process.kill()
+            process.communicate(timeout=LONG)
+        stopped = bramah("stop")
+        assert stopped.returncode == 0, stopped.stderr
+        assert f"confirmed by the device of shinshu-2dof at {endpoint}" in stopped.stdout
+        again = bramah("stop")
+        assert again.returncode == 2
+        assert "or has left one with outputs not confirmed at zero" in again.stderr
+
+
 def test_stop_zeroes_one_bench_while_another_does_not_answer(endless: Path, tmp_path: Path) -> None:
     with simulated() as one, simulated() as two:
         # In the order in which `stop` finds them: the first device hangs.

@@ -247,6 +247,25 @@ async def test_a_reset_that_fails_says_why_and_the_alarm_stays(
         assert "is at the end" in shown.text
 
 
+async def test_a_stop_of_a_run_that_has_ended_reaches_its_device(
+    tripped_run: Machine, bramah: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run may have ended without confirming that the valve is at zero."""
+    tripped_run.runs[HERE].answers = False
+    async with glass(tripped_run, size=(160, 40)) as shown:
+        await shown.press("space")
+        while "OUTPUTS ZEROED: the device confirmed it" not in shown.text:
+            await shown.watch()
+        asked = json.loads(bramah.read_text())
+        assert asked[:2] == ["stop", "--rig"]
+        assert asked[3:] == ["--endpoint", "modbus-tcp://127.0.0.1:5020"]
+        monkeypatch.setattr(jobs, "BRAMAH", (sys.executable, "-c", "raise SystemExit(4)"))
+        await shown.press("space")
+        while "Its device: DEVICE LOST" not in shown.text:
+            await shown.watch()
+        assert "emergency stop" in shown.text
+
+
 def by_hand(**changes: object) -> Recorded:
     """A manual session, with this screen's view of it."""
     return running(engine="manual", kind="manual", step="manual", part=0, parts=0, **changes)

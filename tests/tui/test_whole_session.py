@@ -27,6 +27,11 @@ PATIENCE = 60.0  # of a test whose processes ought to have acted long ago [s]
 
 
 @pytest.fixture(autouse=True)
+def verbs() -> None:
+    """Let the screen start the real verbs."""
+
+
+@pytest.fixture(autouse=True)
 def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)

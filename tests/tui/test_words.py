@@ -131,6 +131,9 @@ def test_the_age_includes_how_late_the_block_already_was() -> None:
         (StopAnswer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
         (StopAnswer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
         (StopAnswer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
+        (StopAnswer.DEVICE, "done", 0.1, "alarm", "Asking its device"),
+        (StopAnswer.ZEROED, "done", 0.1, "normal", "OUTPUTS ZEROED: the device confirmed"),
+        (StopAnswer.FAILED, "done", 0.1, "alarm", "NO ANSWER"),
     ],
 )
 def test_a_stop_is_called_what_it_is(

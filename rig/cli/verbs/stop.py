@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 News = SimpleQueue[str | BaseException | None]
 
-NOT_IN_USE: Final = "no process of this computer drives a bench"
+NOT_IN_USE: Final = (
+    "no process of this computer drives a bench, or has left one with outputs not confirmed at zero"
+)
 # Without an answer for so long the operator is asked to use the emergency stop.
 SILENCE: Final = 1.0  # [s]
 # A stopped run records its outputs at zero, for at most 6 s and two answer times.
@@ -38,16 +40,17 @@ BETWEEN_ZEROS: Final = 0.2  # [s]
 def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     """Set all outputs to zero now, whoever is in control, and end the run that drives them.
 
-    Without --rig it stops every bench that this computer drives, all at once.
+    Without --rig it stops every bench that this computer drives, or has left without confirming
+    that its outputs are at zero, all at once.
 
     Example: bramah stop --rig shinshu-2dof
     """
     from rig.bench import probe  # noqa: F401 - before the threads, which all need it
-    from rig.bench.latch import rigs_in_use
+    from rig.bench.latch import rigs_to_stop
     from rig.model.parse import InputError
 
     refuse_endpoint_alone(rig, endpoint)
-    rigs = [rig] if rig is not None else [str(path) for path in rigs_in_use()]
+    rigs = [rig] if rig is not None else [str(path) for path in rigs_to_stop()]
     if not rigs:
         raise InputError(f"{NOT_IN_USE}; name the bench: --rig RIG")
     news: News = SimpleQueue()
@@ -92,8 +95,9 @@ class BenchStop(threading.Thread):
         The run is signalled first: it then zeroes the outputs too, whatever this device answers.
         Raises InputError and DeviceError.
         """
-        from drivers.base import DeviceError
+        from drivers.base import DeviceError, zeroed_without_host
         from rig.bench import probe as bench
+        from rig.bench.latch import BenchState
         from rig.bench.outputs import UNSURE
 
         bench_rig, driver = device_of(self._rig, self._endpoint)
@@ -102,22 +106,23 @@ class BenchStop(threading.Thread):
         try:
             self._zero(driver, bench_rig.wire, holder)
         except DeviceError as error:
-            watchdog = bench_rig.wire.watchdog
+            otherwise = zeroed_without_host(driver, bench_rig.wire.watchdog)
             raise type(error)(
-                f"{UNSURE}, {self.place}: {error}; use the emergency stop (the device's watchdog "
-                f"zeroes the outputs {watchdog:g} s after the host's last message)"
+                f"{UNSURE}, {self.place}: {error}; use the emergency stop ({otherwise})"
             ) from error
         finally:
             driver.close()
         _await_end(bench_rig.wire, holder)
+        if _holder(bench_rig.wire) is None:
+            BenchState(bench_rig.wire).forget_session()
         self._news.put(f"outputs at zero, confirmed by the device of {self.place}")
         try:
             readings = bench.probe(device_of(self._rig, self._endpoint)[1], bench_rig)
         except DeviceError as error:
             progress(f"pressures not read, {self.place}: {error}")
         else:
-            if places := bench.pressurised(readings):
-                self._news.put(pressure_text(places, self.place))
+            if text := pressure_text(readings, self.place):
+                self._news.put(text)
 
     def _zero(self, driver: Driver, wire: Wire, holder: Holder | None) -> None:
         """Zero the outputs, several times where a run of another computer may still set them.
@@ -129,16 +134,30 @@ class BenchStop(threading.Thread):
         from drivers.base import DeviceError
 
         try:
-            driver.zero_outputs()
+            self._zero_once(driver)
         except DeviceError:
             if holder is None:
                 raise
             _await_end(wire, holder)
-            driver.zero_outputs()
+            self._zero_once(driver)
         self.answered.set()
         for _ in range(ZEROS - 1 if holder is None else 0):
             time.sleep(BETWEEN_ZEROS)
             driver.zero_outputs()
+
+    @staticmethod
+    def _zero_once(driver: Driver) -> None:
+        """Zero the outputs; a device that refuses, as a busy one does, is asked again."""
+        from drivers.base import DeviceError, DeviceLost
+
+        for _ in range(ZEROS - 1):
+            try:
+                return driver.zero_outputs()
+            except DeviceLost:
+                raise
+            except DeviceError:
+                time.sleep(BETWEEN_ZEROS)
+        return driver.zero_outputs()
 
 
 def _warn_of_silence(stops: list[BenchStop]) -> None:

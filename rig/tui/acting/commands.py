@@ -54,15 +54,35 @@ class Commands:
 
         def answered(where: Endpoint | None, taken: bool) -> None:
             # Called by the sending thread: replacing one attribute needs no lock.
+            not_taken = StopAnswer.NOWHERE if where is None else StopAnswer.NONE
+            asked = replace(stop, endpoint=where, answer=StopAnswer.TAKEN if taken else not_taken)
             if self.stop_asked is stop:
-                not_taken = StopAnswer.NOWHERE if where is None else StopAnswer.NONE
-                answer = StopAnswer.TAKEN if taken else not_taken
-                self.stop_asked = replace(stop, endpoint=where, answer=answer)
+                self.stop_asked = asked
                 self.redraw()
+            if not taken and where == frame.endpoint and frame.snapshot is not None:
+                self._stop_device(asked, frame.snapshot)
 
         self.link.stop(endpoint, answered)
         if choosing:
             self.link.choose(endpoint)
+
+    def _stop_device(self, asked: Stop, snapshot: Snapshot) -> None:
+        """Zero the outputs of the bench of a run that does not answer, by the verb `stop`."""
+        if not snapshot.wire:
+            return
+        shown = asked
+
+        def changed(job: VerbJob) -> None:
+            nonlocal shown
+            ended = StopAnswer.FAILED if job.code else StopAnswer.ZEROED
+            answer = StopAnswer.DEVICE if job.code is None else ended
+            newest = replace(asked, answer=answer, reason=job.ended)
+            if self.stop_asked == shown:  # no other stop was asked since
+                self.stop_asked = shown = newest
+                self.redraw()
+
+        rig = rig_of_run(snapshot.run, snapshot.rig)
+        begin(("stop", "--rig", rig, "--endpoint", snapshot.wire), changed)
 
     # Commands
 
