@@ -236,7 +236,7 @@ class PlanRunner:
         limit = self.inputs.longest_pause if self.inputs.attended else question.timeout
         began = self.elapsed
         while self.elapsed - began < limit:
-            self.session.wait(ENGINE.look_seconds)
+            self._await_person()
             answer = self.inputs.control.requests.answer
             if answer is not None:
                 return answer, "from the screen"
@@ -289,6 +289,13 @@ class PlanRunner:
         """End the run with a reason."""
         raise RunEnded(why)
 
+    def _await_person(self) -> None:
+        """Wait a moment for a person; it is no time of the step, and the rest takes as long."""
+        began = self.elapsed
+        self.session.wait(ENGINE.look_seconds)
+        self._part_began += self.elapsed - began
+        self.bench.status(total_s=self.elapsed + self.remaining_seconds())
+
     # Rest and safe points
 
     def rest_now(self, why: str, *, confirmed: bool = True) -> None:
@@ -325,7 +332,7 @@ class PlanRunner:
                 raise RunEnded(
                     f"paused for longer than {self.inputs.longest_pause:g} s; the run is over"
                 )
-            self.session.wait(ENGINE.look_seconds)
+            self._await_person()
         requests.resume = False
         self.machine.to(EngineState.IDLE, "resumed; joints are positioned and locked again")
 

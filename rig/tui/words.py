@@ -189,7 +189,9 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
         listed.append(Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}"))
     if snapshot is not None and snapshot.device == LOST:
         result = (
-            snapshot.message if frame.over else "looking for it; outputs zeroed by its watchdog"
+            snapshot.message
+            if frame.over
+            else "looking for it; only its own watchdog, if set, zeroes it"
         )
         listed.append(Notice("alarm", f"DEVICE LOST: {result}"))
     if snapshot is not None and snapshot.trip is not None:

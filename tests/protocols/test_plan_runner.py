@@ -169,6 +169,20 @@ def test_nobody_answers_and_the_default_counts_after_its_time(rig: Rig) -> None:
     assert sheet.states == ["prompting", "idle", "safe"]
 
 
+def test_the_time_left_stands_while_a_person_is_awaited(rig: Rig) -> None:
+    sheet = Attended(rig, ASK.replace("DEFAULT", "yes") + STEP.replace("NAME", "one"))
+    left: list[float] = []
+
+    def look() -> None:
+        left.append(sheet.bench.shown["total_s"] - sheet.bench.tick / rig.sample_rate)
+
+    for tick in (5_000, 12_000, 19_000):
+        sheet.bench.happenings[tick] = look
+    sheet.run()
+    assert left[0] > 10.0
+    assert left == pytest.approx([left[0]] * 3, abs=0.3)
+
+
 def test_a_question_without_a_default_that_nobody_answers_ends_the_run(rig: Rig) -> None:
     sheet = Attended(rig, ASK.replace("    default: DEFAULT\n", ""))
     with pytest.raises(RunEnded, match="'Go\\?' was not answered within 20 s"):
