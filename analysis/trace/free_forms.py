@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,11 +37,13 @@ def explained_by_free_form(
 ) -> Finding | None:
     """Return an explanation by the first set with a free form that gives one.
 
-    None where none does, and where none is needed: named effects explain to within the tolerance
-    for their forms, with one mechanism or only noise left. A free form of the mechanisms `free`
-    joins the named effects that passed, or replaces those of one mechanism; it never joins a name
-    of its own mechanism at the same place. Every effect must pass every gate with it, no remainder
-    may have a veto, and no named effect may fit as well as the free form. Where the named effects
+    Otherwise an `unexplained` finding that names the first set which explains every equation that
+    it alters, and thus more equations than `finding` does. None where there is neither, and where
+    none is needed: named effects explain to within the tolerance for their forms, with one
+    mechanism or only noise left. A free form of the mechanisms `free` joins the named effects that
+    passed, or replaces those of one mechanism; it never joins a name of its own mechanism at the
+    same place. Every effect must pass every gate with it, no remainder may have a veto in an
+    explanation, and no named effect may fit as well as the free form. Where the named effects
     explain, `_is_better` must hold too. `rng` draws the sign flips.
     """
     hypotheses, winner = finding.hypotheses, finding.winner
@@ -49,6 +52,8 @@ def explained_by_free_form(
         return None
     extended = hypotheses.with_candidates(free)
     named = {kind.name for kind in extended.effects if not kind.free}
+    unexplained = {r.equation for r in finding.remainders if r.veto and not explained}
+    beside: Finding | None = None
     sets = _sets_with_free_form(extended, winner, explained)
     for hypothesis in map(extended.in_best_forms, _simplest_first(extended, sets)):
         within_range = CurveRange(finding.rows.choosing, hypothesis.fit).rows
@@ -57,12 +62,17 @@ def explained_by_free_form(
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
         words = [r.words for r in remaining]
         log.info("free form %s: %s %s", sorted(hypothesis.keys), words, failed)
-        passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in remaining)
         ties = any(r.tied and r.name in named for f in effects if f.free for r in f.rivals)
-        if passed and not ties:
+        if ties or not all(map(gates.passes_gates, effects)):
+            continue
+        above = {r.equation for r in remaining if r.veto}
+        if not above:
             verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
             return Finding(finding.rows, extended, hypothesis, verdict, effects, remaining)
-    return None
+        if beside is None and above < unexplained:
+            judged = Finding(finding.rows, extended, hypothesis, UNEXPLAINED, effects, remaining)
+            beside = _named_beside_unknown_cause(judged, above)
+    return beside
 
 
 def _may_be_replaced(hypotheses: HypothesisSet, winner: Hypothesis) -> bool:
@@ -128,6 +138,24 @@ def _is_better(hypotheses: HypothesisSet, winner: Hypothesis, hypothesis: Hypoth
     ratio = SEARCH.free_form_ratio if fewer else SEARCH.free_form_ratio_alike
     possible = len(hypothesis.laws) <= _most_mechanisms(hypotheses, winner)
     return possible and hypothesis.total < ratio * winner.total
+
+
+def _named_beside_unknown_cause(finding: Finding, above: Collection[str]) -> Finding | None:
+    """Return a finding whose effects pass the gates beside an unknown cause, None if one does not.
+
+    The cause, in the equations `above` the band, must not lie where the effects act.
+    """
+    hypotheses, winner = finding.hypotheses, finding.winner
+    effects = gates.judged_beside_unknown_cause(hypotheses, winner, finding.effects, above)
+    named = all(map(gates.passes_gates, effects)) and not _altered(hypotheses, winner) & set(above)
+    return replace(finding, effects=effects) if named else None
+
+
+def _altered(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> set[str]:
+    """Return the equations of whose energy a set removes a visible share."""
+    start = hypotheses.empty.excess_energy
+    left = hypothesis.excess_energy
+    return {e for e, v in start.items() if v - left[e] >= SEARCH.altered_share * v > 0.0}
 
 
 def _explains_what_it_alters(

@@ -336,6 +336,17 @@ def a_drop_without_a_name_is_drawn_as_a_curve(b: Benches) -> None:
     assert [e.name for e in result.effects] == ["supply_curve"]
 
 
+def a_curve_is_named_although_noise_of_other_equations_is_not_known(b: Benches) -> None:
+    """Once recorded, noise with a memory is larger in the rows than above them."""
+    train, held_out = (
+        with_filtered_noise(hardening(replace(run, records=run.records[:1]), 1e7), 1.0, corner=20.0)
+        for run in b.runs()
+    )
+    names = ("coulomb_friction", "base_inclination", "joint_spring")
+    result = b.traced((train, held_out), *names, free_forms=True)
+    assert (result.verdict, [e.name for e in result.effects]) == (UNEXPLAINED, ["position_force"])
+
+
 def the_floor_is_the_noise_that_is_there(b: Benches) -> None:
     terms = b.searched(b.runs(), "internal_leakage").hypotheses.base
     (train, _) = b.runs()
@@ -956,6 +967,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),
     (a_breakaway_that_motion_hides_is_named_as_all_rows_show_it, ("force at standstill",)),
     (a_drop_without_a_name_is_drawn_as_a_curve, ("free forms",)),
+    (a_curve_is_named_although_noise_of_other_equations_is_not_known, ("free form beside",)),
     (the_floor_is_the_noise_that_is_there, ("floor x 0.3", "floor x 3")),
     (repeats_that_do_not_differ_make_no_floor_of_nothing, ("least floor",)),
     (the_order_of_the_repeats_changes_nothing, ("first repeat alone",)),

@@ -36,10 +36,26 @@ def quiet(rig: Rig) -> tuple[Run, Run]:
     return pair_of_runs(rig)
 
 
+def traced(runs: tuple[Run, Run], *, free_forms: bool) -> Trace:
+    effects = catalogue(runs[0].rig, FEW)
+    return trace([runs[0]], [runs[1]], effects, look_ahead=False, free_forms=free_forms)
+
+
 @pytest.fixture(scope="module")
-def sprung(quiet: tuple[Run, Run]) -> Trace:
+def hardened(quiet: tuple[Run, Run]) -> tuple[Run, Run]:
     train, held_out = (hardening(run, 2.0e7) for run in quiet)
-    return trace([train], [held_out], catalogue(train.rig, FEW), look_ahead=False)
+    return train, held_out
+
+
+@pytest.fixture(scope="module")
+def sprung(hardened: tuple[Run, Run]) -> Trace:
+    """The answer where no mechanism may have a curve in place of a name."""
+    return traced(hardened, free_forms=False)
+
+
+def test_a_curve_is_named_where_mechanisms_may_have_one(hardened: tuple[Run, Run]) -> None:
+    result = traced(hardened, free_forms=True)
+    assert [(e.name, e.where) for e in result.effects] == [("position_force", "joint 2")]
 
 
 @pytest.mark.slow
@@ -55,7 +71,7 @@ def test_a_spring_that_goes_with_the_cube_is_read_off_with_its_stiffness(sprung:
 @pytest.mark.slow
 def test_drag_by_the_square_of_the_speed_is_read_off(quiet: tuple[Run, Run]) -> None:
     train, held_out = (dragged(run, 6.0e4) for run in quiet)
-    result = trace([train], [held_out], catalogue(train.rig, FEW), look_ahead=False)
+    result = traced((train, held_out), free_forms=False)
     assert result.verdict == "unexplained"
     best = max(result.formulas, key=lambda f: f.share)
     assert set(best.terms) == {"velocity_2 |velocity_2|"}

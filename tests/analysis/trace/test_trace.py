@@ -221,7 +221,7 @@ def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     quiet: tuple[Run, Run],
 ) -> None:
     train, held_out = (hardening(run, 2.0e7) for run in quiet)
-    result = trace([train], [held_out], look_ahead=False)
+    result = trace([train], [held_out], look_ahead=False, free_forms=False)
     assert result.verdict == "unexplained"
     assert result.unexplained_fraction > 0.05
     assert "piston_2" in [d.variable for d in result.depends_on[:2]]

@@ -286,6 +286,8 @@ RULES: Final = (
           (engine, "joints_with_friction", lambda *_: set()))),
     Rule("force at standstill", "rows in motion alone decide whether a breakaway acts",
          ((in_motion, "_hides_breakaway", lambda *_: False),)),
+    Rule("free form beside", "a free form beside an unknown cause in other equations is not named",
+         ((free_forms, "_named_beside_unknown_cause", lambda *_: None),)),
     Rule("free forms", "no mechanism without a named form",
          ((judging, "explained_by_free_form", lambda *_: None),)),
 )  # fmt: skip
