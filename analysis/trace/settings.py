@@ -221,6 +221,13 @@ class DataSettings:
     unrepeated_ratio: float = 5.0
     """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
     note says that something else acts (tuned: clean benches stay below 2)."""
+    passed_power: float = 0.01
+    """Power of the noise at a frequency, over the largest one, from which a filter passes it."""
+    smoothed_frequencies: int = 9
+    """Number of neighbouring frequencies over which the power of one draw of noise is averaged."""
+    broad_share: float = 0.8
+    """Share of the frequencies, those of least power over the noise's, that count as noise: a hum
+    and its harmonics take a few per cent."""
     coloured_ratio: float = 3.0
     """Noise of repeats in the rows' band over that in the octave above, both over the stated noise,
     up to which it counts as sensor noise that is not white (noise behind a pole at 5 to 60 Hz stays

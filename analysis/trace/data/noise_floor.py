@@ -28,6 +28,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from analysis.regression.conditioned import ConditionedRecord
@@ -161,13 +162,33 @@ def noise_above_rows(
     filtering = filtering_above_rows(conditioned.record, conditioned.filtering)
     above = replace(conditioned, filtering=filtering)
     rows = model_rows(rig, terms, above)
-    stated = stated_noise(rig, terms, above, rows, beta)
-    ratios = {
-        e: float(np.sqrt(np.mean(row_residual(r, beta) ** 2))) / stated[e]
-        for e, r in rows.items()
-        if stated[e] > NO_ROWS
-    }
+    rng = np.random.default_rng(0)
+    ratios = {}
+    for e, (at, noise) in _noise_rows(rig, terms, above, rows, beta, with_added_noise, rng).items():
+        if len(noise) >= DATA.least_pairs and np.any(noise):
+            residual = row_residual(rows[e], beta)[at]
+            ratios[e] = _spectral_ratio(rows[e].time[at], residual, noise)
     return {e: ratio for e, ratio in ratios.items() if ratio > 1.0}
+
+
+def _spectral_ratio(time: Array, residual: Array, noise: Array) -> float:
+    """Return the rms ratio of the broad-band part of a residual (m,) to noise (m,) at times [s].
+
+    The largest powers are left out, such as those of a hum above the rows' frequencies, which is no
+    measure of the noise in the rows. Instants without rows count as zero.
+    """
+    step = float(np.min(np.diff(time)))
+    at = np.rint((time - time[0]) / step).astype(np.int64)
+    series = np.zeros((2, int(at[-1]) + 1))
+    series[:, at] = residual, noise
+    power, of_noise = np.abs(np.fft.rfft(series * np.hanning(series.shape[1]))) ** 2
+    of_noise = uniform_filter1d(of_noise, DATA.smoothed_frequencies)
+    passed = of_noise >= DATA.passed_power * np.max(of_noise)
+    ratio = np.sort(power[passed] / of_noise[passed])
+    kept = DATA.broad_share
+    # Of noise, powers are distributed exponentially: their mean up to the share that is kept.
+    mean = 1.0 + (1.0 - kept) * math.log1p(-kept) / kept
+    return math.sqrt(float(np.mean(ratio[: math.ceil(kept * len(ratio))])) / mean)
 
 
 def _within_residual(floor: Floor, ratios: Mapping[str, float]) -> dict[str, float]:
@@ -398,12 +419,24 @@ def stated_noise(
     rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
     squares: dict[str, list[float]] = {name: [] for name in rows}
     for _ in range(draws):
-        noisy = disturbed(rig, conditioned.record, rng)
-        after = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
-        for name, before in rows.items():
-            in_before, in_after = in_common(before, after[name])
-            quiet, disturbed_rows = row_residual(before, beta), row_residual(after[name], beta)
-            change = disturbed_rows[in_after] - quiet[in_before]
+        drawn = _noise_rows(rig, terms, conditioned, rows, beta, disturbed, rng)
+        for name, (_, change) in drawn.items():
             if len(change):
                 squares[name].append(float(np.mean(change**2)))
     return {n: float(np.sqrt(np.mean(drawn))) if drawn else NO_ROWS for n, drawn in squares.items()}
+
+
+def _noise_rows(
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, rows: Mapping[str, Rows],
+    beta: Mapping[str, float], disturbed: Callable[[Rig, Record, np.random.Generator], Record],
+    rng: np.random.Generator,
+) -> dict[str, tuple[NDArray[np.int64] | slice, Array]]:  # fmt: skip
+    """Return of each equation the rows that noise leaves valid, and its residual (m,) of noise."""
+    noisy = disturbed(rig, conditioned.record, rng)
+    after = model_rows(rig, terms, conditioned.condition_alike(rig, noisy))
+    out = {}
+    for name, before in rows.items():
+        in_before, in_after = in_common(before, after[name])
+        quiet, changed = row_residual(before, beta), row_residual(after[name], beta)
+        out[name] = in_before, changed[in_after] - quiet[in_before]
+    return out

@@ -242,6 +242,8 @@ RULES: Final = (
          ((noise_floor, "noise_above_rows", lambda *_: {}),)),
     Rule("noise with a memory", "only noise above the rows counts where repeats show far more",
          ((DATA, "coloured_ratio", 0.0),), refits=True),
+    Rule("hum above the rows", "lines above the rows count as noise",
+         ((noise_floor, "_spectral_ratio", lambda _, r, n: float(np.std(r) / np.std(n))),)),
     Rule("noise in the residual", "noise above the rows counts where the rows hold less",
          ((noise_floor, "_within_residual", lambda _, ratios: ratios),)),
     Rule("noise of the samples", "neighbouring states may show less than the samples' noise",
