@@ -65,7 +65,7 @@ def geometry_for_smaller_set(
         return None
     changes = residual_changes(data, winner.fit, numbers)
     limit = len(numbers) + SEARCH.most_deviations * math.sqrt(2.0 * len(numbers))
-    best: tuple[Hypothesis, Array] | None = None
+    possible: list[tuple[Hypothesis, Array]] = []
     largest = winner if explained else min(hypotheses.fitted.values(), key=lambda o: o.total)
     for size in range(1, len(largest.effects)):
         for effects in itertools.combinations(largest.effects, size):
@@ -84,12 +84,28 @@ def geometry_for_smaller_set(
             else hypotheses.negligible(e, v)
             for e, v in left.items()
         )
-        if is_as_small and (best is None or is_preferred(moved, best[0], band)):
-            best = moved, deviations
-    if best is None:
+        if is_as_small:
+            possible.append((moved, deviations))
+    if not possible:
         return None
-    hypothesis, deviations = best
+    hypothesis, deviations = _simplest(hypotheses, possible)
     return Geometry(data.rig.with_deviations(deviations.tolist()), deviations, hypothesis.effects)
+
+
+def _simplest(
+    hypotheses: HypothesisSet, possible: Sequence[tuple[Hypothesis, Array]]
+) -> tuple[Hypothesis, Array]:
+    """Return the simplest set that leaves noise alone beside its geometry, else the preferred one.
+
+    Shapes that compensate a wrong number are fitted again later, and leave less.
+    """
+    band = hypotheses.noise_band
+    in_noise = [pair for pair in possible if hypotheses.within_noise(pair[0])]
+    if in_noise:
+        return min(in_noise, key=lambda pair: (pair[0].size, pair[0].total))
+    return functools.reduce(
+        lambda best, pair: pair if is_preferred(pair[0], best[0], band) else best, possible
+    )
 
 
 def residual_changes(

@@ -122,6 +122,24 @@ def test_a_smaller_set_may_leave_the_price_of_the_numbers_it_saves(
     assert (found is not None and found.effects == leak.effects) == is_smaller
 
 
+@pytest.mark.parametrize(("left", "is_smaller"), [(0.4, True), (1.5, False)])
+def test_of_sets_that_leave_noise_beside_a_geometry_the_simplest_is_taken(
+    rig: Rig, left: float, is_smaller: bool
+) -> None:
+    """A dead volume of 1.7 tolerances was named: the shapes of a sag had adapted to the pipe."""
+    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig, c_internal=2e-12)]
+    s = searched(runs[0].rig, *runs, "internal_leakage", "dead_volume")
+    leak = s.set_of("internal_leakage")
+    volume = at_start(s.hypotheses.train_data.rig, make("dead_volume", "joint 2 rod"))
+    both = s.hypotheses.refined([*leak.effects, volume])
+    band = s.hypotheses.noise_band
+    smaller = replace(leak, excess_energy={e: left * v for e, v in band.items()})
+    larger = replace(both, excess_energy={e: 0.01 * v for e, v in band.items()})
+    nowhere = np.zeros(len(runs[0].rig.uncertain_numbers))
+    found, _ = geometry._simplest(s.hypotheses, [(larger, nowhere), (smaller, nowhere)])
+    assert (found is smaller) == is_smaller
+
+
 def test_a_gain_far_beyond_the_tolerance_of_an_area_is_still_named(rig: Rig) -> None:
     train, held_out = pair_of_runs(rig)
 
