@@ -30,7 +30,7 @@ from analysis.trace.in_motion import find, held_out_ratios, joints_with_friction
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.curves import CurveRange
 from analysis.trace.judge.unrepeated import phase_notes, unlocked_lines, unrepeated_notes
-from analysis.trace.judging import Candidates, noise_beside_effects, unstated_noise
+from analysis.trace.judging import Candidates
 from analysis.trace.next_experiment.detection_limits import (
     absorbed_effects,
     detection_limit_notes,
@@ -58,6 +58,7 @@ from analysis.trace.search.hypothesis import Hypothesis, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.settings import SEARCH, TRACE
+from analysis.trace.unmeasured_noise import noise_beside_effects, unstated_noise
 from analysis.trace.words import sentence, tolerated_error_notes
 from analysis.workers.pool import Pool, Serial
 from rig.model.parse import InputError

@@ -6,14 +6,10 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
-from analysis.trace.clues.dependence import BY_BALANCE, clues_to
-from analysis.trace.data.candidates import at_start, effect_in
-from analysis.trace.data.conditioned_record import model_rows
-from analysis.trace.data.noise_floor import ABOVE, NEIGHBOURS, STATED, floors
+from analysis.trace.data.candidates import effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
@@ -27,12 +23,10 @@ from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended_in, with_parts_beside
 from analysis.trace.search.forward_search import search
-from analysis.trace.search.hypothesis import Hypothesis, effect_of
+from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import DATA, SEARCH
+from analysis.trace.settings import SEARCH
 from analysis.workers.pool import Pool, Serial
-
-Array = NDArray[np.float64]
 
 ONLY_HELD_OUT_MISSED = (
     "the training records are met to within the noise, the held-out ones are not: train on "
@@ -302,70 +296,3 @@ class Judge:
         )
         within = all(removed[e] >= acting for e in equations)
         return after <= SEARCH.further_share * before and within
-
-
-def unstated_noise(finding: Finding) -> dict[str, float]:
-    """Return what `finding` leaves over the stated noise, by equation, where nothing repeats.
-
-    Equations whose noise a step shows by repeats, periods or neighbouring states keep their floors.
-    Empty where each has one, where more than `DATA.unstated_ratio` floors is left, where a variable
-    of the records removes a part of that from held-out records, or an effect that the gates refuse.
-    """
-    data = finding.rows.train
-    measured = {f.equation for f in data.floors if f.source not in (STATED, ABOVE)}
-    refused = any(map(gates.removes, gates.refused_effects(finding.effects)))
-    if finding.verdict != UNEXPLAINED or refused:
-        return {}
-    winner = _with_tied_effects(finding)
-    over_stated = {(f.group, f.equation): f.noise / f.stated for f in data.floors}
-    left: dict[str, list[Array]] = {}
-    stated: dict[str, list[Array]] = {}
-    for s in data.segments:
-        if s.equation not in measured:
-            residual = winner.fit.residual[s.where]
-            left.setdefault(s.equation, []).append(residual)
-            stated.setdefault(s.equation, []).append(residual * over_stated[s.group, s.equation])
-    if not left or max(map(_rms, left.values())) > DATA.unstated_ratio:
-        return {}
-    clues, formulas = clues_to(data, finding.rows.choosing, winner, ())
-    # Noise of a variable that the balance gives is in the residual as it is in the variable.
-    causes = [clue for clue in clues if not clue.words.endswith(BY_BALANCE)]
-    if formulas or any(clue.share > DATA.unstated_clue for clue in causes):
-        return {}
-    return {name: max(1.0, _rms(parts)) for name, parts in stated.items()}
-
-
-def _rms(parts: Sequence[Array]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-
-
-def noise_beside_effects(finding: Finding) -> dict[str, float]:
-    """Return the noise by neighbouring states of what the named effects leave, over the stated.
-
-    It is given by equation.
-
-    Without dry friction the residual jumps with the direction of motion between two such states: a
-    floor was 20 times too large, and a constant force beside the friction was lost in it. Equations
-    whose noise does not get smaller than `DATA.finer_noise` of what it was are left out.
-    """
-    data, fit = finding.rows.train, finding.winner.fit
-    before = {(f.group, f.equation): f.noise for f in data.floors if f.source == NEIGHBOURS}
-    if not before or finding.verdict not in (EXPLAINED, CONFOUNDED):
-        return {}
-    rows = [model_rows(data.rig, fit.terms, record) for record in data.records]
-    after = floors(data.rig, fit.terms, data.records, rows, fit.beta)
-    ratios: dict[str, list[float]] = {}
-    for floor in after:
-        noise = before.get((floor.group, floor.equation))
-        if noise is not None and floor.noise < DATA.finer_noise * noise:
-            ratios.setdefault(floor.equation, []).append(floor.noise / floor.stated)
-    return {e: float(np.sqrt(np.mean(np.square(values)))) for e, values in ratios.items()}
-
-
-def _with_tied_effects(finding: Finding) -> Hypothesis:
-    """Return the set of a finding with effects that only a tied rival keeps from being named."""
-    passing = [effect_of(f.name, f.at) for f in finding.effects if gates.passes_gates(f)]
-    if len(passing) == len(finding.winner.effects):
-        return finding.winner
-    rig = finding.rows.train.rig
-    return finding.hypotheses.refined([at_start(rig, effect) for effect in passing])

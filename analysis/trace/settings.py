@@ -235,6 +235,18 @@ class DataSettings:
     unstated_ratio: float = 2.5
     """What the model leaves over the stated noise, up to which it counts as noise where nothing
     repeats and it follows no variable of the records (convention: twice, and its scatter)."""
+    steady_ratio: float = 10.0
+    """The same of a residual that is as large at rest as in motion (convention: twice the stated
+    noise behind a pole at 25 Hz is seven times the stated one in rows up to 15 Hz)."""
+    motion_window: float = 0.5
+    """Length [s] of the parts of records whose motion and residual are compared."""
+    motion_ratio: float = 1.5
+    """The rms of a residual in the third of these parts with most motion over that with least, up
+    to which it does not follow the motion (noise alone: up to 1.3; other causes: 2 and more)."""
+    motion_contrast: float = 2.0
+    """The same ratio of the motion, below which a residual does not show whether it follows it."""
+    least_windows: int = 12
+    """Number of these parts below which they show nothing."""
     unstated_clue: float = 0.25
     """Share of that energy which a variable removes from held-out records, from which it is no
     noise (tuned: noise in the regressors alone makes 0.1)."""

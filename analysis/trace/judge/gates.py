@@ -46,8 +46,9 @@ from rig.model.units import plain, with_interval
 Array = NDArray[np.float64]
 
 
-REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL, FREE_RUN = (
+REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL, FREE_RUN, BESIDE_UNKNOWN = (
     "removes on held-out", "physical", "invariant", "significant", "no rival", "free run",
+    "beside an unknown cause",
 )  # fmt: skip
 ZERO_IN_INTERVAL = ", but its size may be zero: another effect there shares its force or flow"
 
@@ -55,6 +56,11 @@ ZERO_IN_INTERVAL = ", but its size may be zero: another effect there shares its 
 def passes_gates(effect: JudgedEffect) -> bool:
     """Return whether an effect passes every gate but that of rivals, which makes it confounded."""
     return all(gate.ok for gate in effect.gates if gate.name != NO_RIVAL)
+
+
+def passes_but_beside_unknown_cause(effect: JudgedEffect) -> bool:
+    """Return whether nothing but an unknown cause keeps an effect from being named."""
+    return all(gate.ok for gate in effect.gates if gate.name not in (NO_RIVAL, BESIDE_UNKNOWN))
 
 
 def removes(effect: JudgedEffect) -> bool:
@@ -318,10 +324,8 @@ def judged_beside_unknown_cause(
         used = used_by_key[effect.name, effect.at]
         why = together or problem([used]) or _size_includes_zero(data.rig, used, effect)
         tied = tied_in_held_out(effect)
-        if not why:
-            return tied
-        gates = (Gate(REMOVES, False, why) if g.name == REMOVES else g for g in tied.gates)
-        return replace(tied, gates=tuple(gates))
+        gate = Gate(BESIDE_UNKNOWN, not why, why or "the equations that are explained show it too")
+        return replace(tied, gates=(*tied.gates, gate))
 
     return tuple(map(refused, effects))
 

@@ -29,7 +29,7 @@ from analysis.trace.data.conditioned_record import ConditionedRecord, conditione
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.trace_rows import TraceRuns
 from analysis.trace.judge import gates, held_out, inference
-from analysis.trace.result import EXPLAINED, UNEXPLAINED, Trace
+from analysis.trace.result import CLEAN, EXPLAINED, UNEXPLAINED, Trace
 from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended, extended_in
@@ -507,6 +507,20 @@ def noise_that_is_not_white_is_measured_by_the_repeats_of_other_steps(b: Benches
     assert unknown["torque_2"].source == noise_floor.ABOVE
 
 
+def noise_as_large_at_rest_as_in_motion_is_noise(b: Benches) -> None:
+    """Four times the stated noise behind a pole at 10 Hz; the joint moves in half of the record."""
+
+    def once(seed: int) -> Run:
+        rng = np.random.default_rng(seed)
+        wave, lines = multisine(rng, b.rig.sample_rate, 8.0, 9.5)
+        moving = np.where(np.arange(len(wave)) < len(wave) // 2, 1.0, 0.2)
+        run = synthetic_run(b.rig, rng, (wave * moving, lines), rms=0.025, repeats=1, seconds=8.0)
+        return with_filtered_noise(run, 4.0, corner=10.0)
+
+    names = ("coulomb_friction", "base_inclination", "internal_leakage")
+    assert b.traced((once(1), once(5)), *names).verdict == CLEAN
+
+
 def shaken(b: Benches, wave: Callable[[Array], Array]) -> tuple[RegressionData, dict[str, float]]:
     """Return the rows of a record whose piston 2 is shaken by wave(time) [m], and the noise above.
 
@@ -973,6 +987,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_above_the_measured_one_is_noise_where_nothing_repeats, ("unstated noise",)),
     (noise_that_falls_with_frequency_is_noise_where_nothing_repeats, ("noise above the rows",)),
     (noise_that_is_not_white_is_measured_by_the_repeats_of_other_steps, ("noise with a memory",)),
+    (noise_as_large_at_rest_as_in_motion_is_noise, ("steady noise",)),
     (what_lies_above_the_rows_alone_is_no_noise_of_the_rows, ("noise in the residual",)),
     (a_hum_above_the_rows_is_no_noise_of_the_rows, ("hum above the rows",)),
     (neighbouring_states_show_no_less_than_the_white_noise_of_the_sensors,

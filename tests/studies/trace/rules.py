@@ -21,7 +21,15 @@ from analysis.effects.supply import LineDrop
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
 from analysis.signals.settings import SIGNALS
-from analysis.trace import engine, finding, fitted_model, free_forms, in_motion, judging
+from analysis.trace import (
+    engine,
+    finding,
+    fitted_model,
+    free_forms,
+    in_motion,
+    judging,
+    unmeasured_noise,
+)
 from analysis.trace.data import noise_floor, regression_data, trace_rows
 from analysis.trace.judge import alternatives, gates, held_out, inference, rivals
 from analysis.trace.search import exchanges, extensions, forward_search, linear_fit
@@ -230,6 +238,8 @@ RULES: Final = (
          (setting("viscosity_change", 0.0), setting("bulk_change", 0.0))),
     Rule("unstated noise", "where nothing repeats, noise is at most that above the rows",
          ((engine, "unstated_noise", lambda *_: {}),)),
+    Rule("steady noise", "more than 2.5 floors that no effect explains are never noise",
+         ((unmeasured_noise, "_follows_motion", lambda *_: True),)),
     Rule("unphysical companion", "all effects of a set with an unphysical one are refused",
          ((judging.Judge, "_unphysical_of", lambda *_: []),)),
     Rule("narrower rows", "what rows of all frequencies leave unexplained stays so",
