@@ -303,7 +303,7 @@ class MappedModule:
         """
         self._link.open()
         try:
-            self.write(np.zeros(len(self._map.outputs)))
+            self._write_zeros()
             self._set_watchdog()
         except DeviceError:
             self._link.close()
@@ -355,9 +355,12 @@ class MappedModule:
         """Put every output to zero without setting the watchdog; closes the connection."""
         self._link.open()
         try:
-            self.write(np.zeros(len(self._map.outputs)))
+            self._write_zeros()
         finally:
             self._link.close()
+
+    def _write_zeros(self) -> None:
+        self.write(np.zeros(len(self._map.outputs)))
 
     @contextmanager
     def _naming_registers(self, registers: str) -> Iterator[None]:

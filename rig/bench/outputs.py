@@ -32,6 +32,21 @@ Result = TypeVar("Result")
 UNSURE: Final = "outputs not confirmed at zero"
 
 
+def zero_patiently(driver: Driver) -> None:
+    """Zero the outputs; a device that refuses, as a busy one does, is asked again for a while.
+
+    Raises DeviceLost at once, the last refusal (DeviceError) after `BENCH.zero_patience`.
+    """
+    deadline = time.monotonic() + BENCH.zero_patience
+    while True:
+        try:
+            return driver.zero_outputs()
+        except DeviceError as error:
+            if isinstance(error, DeviceLost) or time.monotonic() > deadline:
+                raise
+        time.sleep(BENCH.zero_pause)
+
+
 class Outputs:
     """The outputs of one device: zeroing them, and a wrapper for every other call."""
 
@@ -67,24 +82,18 @@ class Outputs:
         self._armed_from = None
         if not self._connected:
             return False
-        attempts = 1 if self._silent else BENCH.zero_attempts
-        deadline = time.monotonic() + BENCH.zero_patience
-        while True:
+        problem: BaseException | None = None
+        for _ in range(1 if self._silent else BENCH.zero_attempts):
             try:
-                self.driver.zero_outputs()
+                zero_patiently(self.driver)
             except (Exception, SystemExit) as error:
                 problem = error
+                if isinstance(error, DeviceError) and not isinstance(error, DeviceLost):
+                    break  # it has refused for long enough
             else:
                 self._silent = self._logged = False
                 self._at_zero = True
                 return True
-            attempts -= 1
-            if isinstance(problem, DeviceError) and not isinstance(problem, DeviceLost):
-                if time.monotonic() > deadline:
-                    break
-                time.sleep(BENCH.zero_pause)  # it answers, and may be ready soon
-            elif attempts <= 0:
-                break
         self._at_zero = False
         if not self._logged:
             log.error(

@@ -132,32 +132,19 @@ class BenchStop(threading.Thread):
         that.
         """
         from drivers.base import DeviceError
+        from rig.bench.outputs import zero_patiently
 
         try:
-            self._zero_once(driver)
+            zero_patiently(driver)
         except DeviceError:
             if holder is None:
                 raise
             _await_end(wire, holder)
-            self._zero_once(driver)
+            zero_patiently(driver)
         self.answered.set()
         for _ in range(ZEROS - 1 if holder is None else 0):
             time.sleep(BETWEEN_ZEROS)
             driver.zero_outputs()
-
-    @staticmethod
-    def _zero_once(driver: Driver) -> None:
-        """Zero the outputs; a device that refuses, as a busy one does, is asked again."""
-        from drivers.base import DeviceError, DeviceLost
-
-        for _ in range(ZEROS - 1):
-            try:
-                return driver.zero_outputs()
-            except DeviceLost:
-                raise
-            except DeviceError:
-                time.sleep(BETWEEN_ZEROS)
-        return driver.zero_outputs()
 
 
 def _warn_of_silence(stops: list[BenchStop]) -> None:
