@@ -70,16 +70,14 @@ class Commands:
         """Zero the outputs of the bench of a run that does not answer, by the verb `stop`."""
         if not snapshot.wire:
             return
-        shown = asked
 
         def changed(job: VerbJob) -> None:
-            nonlocal shown
+            if self.stop_asked is None or self.stop_asked.at != asked.at:
+                return  # another stop was asked since
             ended = StopAnswer.FAILED if job.code else StopAnswer.ZEROED
             answer = StopAnswer.DEVICE if job.code is None else ended
-            newest = replace(asked, answer=answer, reason=job.ended)
-            if self.stop_asked == shown:  # no other stop was asked since
-                self.stop_asked = shown = newest
-                self.redraw()
+            self.stop_asked = replace(asked, answer=answer, reason=job.ended)
+            self.redraw()
 
         rig = rig_of_run(snapshot.run, snapshot.rig)
         begin(("stop", "--rig", rig, "--endpoint", snapshot.wire), changed)
