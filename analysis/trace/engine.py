@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from analysis.effects.base import Effect, ordered
 from analysis.effects.disturbance import PeriodicDisturbance
@@ -171,7 +171,7 @@ class _Options:
     seed: int
     look_ahead: bool
     free_forms: bool
-    pool: Pool = field(default_factory=Serial)
+    pool: Pool
 
 
 @dataclass(frozen=True)

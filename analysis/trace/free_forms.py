@@ -147,15 +147,16 @@ def _named_beside_unknown_cause(finding: Finding, above: Collection[str]) -> Fin
     """
     hypotheses, winner = finding.hypotheses, finding.winner
     effects = gates.judged_beside_unknown_cause(hypotheses, winner, finding.effects, above)
-    named = all(map(gates.passes_gates, effects)) and not _altered(hypotheses, winner) & set(above)
+    outside = _altered(hypotheses.empty, winner).isdisjoint(above)
+    named = outside and all(map(gates.passes_gates, effects))
     return replace(finding, effects=effects) if named else None
 
 
-def _altered(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> set[str]:
-    """Return the equations of whose energy a set removes a visible share."""
-    start = hypotheses.empty.excess_energy
-    left = hypothesis.excess_energy
-    return {e for e, v in start.items() if v - left[e] >= SEARCH.altered_share * v > 0.0}
+def _altered(start: Hypothesis, other: Hypothesis) -> set[str]:
+    """Return the equations of which `other` removes a visible share of what `start` leaves."""
+    before = start.excess_energy
+    removed = {e: before[e] - v for e, v in other.excess_energy.items() if before[e] > 0.0}
+    return {e for e, v in removed.items() if v >= SEARCH.altered_share * before[e]}
 
 
 def _explains_what_it_alters(
@@ -165,11 +166,7 @@ def _explains_what_it_alters(
 
     Held-out records judge the others, whose residual may be too small to refuse the set.
     """
-    removed = {e: start.excess_energy[e] - v for e, v in other.excess_energy.items()}
-    return all(
-        hypotheses.negligible(e, v) or removed[e] < SEARCH.altered_share * start.excess_energy[e]
-        for e, v in other.excess_energy.items()
-    )
+    return all(hypotheses.negligible(e, other.excess_energy[e]) for e in _altered(start, other))
 
 
 def _simplest_first(hypotheses: HypothesisSet, sets: Sequence[Hypothesis]) -> list[Hypothesis]:

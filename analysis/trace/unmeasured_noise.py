@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.solve import numbered, sums_of
 from analysis.trace.clues.dependence import BY_BALANCE, clues_to
 from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import model_rows
@@ -70,21 +71,23 @@ def _follows_motion(data: RegressionData, winner: Hypothesis, equation: str) -> 
     be at most `DATA.motion_ratio` times that in its lower third. Motions that are less than
     `DATA.motion_contrast` times as large there show nothing, and windows that are too few.
     """
-    energy: list[Array] = []
-    motion: list[Array] = []
+    of_group = {
+        conditioned.group: (conditioned, rows)
+        for conditioned, rows in zip(data.records, data.rows, strict=True)
+    }
+    parts = []
     for segment in data.segments:
-        if segment.equation != equation:
-            continue
-        for conditioned, rows in zip(data.records, data.rows, strict=True):
-            if conditioned.group == segment.group:
-                time = rows[equation].time
-                window = np.floor(time / DATA.motion_window).astype(np.int64)
-                squares = winner.fit.residual[segment.where] ** 2
-                energy.append(_means(window, squares[:, None])[:, 0])
-                motion.append(_means(window, _motion(conditioned, time) ** 2))
-    if sum(map(len, energy)) < DATA.least_windows:
+        if segment.equation == equation:
+            conditioned, rows = of_group[segment.group]
+            time, residual = rows[equation].time, winner.fit.residual[segment.where]
+            squares = np.column_stack((residual, _motion(conditioned, time))) ** 2
+            window = np.floor(time / DATA.motion_window).astype(np.int64)
+            _, number = numbered(window)
+            parts.append(sums_of(squares, number) / np.bincount(number)[:, None])
+    means = np.vstack(parts)
+    if len(means) < DATA.least_windows:
         return True
-    energies, motions = np.concatenate(energy), np.vstack(motion)
+    energies, motions = means[:, 0], means[:, 1:]
     least, most = np.quantile(motions, (1 / 3, 2 / 3), axis=0)
     shown = []
     for m, low, high in zip(motions.T, least, most, strict=True):
@@ -100,14 +103,6 @@ def _motion(conditioned: ConditionedRecord, time: Array) -> Array:
     changes = (np.gradient(p, axis=0) for p in (signals.p_cap, signals.p_rod))
     kinds = (signals.qd, signals.u, *changes)
     return np.column_stack([kind[np.ix_(at, signals.moving)] for kind in kinds])
-
-
-def _means(window: NDArray[np.int64], values: Array) -> Array:
-    """Return the means (w, k) of values (m, k) in each window (m,)."""
-    number = np.unique(window, return_inverse=True)[1]
-    sums = np.zeros((number.max(initial=-1) + 1, values.shape[1]))
-    np.add.at(sums, number, values)
-    return np.asarray(sums / np.bincount(number)[:, None])
 
 
 def noise_beside_effects(finding: Finding) -> dict[str, float]:

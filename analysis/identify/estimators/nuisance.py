@@ -252,7 +252,8 @@ def implausible(prior: Prior, fit: EquationFit, error: CovarianceParts) -> bool:
     """Return whether the data contradict prior knowledge, as another effect in the column does."""
     h, deviations = prior.h, IDENTIFY.implausible_deviations
     of_both = deviations**2 * (prior.std**2 + float(h @ error.covariance @ h))
-    return bool((h @ fit.beta) ** 2 > max(of_both, 4.0 * variance_by_rows(fit, error, h)))
+    of_interval = 2.0**2 * variance_by_rows(fit, error, h)
+    return bool((h @ fit.beta) ** 2 > max(of_both, of_interval))
 
 
 @dataclass(frozen=True)

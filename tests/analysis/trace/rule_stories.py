@@ -34,6 +34,7 @@ from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended, extended_in
 from analysis.trace.settings import DATA
+from analysis.workers.pool import Serial
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Record, Run, of_bandwidth
@@ -633,7 +634,7 @@ def slow_rows_show_what_noise_of_the_acceleration_hides(b: Benches) -> None:
     terms = baseline_terms(b.rig)
     records = TraceRuns(b.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
     candidates = gate_cases.at_joint_2(b.rig, "joint_spring", "base_inclination")
-    options = engine._Options(candidates, 0, look_ahead=False, free_forms=False)
+    options = engine._Options(candidates, 0, look_ahead=False, free_forms=False, pool=Serial())
     wide = engine._traced(records, options, lambda _: None)
     assert wide.effects == ()
     # Where the wide rows keep a little more than noise, the narrower ones are asked.

@@ -22,6 +22,8 @@ from analysis.trace.result import Trace
 from analysis.trace.search import geometry
 from analysis.trace.search.exact_fit import fit_coefficients
 from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set, residual_changes
+from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -102,23 +104,28 @@ def test_records_are_traced_again_only_where_the_other_geometry_leaves_little(
     assert len(traces) == 1
 
 
+def a_leak_and(rig: Rig, name: str, where: str) -> tuple[HypothesisSet, Hypothesis, Hypothesis]:
+    """Return the sets of a bench with a leak: that of the leak, and that with a second effect."""
+    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig, c_internal=2e-12)]
+    s = searched(runs[0].rig, *runs, "internal_leakage", name)
+    leak, second = s.set_of("internal_leakage"), at_start(runs[0].rig, make(name, where))
+    return s.hypotheses, leak, s.hypotheses.refined([*leak.effects, second])
+
+
 @pytest.mark.parametrize(("share", "is_smaller"), [(0.5, True), (1.5, False)])
 def test_a_smaller_set_may_leave_the_price_of_the_numbers_it_saves(
     rig: Rig, share: float, is_smaller: bool
 ) -> None:
     """A leak was named with a gain within the area's tolerance: alone it left 1 % more."""
-    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig, c_internal=2e-12)]
-    s = searched(runs[0].rig, *runs, "internal_leakage", "sensor_gain")
-    data, leak = s.hypotheses.train_data, s.set_of("internal_leakage")
-    gain = at_start(data.rig, make("sensor_gain", "joint 2 cap"))
-    both = s.hypotheses.refined([*leak.effects, gain])
+    sets, leak, both = a_leak_and(rig, "sensor_gain", "joint 2 cap")
+    data = sets.train_data
     changes = residual_changes(data, both.fit, data.rig.uncertain_numbers)
     _, left = geometry.likeliest(data, leak, changes)
     price = SEARCH.number_price * (sum(both.size) - sum(leak.size))
     winner = replace(both, excess_energy={e: v - share * price for e, v in left.items()})
-    s.hypotheses.fitted = {leak.keys: leak, winner.keys: winner}
-    s.hypotheses.noise_band = dict.fromkeys(left, -np.inf)
-    found = geometry_for_smaller_set(s.hypotheses, winner, explained=True)
+    sets.fitted = {leak.keys: leak, winner.keys: winner}
+    sets.noise_band = dict.fromkeys(left, -np.inf)
+    found = geometry_for_smaller_set(sets, winner, explained=True)
     assert (found is not None and found.effects == leak.effects) == is_smaller
 
 
@@ -127,16 +134,12 @@ def test_of_sets_that_leave_noise_beside_a_geometry_the_simplest_is_taken(
     rig: Rig, left: float, is_smaller: bool
 ) -> None:
     """A dead volume of 1.7 tolerances was named: the shapes of a sag had adapted to the pipe."""
-    runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig, c_internal=2e-12)]
-    s = searched(runs[0].rig, *runs, "internal_leakage", "dead_volume")
-    leak = s.set_of("internal_leakage")
-    volume = at_start(s.hypotheses.train_data.rig, make("dead_volume", "joint 2 rod"))
-    both = s.hypotheses.refined([*leak.effects, volume])
-    band = s.hypotheses.noise_band
+    sets, leak, both = a_leak_and(rig, "dead_volume", "joint 2 rod")
+    band = sets.noise_band
     smaller = replace(leak, excess_energy={e: left * v for e, v in band.items()})
     larger = replace(both, excess_energy={e: 0.01 * v for e, v in band.items()})
-    nowhere = np.zeros(len(runs[0].rig.uncertain_numbers))
-    found, _ = geometry._simplest(s.hypotheses, [(larger, nowhere), (smaller, nowhere)])
+    nowhere = np.zeros(len(sets.train_data.rig.uncertain_numbers))
+    found, _ = geometry._simplest(sets, [(larger, nowhere), (smaller, nowhere)])
     assert (found is smaller) == is_smaller
 
 
