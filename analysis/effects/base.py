@@ -250,6 +250,12 @@ class Effect(Term):
         """Return `inseparable`, with those that hold beside the `others` of a set on a rig."""
         return self.inseparable(shape)
 
+    def usual_beside(
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Used]
+    ) -> tuple[tuple[str, str], ...]:
+        """Return those of `inseparable_beside` that are the usual cause of the same records."""
+        return ()
+
     def alike_together(self, rig: Rig) -> tuple[tuple[str, str], ...]:
         """Return two effects, as (name, where), that together nearly act as this one; else ()."""
         return ()

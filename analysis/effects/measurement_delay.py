@@ -92,6 +92,12 @@ class TimingError(Sensor):
             return ()
         return tuple(("spool_lag", f"joint {i}") for i in range(1, len(rig.joints) + 1))
 
+    def usual_beside(
+        self, rig: Rig, shape: Sequence[float], others: Sequence[Used]
+    ) -> tuple[tuple[str, str], ...]:
+        """Return the lags of all spools: of valves of one type whose command is recorded."""
+        return self.inseparable_beside(rig, shape, others)
+
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State that a position half a sample late may be a command that is held, and recorded so.
 

@@ -9,21 +9,21 @@ import numpy as np
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import effect_in
+from analysis.trace.data.candidates import at_start, effect_in
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import TraceRows
 from analysis.trace.finding import Finding, Remainder, has_tied_rival, remainder_notes, remainders
 from analysis.trace.free_forms import explained_by_free_form
 from analysis.trace.judge import gates, readings
-from analysis.trace.judge.gates import judged_beside_unknown_cause
-from analysis.trace.judge.rivals import best_tied_set, cost
+from analysis.trace.judge.gates import judged_beside_unknown_cause, with_rivals
+from analysis.trace.judge.rivals import best_tied_set, cost, replaced_as_rivals
 from analysis.trace.judge.unrepeated import unrepeated_floors
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, JudgedEffect
 from analysis.trace.search.exact_trials import improved_by_exact_trials
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended_in, with_parts_beside
 from analysis.trace.search.forward_search import search
-from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis import Hypothesis, Key, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
 from analysis.workers.pool import Pool, Serial
@@ -145,7 +145,7 @@ class Judge:
         if finding.verdict == UNEXPLAINED:
             finding = self._under_other_names(winner, simplest) or finding
         if finding.verdict == CONFOUNDED:
-            finding = self._best_tied_set(finding)
+            finding = self._usual_cause(self._best_tied_set(finding))
         by_free_form = explained_by_free_form(finding, self.free, self.rng)
         if by_free_form is None and finding.verdict == UNEXPLAINED:
             return replace(finding, effects=(*finding.effects, *self._refused_as_unphysical()))
@@ -180,6 +180,35 @@ class Judge:
         Only the gates of removed energy and of physics count; rivals do not matter for an effect
         that is refused as unphysical.
         """
+    def _usual_cause(self, finding: Finding) -> Finding:
+        """Return the finding with the usual cause of the same records named in place of effects.
+
+        It takes their place if it passes the gates and fits as well. They remain its rivals.
+        """
+        for keys, replaced in self._usual_causes(finding.winner).items():
+            others = [used for used in finding.winner.effects if used not in replaced]
+            usual = (at_start(self.rows.train.rig, effect_of(*key)) for key in keys)
+            cause = self.hypotheses.refined([*others, *usual])
+            rivals = replaced_as_rivals(self.hypotheses, finding.winner, cause, self.choosing)
+            judged = self.apply_gates(cause) if rivals else finding
+            if judged.verdict != UNEXPLAINED and set(keys) <= judged.winner.keys:
+                effects = tuple(
+                    with_rivals(f, [*rivals, *f.rivals]) if (f.name, f.at) in keys else f
+                    for f in judged.effects
+                )
+                return replace(judged, effects=effects, verdict=CONFOUNDED)
+        return finding
+
+    def _usual_causes(self, winner: Hypothesis) -> dict[tuple[Key, ...], list[Used]]:
+        """Return the effects of a set that have a usual cause in their place, by that cause."""
+        causes: dict[tuple[Key, ...], list[Used]] = {}
+        for used in winner.effects:
+            beside = winner.without(used)
+            keys = effect_in(used).usual_beside(self.rows.train.rig, used.shape, beside)
+            if keys and not winner.keys & set(keys):
+                causes.setdefault(keys, []).append(used)
+        return causes
+
         explaining = [
             o for o in self.hypotheses.fitted.values()
             if o.effects and self.hypotheses.within_form_tolerance(o)

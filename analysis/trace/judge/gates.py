@@ -357,8 +357,14 @@ def tied_in_held_out(effect: JudgedEffect) -> JudgedEffect:
 
     With an unknown cause in the training records, their residuals are no evidence.
     """
-    rivals = [replace(r, tied=r.tied or r.ratio < TRACE.tie_ratio) for r in effect.rivals]
-    rivals.sort(key=lambda r: not r.tied)
+    return with_rivals(
+        effect, [replace(r, tied=r.tied or r.ratio < TRACE.tie_ratio) for r in effect.rivals]
+    )
+
+
+def with_rivals(effect: JudgedEffect, rivals: Sequence[Rival]) -> JudgedEffect:
+    """Return an effect with these rivals, tied ones first; any of them fails its gate."""
+    rivals = sorted(rivals, key=lambda r: not r.tied)
     if not any(r.tied for r in rivals):
         return effect
     other_gates = [gate for gate in effect.gates if gate.name != NO_RIVAL]

@@ -170,6 +170,29 @@ class _Comparison:
         return out
 
 
+def replaced_as_rivals(
+    hypotheses: HypothesisSet, winner: Hypothesis, other: Hypothesis, holdout_data: RegressionData
+) -> list[Rival]:
+    """Return the effects of a set that `other` replaces, as tied rivals; none if that fits worse.
+
+    It fits as well if it loses no more than tied rivals do in the equations in which they act.
+    """
+    replaced = [used for used in winner.effects if used.term.key not in other.keys]
+    without = hypotheses.refined([used for used in winner.effects if used not in replaced])
+    equations = held_out.removed_energy(winner, without)
+    unseen, after, before = (
+        held_out_residual(holdout_data, o.fit) for o in (other, winner, without)
+    )
+    test = TieTest(holdout_data, equations, after, before)
+    if not test.ties(unseen, TRACE.tie_ratio):
+        return []
+    in_training = TieTest(
+        hypotheses.train_data, equations, winner.fit.residual, without.fit.residual
+    )
+    ratios = 1.0 / test.ratio(unseen), 1.0 / in_training.ratio(other.fit.residual)
+    return [_rival(effect_in(used), *ratios, tied=True) for used in replaced]
+
+
 def _over_its_noise(data: RegressionData, hypothesis: Hypothesis) -> Hypothesis:
     """Return a set with its residual over the noise that its effects amplify."""
     residual = over_amplified_noise(data, hypothesis.fit, hypothesis.fit.residual)

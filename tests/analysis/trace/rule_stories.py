@@ -876,6 +876,30 @@ def a_clean_bench_in_a_loop_that_oscillates_is_clean(b: Benches) -> None:
             records.append(replace(record, repeat=k, period=0))
         return Run(b.rig, tuple(records), f"swinging, seed {seed}")
 
+def spools_behind_their_recorded_commands_lag(b: Benches) -> None:
+    """Both valves answer 6 ms after the command recorded in place of the spool.
+
+    All pistons and all pressures late by 6 ms fit as well.
+    """
+
+    def ahead(record: Record) -> Record:
+        spools = {name: np.roll(record.channels[name], -3) for name in ("spool_1", "spool_2")}
+        return replace(record, channels={**record.channels, **spools})
+
+    train, held_out = (
+        replace(run, records=tuple(map(ahead, run.records)))
+        for run in with_other_volumes(b.rig, 1, 1.0, 1.0)
+    )
+    lags, delays = (catalogue(b.rig, (name,)) for name in ("spool_lag", "channel_delay"))
+    candidates = [*lags, *(d for d in delays if d.where in ("bench piston", "bench pressure"))]
+    result = engine.trace([train], [held_out], candidates, look_ahead=False, free_forms=False)
+    assert result.verdict == "confounded"
+    assert {(f.name, f.at) for f in result.effects} == {
+        ("spool_lag", "joint 1"), ("spool_lag", "joint 2")
+    }  # fmt: skip
+    assert set(result.tied_at) >= {d.key for d in candidates if d.name == "channel_delay"}
+
+
     runs = b.kept("swinging", lambda: (swinging(1, 0.03, 3), swinging(2, 0.021, 2)))
     result = b.traced(runs, "internal_leakage", "spool_lag")
     assert (result.verdict, result.effects) == ("clean", ())
@@ -971,6 +995,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (wrong_numbers_of_a_rig_file_within_their_tolerances_are_no_effect, ("tolerances",)),
     (a_high_return_pressure_is_found_beside_an_underlap, ("exact columns",)),
     (wrong_volumes_at_one_joint_name_nothing_at_the_other, ("unknown cause",)),
+    (spools_behind_their_recorded_commands_lag, ("usual cause",)),
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (equal_levels_by_direction_are_one_level, ("simpler name",)),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.friction import Friction
+from analysis.effects.measurement_delay import TimingError
 from analysis.effects.measurement_scale import SensorOffset
 from analysis.effects.supply import LineDrop
 from analysis.effects.valve import SpoolOffset
@@ -211,6 +212,8 @@ RULES: Final = (
          ((LineDrop, "inseparable_beside", lambda *_: ()),
           (SpoolOffset, "inseparable", lambda *_: ()),
           (SensorOffset, "inseparable", lambda *_: ()))),
+    Rule("usual cause", "equal delays of all pistons and pressures stay named so",
+         ((TimingError, "usual_beside", lambda *_: ()),)),
     Rule("held-out band", "any held-out error may remain", (setting("held_out_band", math.inf),)),
     Rule("held-out rows choose", "where training rows hold noise alone, they choose alone",
          ((judging, "_shown_by_held_out_rows", lambda _sets, winner, _rows: winner),)),
