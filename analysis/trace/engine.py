@@ -17,7 +17,13 @@ from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used, joint_of
 from analysis.trace.clues.dependence import clues_to
-from analysis.trace.data.candidates import catalogue, free_mechanisms
+from analysis.trace.data.candidates import (
+    at_start,
+    catalogue,
+    effect_in,
+    effects_among,
+    free_mechanisms,
+)
 from analysis.trace.data.conditioned_record import moving_filtering
 from analysis.trace.data.nuisance_terms import temperature_terms
 from analysis.trace.data.regression_data import RegressionData
@@ -172,6 +178,7 @@ class _Options:
     look_ahead: bool
     free_forms: bool
     pool: Pool
+    sets: Sequence[Sequence[Used]] = ()
 
 
 @dataclass(frozen=True)
@@ -210,6 +217,7 @@ def _prepared(records: TraceRuns, options: _Options) -> _Prepared:
         _lacking_candidates(free_mechanisms(rig), known) if options.free_forms else [],
         options.seed,
         options.pool,
+        options.sets,
     )
     return _Prepared(records, rows, as_recorded.train, candidates, baseline.model, notes)
 
@@ -412,26 +420,67 @@ def _traced_within_tolerances(
 def _traced_in_narrower_rows(
     records: TraceRuns, options: _Options, result: Trace, progress: Callable[[float], None]
 ) -> Trace | None:
-    """Return an explanation in rows of lower frequencies where a result names nothing, else None.
+    """Return a better answer in rows of lower frequencies, None where there is none.
 
-    Its effects must leave no more than noise in the judging rows of the measured bandwidth too.
+    All candidates are searched there where a result explains nothing, and where it leaves
+    `TRACE.loud_ratio` floors. Else the sets with tied rivals are compared: fewer must be tied.
+    The effects must leave no more than noise in the judging rows of the measured bandwidth too.
     """
     width = records.bandwidth
-    if result.verdict != UNEXPLAINED or result.effects or width is None:
+    if width is None:
         return None
     narrower = TRACE.narrower_bandwidth * width
+    narrower_records = records.of_bandwidth(narrower)
     try:
-        again = _traced(records.of_bandwidth(narrower), options, progress)
+        named = _named_terms(result)
+        fails = result.verdict == UNEXPLAINED or _is_loud(narrower_records, options, named)
+        if not fails:
+            sets = _sets_that_may_hold(result, narrower_records.rig)
+            if len(sets) == 1:
+                return None
+            among = list({used.term.key: effect_in(used) for s in sets for used in s}.values())
+            options = replace(options, effects=among, free_forms=False, sets=sets)
+        again = _traced(narrower_records, options, progress)
     except InputError as error:  # the longer filter leaves too few rows of short records
         log.info("not traced in rows up to %.3g Hz: %s", narrower, error)
         return None
-    if again.verdict not in (EXPLAINED, CONFOUNDED):
+    as_many = len(again.effects) == len(result.effects)
+    is_better = fails or (as_many and set(again.tied_at) < set(result.tied_at))
+    if again.verdict not in (EXPLAINED, CONFOUNDED) or not is_better:
         return None
-    named = {(effect.name, effect.at) for effect in again.effects}
-    effects = [used for used in again.model_after.terms if used.term.key in named]
-    if not _explain_judging_rows(trace_rows(records), effects):
+    if not _explain_judging_rows(trace_rows(records), _named_terms(again)):
         return None
     return replace(again, notes=(narrower_rows_note(narrower, width), *again.notes))
+
+
+def _sets_that_may_hold(result: Trace, rig: Rig) -> list[list[Used]]:
+    """Return the set of effects that a trace names, and those with a tied rival in place of one."""
+    named = {used.term.key: used for used in _named_terms(result)}
+    sets = [named]
+    for effect in result.effects:
+        others = {key: used for key, used in named.items() if key != (effect.name, effect.at)}
+        for rival in (r for r in effect.rivals if r.tied):
+            rivals = (effect_of(r.name, r.at or r.where) for r in rival.effects)
+            sets.append({**{r.key: at_start(rig, r) for r in rivals}, **others})
+    return [list(effects.values()) for effects in sets]
+
+
+def _named_terms(result: Trace) -> list[Used]:
+    """Return the effects that a trace names, with their shapes."""
+    named = {(effect.name, effect.at) for effect in result.effects}
+    return [used for used in result.model_after.terms if used.term.key in named]
+
+
+def _is_loud(records: TraceRuns, options: _Options, effects: Sequence[Used]) -> bool:
+    """Return whether a model with effects leaves `TRACE.loud_ratio` floors in the choosing rows.
+
+    Where friction is among the effects, its joint's torque balance counts in motion only.
+    """
+    records, rows = (prepared := _prepared(records, options)).records, prepared.rows
+    if joints := {e.joint for e in effects_among(effects) if e.family == "friction"}:
+        rows = trace_rows(records, moving_filtering(joints))
+    ratios = held_out_ratios(rows, _refined_on(rows, effects)[1])
+    return max(ratios.values()) >= TRACE.loud_ratio
 
 
 def _traced_in_wider_rows(

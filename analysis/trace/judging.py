@@ -39,13 +39,15 @@ ONLY_HELD_OUT_MISSED = (
 class Candidates:
     """What is searched: `named` effects, and `free` mechanisms tried where none of them explains.
 
-    `seed` draws the sign flips; `pool` computes the fits.
+    `sets` of named effects, where given, are compared in place of a search. `seed` draws the sign
+    flips; `pool` computes the fits.
     """
 
     named: Sequence[Effect]
     free: Sequence[Effect]
     seed: int
     pool: Pool = field(default_factory=Serial)
+    sets: Sequence[Sequence[Used]] = ()
 
 
 def search_and_judge(
@@ -60,8 +62,12 @@ def search_and_judge(
     in_noise = hypotheses.within_noise(hypotheses.empty)
     if in_noise and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
         return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    found = exchanged(hypotheses, search(hypotheses))
-    winner = improved_by_exact_trials(hypotheses, found)
+    if candidates.sets:
+        hypotheses.compute_columns()
+        winner = hypotheses.best([*map(hypotheses.refined, candidates.sets)])
+    else:
+        found = exchanged(hypotheses, search(hypotheses))
+        winner = improved_by_exact_trials(hypotheses, found)
     if in_noise:
         winner = _shown_by_held_out_rows(hypotheses, winner, choosing)
     rng = np.random.default_rng(candidates.seed)
@@ -174,12 +180,6 @@ class Judge:
         all_pass = best.keys <= other.winner.keys
         return other if all_pass and other.verdict == CONFOUNDED else finding
 
-    def _refused_as_unphysical(self) -> tuple[JudgedEffect, ...]:
-        """Return the refused effects of the simplest set that explains with an unphysical number.
-
-        Only the gates of removed energy and of physics count; rivals do not matter for an effect
-        that is refused as unphysical.
-        """
     def _usual_cause(self, finding: Finding) -> Finding:
         """Return the finding with the usual cause of the same records named in place of effects.
 
@@ -209,6 +209,12 @@ class Judge:
                 causes.setdefault(keys, []).append(used)
         return causes
 
+    def _refused_as_unphysical(self) -> tuple[JudgedEffect, ...]:
+        """Return the refused effects of the simplest set that explains with an unphysical number.
+
+        Only the gates of removed energy and of physics count; rivals do not matter for an effect
+        that is refused as unphysical.
+        """
         explaining = [
             o for o in self.hypotheses.fitted.values()
             if o.effects and self.hypotheses.within_form_tolerance(o)

@@ -236,8 +236,8 @@ def narrower_rows_note(narrower: float, width: float) -> str:
     """State the bandwidths [Hz] with and without which the effects are named."""
     return (
         f"the effects are named with rows for a motion up to {plain(narrower, 2)} Hz; in those for "
-        f"the measured bandwidth of {plain(width, 2)} Hz, which they explain to within the noise, "
-        "noise of the accelerations hides them (`bandwidth` of the manifest)"
+        f"the whole motion, up to {plain(width, 2)} Hz, which they explain to within the noise, "
+        "noise of the accelerations hides them or their difference from others"
     )
 
 

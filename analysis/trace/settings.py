@@ -86,6 +86,9 @@ class TraceSettings:
     """Bandwidth of records whose residual is unexplained, over the measured one, with which they
     are traced again: the noise of an acceleration grows with frequency and hides slow effects
     (tuned: a spring left 1.6 noise floors in rows up to 14 Hz, 4.7 in those up to 6 Hz)."""
+    loud_ratio: float = 2.0
+    """Noise floors in these rows from which a clean result is traced again there (tuned: effects
+    that wide rows hide leave 2.6 to 3.8, sensors' errors of 0.1 % up to 1.5)."""
     wider_bandwidth: float = 10.0
     """Bandwidth [Hz] of the rows in which repeats of a clean result are searched for torques that
     do not follow the motion: rows up to 15 Hz (convention)."""

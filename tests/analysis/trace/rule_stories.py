@@ -625,25 +625,41 @@ def a_leak_is_not_refused_for_a_friction_that_would_drive(b: Benches) -> None:
 
 def slow_rows_show_what_noise_of_the_acceleration_hides(b: Benches) -> None:
     """Sensors eight times as noisy as stated hide a spring in rows up to 15 Hz."""
-    hidden = foreign_bench.Hidden(spring=6.0)
-    train, held_out = (
-        with_filtered_noise(replace(run, records=run.records[:1]), 8.0, 1e4)
-        for run in b.kept("soft", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
-    )
-    train, held_out = of_bandwidth((train, held_out), 10.0)
-    terms = baseline_terms(b.rig)
-    records = TraceRuns(b.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
-    candidates = gate_cases.at_joint_2(b.rig, "joint_spring", "base_inclination")
-    options = engine._Options(candidates, 0, look_ahead=False, free_forms=False, pool=Serial())
-    wide = engine._traced(records, options, lambda _: None)
-    assert wide.effects == ()
-    # Where the wide rows keep a little more than noise, the narrower ones are asked.
-    unexplained = replace(wide, verdict=UNEXPLAINED)
-    again = engine._traced_in_narrower_rows(records, options, unexplained, lambda _: None)
+    wide, again = _in_slow_rows(b, "soft", foreign_bench.Hidden(spring=9.0), GRAVITY)
+    assert (wide.verdict, wide.effects) == (CLEAN, ())
     assert again is not None
     named = {*again.tied_at, *((e.name, e.at) for e in again.effects)}
     assert named == {("joint_spring", "joint 2"), ("base_inclination", "bench")}
     assert "up to 2.5 Hz" in again.notes[0]
+
+
+def slow_rows_separate_what_noise_of_the_acceleration_ties(b: Benches) -> None:
+    """Such sensors show a level of friction, but not whether the pressures make it."""
+    wide, again = _in_slow_rows(b, "level", foreign_bench.Hidden(60.0, 60.0), LEVELS)
+    assert wide.verdict == "confounded"
+    assert again is not None
+    assert (again.verdict, [e.name for e in again.effects]) == (EXPLAINED, ["coulomb_friction"])
+
+
+GRAVITY: Final = ("joint_spring", "base_inclination")
+LEVELS: Final = ("coulomb_friction", "pressure_dependent_friction", "asymmetric_friction")
+
+
+def _in_slow_rows(
+    b: Benches, key: str, hidden: foreign_bench.Hidden, names: tuple[str, ...]
+) -> tuple[Trace, Trace | None]:
+    """Return the trace of a noisy bench in rows up to 15 Hz, and the better one in slow rows."""
+    train, held_out = (
+        with_filtered_noise(replace(run, records=run.records[:1]), 8.0, 1e4)
+        for run in b.kept(key, lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    )
+    train, held_out = of_bandwidth((train, held_out), 10.0)
+    terms = baseline_terms(b.rig)
+    records = TraceRuns(b.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
+    candidates = gate_cases.at_joint_2(b.rig, *names)
+    options = engine._Options(candidates, 0, look_ahead=False, free_forms=False, pool=Serial())
+    wide = engine._traced(records, options, lambda _: None)
+    return wide, engine._traced_in_narrower_rows(records, options, wide, lambda _: None)
 
 
 def a_torque_above_the_motions_frequencies_is_named(b: Benches) -> None:
@@ -860,22 +876,6 @@ def with_other_volumes(rig: Rig, joint: int, cap: float, rod: float) -> tuple[Ru
     return recorded(1, 0.025, 3), recorded(2, 0.018, 2)
 
 
-def a_clean_bench_in_a_loop_that_oscillates_is_clean(b: Benches) -> None:
-    """A position loop swings at 12 Hz, in each repeat in another phase.
-
-    The average of the channels is of no motion: their products leave seven times the noise.
-    """
-
-    def swinging(seed: int, rms: float, repeats: int) -> Run:
-        records = []
-        for k in range(1, repeats + 1):
-            swing = [0.012, 2.0 * np.pi * 12.0, 2.0 * np.pi * k / repeats]
-            wave = np.vstack((one_joint.excitation(rms, seed), swing))
-            clean = foreign_bench.channels(b.rig, foreign_bench.Hidden(), wave, 8.0)
-            record = one_joint.record(b.rig, clean, f"step1_r{k}", 1000 * seed + k)
-            records.append(replace(record, repeat=k, period=0))
-        return Run(b.rig, tuple(records), f"swinging, seed {seed}")
-
 def spools_behind_their_recorded_commands_lag(b: Benches) -> None:
     """Both valves answer 6 ms after the command recorded in place of the spool.
 
@@ -899,6 +899,22 @@ def spools_behind_their_recorded_commands_lag(b: Benches) -> None:
     }  # fmt: skip
     assert set(result.tied_at) >= {d.key for d in candidates if d.name == "channel_delay"}
 
+
+def a_clean_bench_in_a_loop_that_oscillates_is_clean(b: Benches) -> None:
+    """A position loop swings at 12 Hz, in each repeat in another phase.
+
+    The average of the channels is of no motion: their products leave seven times the noise.
+    """
+
+    def swinging(seed: int, rms: float, repeats: int) -> Run:
+        records = []
+        for k in range(1, repeats + 1):
+            swing = [0.012, 2.0 * np.pi * 12.0, 2.0 * np.pi * k / repeats]
+            wave = np.vstack((one_joint.excitation(rms, seed), swing))
+            clean = foreign_bench.channels(b.rig, foreign_bench.Hidden(), wave, 8.0)
+            record = one_joint.record(b.rig, clean, f"step1_r{k}", 1000 * seed + k)
+            records.append(replace(record, repeat=k, period=0))
+        return Run(b.rig, tuple(records), f"swinging, seed {seed}")
 
     runs = b.kept("swinging", lambda: (swinging(1, 0.03, 3), swinging(2, 0.021, 2)))
     result = b.traced(runs, "internal_leakage", "spool_lag")
@@ -979,6 +995,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (a_leak_of_one_step_alone_is_no_leak, ("invariance", "tolerance x 10")),
     (what_noise_makes_as_large_is_not_significant, ("family-wise p", "p always 0")),
     (a_null_and_its_sensors_offset_are_confounded, ("twins",)),
+    (spools_behind_their_recorded_commands_lag, ("usual cause",)),
     (a_small_force_beside_friction_is_found_in_one_record, ("noise beside effects",)),
     (a_hardening_spring_is_no_constant_torque, ("without a form",)),
     (a_force_in_time_is_no_noise_between_like_states, ("line no noise",)),
@@ -995,7 +1012,6 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (wrong_numbers_of_a_rig_file_within_their_tolerances_are_no_effect, ("tolerances",)),
     (a_high_return_pressure_is_found_beside_an_underlap, ("exact columns",)),
     (wrong_volumes_at_one_joint_name_nothing_at_the_other, ("unknown cause",)),
-    (spools_behind_their_recorded_commands_lag, ("usual cause",)),
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (equal_levels_by_direction_are_one_level, ("simpler name",)),
@@ -1019,7 +1035,8 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (neighbouring_states_show_no_less_than_the_white_noise_of_the_sensors,
      ("noise of the samples",)),
     (a_quicker_motion_on_another_day_does_not_widen_the_rows, ("training's bandwidth",)),
-    (slow_rows_show_what_noise_of_the_acceleration_hides, ("narrower rows",)),
+    (slow_rows_show_what_noise_of_the_acceleration_hides, ("narrower rows", "loud slow rows")),
+    (slow_rows_separate_what_noise_of_the_acceleration_ties, ("ties in slow rows",)),
     (a_torque_above_the_motions_frequencies_is_named, ("wider rows",)),
     (noise_of_a_position_leaves_a_level_as_it_is, ("filtered path",)),
     (a_leak_is_not_refused_for_a_friction_that_would_drive, ("unphysical companion",)),
