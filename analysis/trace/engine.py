@@ -54,6 +54,7 @@ from analysis.trace.notes import (
     refitted_notes,
     rival_notes,
     shared_parameters,
+    slow_residual_note,
     undetermined_notes,
     unseen_load_notes,
     wider_rows_note,
@@ -130,10 +131,9 @@ def trace(
     records = TraceRuns(with_b, known, train, unseen, judging, tuple(families))
     progress = _without_steps_back(progress or (lambda _: None))
     result = _traced(records, options, progress)
-    in_other_rows = _traced_in_narrower_rows(
-        records, options, result, progress
-    ) or _traced_in_wider_rows(records, options, result, progress)
-    result = _with_stated_rig(rig, in_other_rows or result)
+    in_other_rows, slow = _traced_in_narrower_rows(records, options, result, progress)
+    in_other_rows = in_other_rows or _traced_in_wider_rows(records, options, result, progress)
+    result = _with_stated_rig(rig, in_other_rows or replace(result, notes=(*slow, *result.notes)))
     notes = (*quicker, *apart)
     result = replace(result, notes=(*notes, *result.notes))
     may_be_load = any(effect.name == Payload.name for effect in effects)
@@ -419,38 +419,41 @@ def _traced_within_tolerances(
 
 def _traced_in_narrower_rows(
     records: TraceRuns, options: _Options, result: Trace, progress: Callable[[float], None]
-) -> Trace | None:
-    """Return a better answer in rows of lower frequencies, None where there is none.
+) -> tuple[Trace | None, tuple[str, ...]]:
+    """Return a better answer in rows of lower frequencies, None where there is none, and notes.
 
     All candidates are searched there where a result explains nothing, and where it leaves
-    `TRACE.loud_ratio` floors. Else the sets with tied rivals are compared: fewer must be tied.
-    The effects must leave no more than noise in the judging rows of the measured bandwidth too.
+    `TRACE.loud_ratio` floors; where that names nothing, a note says so. Else the sets with tied
+    rivals are compared: fewer must be tied. The effects must leave no more than noise in the
+    judging rows of the measured bandwidth too.
     """
     width = records.bandwidth
     if width is None:
-        return None
+        return None, ()
     narrower = TRACE.narrower_bandwidth * width
     narrower_records = records.of_bandwidth(narrower)
+    rig = result.model_after.rig  # with numbers within the tolerances that explain more
+    loud = {}
     try:
-        named = _named_terms(result)
-        fails = result.verdict == UNEXPLAINED or _is_loud(narrower_records, options, named)
+        if result.verdict != UNEXPLAINED:
+            loud = _loud_equations(narrower_records.of_rig(rig), options, result)
+        fails = result.verdict == UNEXPLAINED or bool(loud)
         if not fails:
-            sets = _sets_that_may_hold(result, narrower_records.rig)
-            if len(sets) == 1:
-                return None
+            sets = _sets_that_may_hold(result, rig)
+            if len(sets) == 1 or rig != records.rig:
+                return None, ()
             among = list({used.term.key: effect_in(used) for s in sets for used in s}.values())
             options = replace(options, effects=among, free_forms=False, sets=sets)
         again = _traced(narrower_records, options, progress)
     except InputError as error:  # the longer filter leaves too few rows of short records
         log.info("not traced in rows up to %.3g Hz: %s", narrower, error)
-        return None
+        return None, ()
     as_many = len(again.effects) == len(result.effects)
     is_better = fails or (as_many and set(again.tied_at) < set(result.tied_at))
-    if again.verdict not in (EXPLAINED, CONFOUNDED) or not is_better:
-        return None
-    if not _explain_judging_rows(trace_rows(records), _named_terms(again)):
-        return None
-    return replace(again, notes=(narrower_rows_note(narrower, width), *again.notes))
+    is_better &= again.verdict in (EXPLAINED, CONFOUNDED)
+    if not is_better or not _explain_judging_rows(trace_rows(records), _named_terms(again)):
+        return None, tuple(slow_residual_note(e, ratio, narrower) for e, ratio in loud.items())
+    return replace(again, notes=(narrower_rows_note(narrower, width), *again.notes)), ()
 
 
 def _sets_that_may_hold(result: Trace, rig: Rig) -> list[list[Used]]:
@@ -471,16 +474,21 @@ def _named_terms(result: Trace) -> list[Used]:
     return [used for used in result.model_after.terms if used.term.key in named]
 
 
-def _is_loud(records: TraceRuns, options: _Options, effects: Sequence[Used]) -> bool:
-    """Return whether a model with effects leaves `TRACE.loud_ratio` floors in the choosing rows.
+def _loud_equations(records: TraceRuns, options: _Options, result: Trace) -> dict[str, float]:
+    """Return the equations of which an answer leaves `TRACE.loud_ratio` floors, and how many.
 
-    Where friction is among the effects, its joint's torque balance counts in motion only.
+    The choosing rows of records count; where friction is among the effects, those of its joint's
+    torque balance in motion only. A free curve is not compared: it has a form error that narrower
+    rows show.
     """
-    records, rows = (prepared := _prepared(records, options)).records, prepared.rows
+    if any(effect.free for effect in result.effects):
+        return {}
+    effects, prepared = _named_terms(result), _prepared(records, options)
+    rows = prepared.rows
     if joints := {e.joint for e in effects_among(effects) if e.family == "friction"}:
-        rows = trace_rows(records, moving_filtering(joints))
+        rows = trace_rows(prepared.records, moving_filtering(joints))
     ratios = held_out_ratios(rows, _refined_on(rows, effects)[1])
-    return max(ratios.values()) >= TRACE.loud_ratio
+    return {e: ratio for e, ratio in ratios.items() if ratio >= TRACE.loud_ratio}
 
 
 def _traced_in_wider_rows(

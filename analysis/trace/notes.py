@@ -241,6 +241,14 @@ def narrower_rows_note(narrower: float, width: float) -> str:
     )
 
 
+def slow_residual_note(equation: str, ratio: float, narrower: float) -> str:
+    """State what an equation keeps in rows up to a lower bandwidth [Hz], in noise floors."""
+    return (
+        f"{equation}: in rows for a motion up to {plain(narrower, 2)} Hz, {plain(ratio, 2)} times "
+        "the noise floor remains, and no effect explains it there: something slow is not named"
+    )
+
+
 def quicker_motion_notes(train: Sequence[Run], unseen: Sequence[Run]) -> list[str]:
     """Say where held-out motion is quicker than the training's, for which rows are filtered."""
     fitted, held_out = bandwidth_of(train), bandwidth_of(unseen)

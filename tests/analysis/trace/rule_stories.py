@@ -659,7 +659,7 @@ def _in_slow_rows(
     candidates = gate_cases.at_joint_2(b.rig, *names)
     options = engine._Options(candidates, 0, look_ahead=False, free_forms=False, pool=Serial())
     wide = engine._traced(records, options, lambda _: None)
-    return wide, engine._traced_in_narrower_rows(records, options, wide, lambda _: None)
+    return wide, engine._traced_in_narrower_rows(records, options, wide, lambda _: None)[0]
 
 
 def a_torque_above_the_motions_frequencies_is_named(b: Benches) -> None:

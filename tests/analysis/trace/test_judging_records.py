@@ -272,6 +272,17 @@ def test_records_too_short_for_narrower_rows_keep_their_answer(rig: Rig) -> None
     assert (result.verdict, result.effects) == ("unexplained", ())
 
 
+def test_a_clean_answer_says_what_slow_rows_keep_that_nothing_explains(rig: Rig) -> None:
+    """Noise of the accelerations hides a spring, and the only candidate is a leak."""
+    runs = foreign_bench.pair_of_runs(rig, foreign_bench.Hidden(spring=9.0))
+    noisy = [with_filtered_noise(replace(r, records=r.records[:1]), 8.0, 1e4) for r in runs]
+    train, held_out = of_bandwidth(noisy, 10.0)
+    leaks = at_joint_2(rig, "internal_leakage")
+    result = trace([train], [held_out], leaks, look_ahead=False, free_forms=False)
+    assert (result.verdict, result.effects) == ("clean", ())
+    assert result.notes[0].startswith("torque_2: in rows for a motion up to 2.5 Hz, 2.")
+
+
 def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
     data = regression_data(rig, terms, conditioned_records(rig, [leaky[0]]))

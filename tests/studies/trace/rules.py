@@ -250,7 +250,7 @@ RULES: Final = (
     Rule("ties in slow rows", "tied sets are not compared in rows of lower frequencies",
          ((engine, "_sets_that_may_hold", lambda *_: [[]]),)),
     Rule("narrower rows", "what rows of all frequencies leave unexplained stays so",
-         ((engine, "_traced_in_narrower_rows", lambda *_: None),)),
+         ((engine, "_traced_in_narrower_rows", lambda *_: (None, ())),)),
     Rule("wider rows", "what rows for the motion show clean is clean",
          ((engine, "_traced_in_wider_rows", lambda *_: None),)),
     Rule("filtered path", "friction reverses along the path as it is measured, noise included",
