@@ -61,7 +61,7 @@ from analysis.trace.notes import (
 )
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, Gate, Trace
 from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set
-from analysis.trace.search.hypothesis import Hypothesis, effect_of
+from analysis.trace.search.hypothesis import Hypothesis, Key, effect_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.undeclared_loads import MECHANICAL, undeclared_load
 from analysis.trace.settings import SEARCH, TRACE
@@ -457,9 +457,15 @@ def _traced_in_narrower_rows(
 
 
 def _sets_that_may_hold(result: Trace, rig: Rig) -> list[list[Used]]:
-    """Return the set of effects that a trace names, and those with a tied rival in place of one."""
+    """Return the set of effects that a trace names, and those with a tied rival in place of one.
+
+    Rivals of two effects take the place of both together: then there is no set to compare.
+    """
     named = {used.term.key: used for used in _named_terms(result)}
     sets = [named]
+    rivals_of_each = [{(r.name, r.at) for r in e.rivals if r.tied} for e in result.effects]
+    if sum(map(len, rivals_of_each)) > len(set[Key]().union(*rivals_of_each)):
+        return [list(named.values())]
     for effect in result.effects:
         others = {key: used for key, used in named.items() if key != (effect.name, effect.at)}
         for rival in (r for r in effect.rivals if r.tied):
