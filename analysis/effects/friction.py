@@ -236,6 +236,14 @@ FAR_ABOVE: Final = 1e3  # of the speed limit: at it, a breakaway does not fall
 LARGEST_FALL: Final = 0.5  # of the level, up to the speed limit: Coulomb's level is constant
 
 
+def fall_with_speed(rig: Rig, joint: int, values: Mapping[str, float], level: float) -> str:
+    """Return in words that a level [N] falls with speed beside negative viscous friction, or ''."""
+    viscous = values.get(f"Fv{joint + 1}", 0.0) / float(rig.joints[joint].geometry(0.0)[1]) ** 2
+    if viscous * rig.joints[joint].limits.speed < -LARGEST_FALL * abs(level):
+        return "viscous friction would be negative: this level falls with speed"
+    return ""
+
+
 @kernel
 def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
@@ -274,11 +282,8 @@ class CoulombFriction(Friction):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Reject negative friction, a fall with speed, and more than half the cylinder's force."""
         name = f"Fc{self.joint + 1}"
-        level, joint = values[name], rig.joints[self.joint]
-        viscous = values.get(f"Fv{self.joint + 1}", 0.0) / float(joint.geometry(0.0)[1]) ** 2
-        if viscous * joint.limits.speed < -LARGEST_FALL * abs(level):
-            return "viscous friction would be negative: this level falls with speed"
-        return out_of_range(name, level, "N", force_limit(rig, self.joint))
+        falls = fall_with_speed(rig, self.joint, values, values[name])
+        return falls or out_of_range(name, values[name], "N", force_limit(rig, self.joint))
 
 
 @kernel

@@ -20,7 +20,7 @@ from analysis.effects.contact import (
     mean_sign,
     slide,
 )
-from analysis.effects.friction import Friction, force_limit, force_unit
+from analysis.effects.friction import Friction, fall_with_speed, force_limit, force_unit
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -131,7 +131,7 @@ class AsymmetricFriction(Friction):
         return np.array([self.joint, *linear, *contact])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject a negative or too large level, and levels that hardly differ."""
+        """Reject a negative or too large level, a fall with speed, levels that hardly differ."""
         limit = force_limit(rig, self.joint)
         levels = [values[name] for name in self._names()]
         least = LEAST_SHARE * max(map(abs, levels))
@@ -141,7 +141,7 @@ class AsymmetricFriction(Friction):
                 return too_large
         if self.simpler_equivalent(rig, values):
             return "the two directions differ by less than a tenth: this is coulomb_friction"
-        return ""
+        return fall_with_speed(rig, self.joint, values, 0.5 * sum(levels))
 
     def simpler_equivalent(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
         """Return Coulomb friction where the levels differ by less than `DIFFERENCE` of the mean."""
@@ -304,10 +304,11 @@ class PressureDependentFriction(Friction):
         return np.array([self.joint, k, *contact, pressure, *weights])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Reject negative friction, and more than half of the cylinder's force."""
-        name = f"k_friction_{self.joint + 1}"
+        """Reject negative friction, a fall with speed, and over half of the cylinder's force."""
+        k = values[name := f"k_friction_{self.joint + 1}"]
+        falls = fall_with_speed(rig, self.joint, values, k * rig.supply.pressure)
         half_area = 0.5 * rig.joints[self.joint].cylinder.cap_area
-        return out_of_range(name, values[name], "m^2", half_area)
+        return falls or out_of_range(name, k, "m^2", half_area)
 
 
 TERMS = (AsymmetricFriction, PressureDependentFriction)

@@ -415,6 +415,7 @@ REFUSED = [
     ),
     ("supply_curve", "bench", {}, (0.0, 1e-4, 2e-4, 6e5, 3e5)),
     ("asymmetric_friction", "joint 1", {"F_ext_1": 200.0, "F_ret_1": 3.0}, (40e-6, 40e-6)),
+    ("coulomb_friction", "joint 1", {"Fc1": 200.0, "Fv1": -50.0}, (40e-6,)),
     ("sensor_lag", "joint 1 cap", {}, (0.1,)),
     ("sensor_crosstalk", "joint 1 cap", {}, (0.3,)),
     ("spool_hysteresis", "joint 1", {}, (0.35,)),
@@ -451,6 +452,23 @@ def test_the_unphysical_is_refused_in_words(
     said = effect(name, where).problem(rig, TRUTH | values, shape)
     assert said
     assert "nan" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("asymmetric_friction", {"F_ext_1": 200.0, "F_ret_1": 100.0}),
+        ("pressure_dependent_friction", {"k_friction_1": 4e-5}),
+    ],
+)
+def test_a_level_that_falls_with_speed_is_refused_whatever_it_depends_on(
+    rig: Rig, name: str, values: dict[str, float]
+) -> None:
+    """Viscous friction of -5 N m s/rad takes half of 250 N up to the limit of the speed."""
+    tried = effect(name, "joint 1")
+    falls = tried.problem(rig, TRUTH | values | {"Fv1": -5.0}, (40e-6, 40e-6))
+    assert falls == "viscous friction would be negative: this level falls with speed"
+    assert tried.problem(rig, TRUTH | values | {"Fv1": -0.5}, (40e-6, 40e-6)) == ""
 
 
 def test_a_seal_may_hold_a_twelfth_in_the_other_direction(rig: Rig) -> None:
