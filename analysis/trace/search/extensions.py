@@ -169,9 +169,11 @@ def extended(
     added = [u for u in effects if u.term.key not in current.keys]
     others = [u for u in effects if u not in added]
     effects = [*others, *(at_best_size(hypotheses.train_data, u, others) for u in added)]
-    earlier = hypotheses.refined(effects, rival, others)
-    spoils = spoils_equation(earlier, current, hypotheses.noise_band)
-    return hypotheses.refined_anew(effects, rival) if spoils else earlier
+    known = keys_of(effects) in hypotheses.fitted
+    fitted = hypotheses.refined(effects, rival, others)
+    if known and spoils_equation(fitted, current, hypotheses.noise_band):
+        return hypotheses.refined_anew(effects, rival)
+    return fitted
 
 
 def may_act(
