@@ -43,7 +43,7 @@ def test_an_answer_without_rules_kept_from_others_is_that_of_the_whole_trace(
     """Columns and fits kept for one rule change no answer for the next, in either order."""
     candidates = at_joint_2(rig, "internal_leakage", "spool_offset")
     monkeypatch.setattr("analysis.trace.engine.catalogue", lambda *_: candidates)
-    monkeypatch.setattr("analysis.trace.engine.free_mechanisms", lambda *_: [])
+    monkeypatch.setattr("analysis.trace.stages.preparation.free_mechanisms", lambda *_: [])
     train, held_out = pair_of_runs(rig, c_internal=LEAK)
     rules = [by_name(RULES)[name] for name in ("held-out band", "rivals")]
     case = case_of(2)
@@ -98,7 +98,7 @@ def test_plain_methods_add_more_than_the_cause_and_the_page_says_how_much(
     candidates = at_joint_2(rig, "internal_leakage", "spool_offset")
     for module in ("analysis.trace.engine", "tests.studies.trace.baselines"):
         monkeypatch.setattr(f"{module}.catalogue", lambda *_: candidates)
-    monkeypatch.setattr("analysis.trace.engine.free_mechanisms", lambda *_: [])
+    monkeypatch.setattr("analysis.trace.stages.preparation.free_mechanisms", lambda *_: [])
     train, held_out = pair_of_runs(rig, c_internal=LEAK)
     found = baselines.answers(case_of(2), train, [held_out])
     trace, stepwise, sparse = found

@@ -34,6 +34,8 @@ from analysis.trace.search.exact_fit import fit_coefficients, jacobian
 from analysis.trace.search.exchanges import exchanged
 from analysis.trace.search.extensions import extended, extended_in
 from analysis.trace.settings import DATA
+from analysis.trace.stages.one_bandwidth import trace_one_bandwidth
+from analysis.trace.stages.preparation import TraceOptions
 from analysis.workers.pool import Serial
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
@@ -657,9 +659,9 @@ def _in_slow_rows(
     terms = baseline_terms(b.rig)
     records = TraceRuns(b.rig, terms, (train,), (held_out,), (), tuple(FAMILIES))
     candidates = gate_cases.at_joint_2(b.rig, *names)
-    options = engine._Options(candidates, 0, look_ahead=False, free_forms=False, pool=Serial())
-    wide = engine._traced(records, options, lambda _: None)
-    return wide, engine._traced_in_narrower_rows(records, options, wide, lambda _: None)[0]
+    options = TraceOptions(candidates, 0, look_ahead=False, free_forms=False, pool=Serial())
+    wide = trace_one_bandwidth(records, options, lambda _: None)
+    return wide, engine.traced_in_narrower_rows(records, options, wide, lambda _: None)[0]
 
 
 def a_torque_above_the_motions_frequencies_is_named(b: Benches) -> None:

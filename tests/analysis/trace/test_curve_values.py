@@ -15,13 +15,13 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import free_mechanisms
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, evidence, regression_data
-from analysis.trace.engine import judging_rows_above_band
 from analysis.trace.fitted_model import with_effect_values
 from analysis.trace.judge.curves import CurveRange
 from analysis.trace.judge.gates import held_out_above_band
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.exact_fit import ExactFit, fit_coefficients
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.stages.conclusion import judging_rows_above_band
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import RMS, Hidden, experiment

@@ -13,7 +13,6 @@ import pytest
 
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
-from analysis.trace import engine
 from analysis.trace.data.candidates import at_start
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
@@ -25,6 +24,7 @@ from analysis.trace.search.geometry import Geometry, geometry_for_smaller_set, r
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
+from analysis.trace.stages import one_bandwidth
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.model.tolerances import Tolerances
@@ -78,8 +78,8 @@ def test_records_are_traced_again_only_where_the_other_geometry_leaves_little(
 ) -> None:
     """To first order a geometry may explain what its rows do not bear out."""
     traces: list[object] = []
-    again = engine._traced_within_tolerances
-    proposed = engine.geometry_for_smaller_set
+    again = one_bandwidth._traced_within_tolerances
+    proposed = one_bandwidth.geometry_for_smaller_set
 
     def counted(*arguments: Any) -> Trace | None:
         traces.append(arguments)
@@ -90,7 +90,7 @@ def test_records_are_traced_again_only_where_the_other_geometry_leaves_little(
         far = runs[0].rig.with_deviations((-2.0 * geometry.deviations).tolist())
         return replace(geometry, rig=far)
 
-    monkeypatch.setattr(engine, "_traced_within_tolerances", counted)
+    monkeypatch.setattr(one_bandwidth, "_traced_within_tolerances", counted)
     runs = [misread(run, tolerances=STATED) for run in pair_of_runs(rig)]
     candidates = at_joint_2(runs[0].rig, "sensor_gain", "dead_volume")
 
@@ -99,7 +99,7 @@ def test_records_are_traced_again_only_where_the_other_geometry_leaves_little(
 
     assert verdict() == "clean"
     assert len(traces) == 1
-    monkeypatch.setattr(engine, "geometry_for_smaller_set", elsewhere)
+    monkeypatch.setattr(one_bandwidth, "geometry_for_smaller_set", elsewhere)
     assert verdict() != "clean"
     assert len(traces) == 1
 

@@ -21,6 +21,7 @@ from analysis.trace import engine
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
+from analysis.trace.stages.preparation import COLUMNS
 from rig.cli.text.trace_text import trace_text
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -62,7 +63,7 @@ def test_a_trace_tells_how_far_it_is(leaking: Trace, shares: list[float]) -> Non
     assert shares == sorted(shares)
     assert 0.0 < shares[0] < shares[-1] < 1.0
     # During the search, whose length is unknown, each fitted set reports that work goes on.
-    assert shares.count(engine.COLUMNS) > 5
+    assert shares.count(COLUMNS) > 5
 
 
 def test_progress_does_not_go_back_where_a_search_is_repeated() -> None:

@@ -20,6 +20,7 @@ from analysis.trace.data import trace_rows
 from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
 from analysis.trace.search import exchanges, extensions, hypothesis_set
+from analysis.trace.stages import conclusion
 from rig.model.records import Record, Run
 from rig.runs.rigs import load_rig
 from tests.studies.foreign.bench import runs_of
@@ -160,7 +161,7 @@ def decisions_only(kept: Kept) -> Iterator[None]:
             "shoot_hidden_states",
             lambda runs, holdout, after, train, judged, one: (one, []),
         ),
-        (engine, "clues_to", lambda *_: ((), ())),
+        (conclusion, "clues_to", lambda *_: ((), ())),
         (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),
     )
     with switched_off(Rule("", "", changes)):

@@ -36,6 +36,7 @@ from analysis.trace.judge import alternatives, gates, held_out, inference, rival
 from analysis.trace.search import exchanges, extensions, forward_search, linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import DATA, SEARCH, TRACE
+from analysis.trace.stages import conclusion, one_bandwidth, other_bandwidths, preparation
 from rig.model.records import bandwidth_of
 
 Array = NDArray[np.float64]
@@ -234,13 +235,13 @@ RULES: Final = (
     Rule("exact forms", "the form of a gain, an offset or a mass may miss as much as any other",
          ((gates, "form_share", lambda *_: TRACE.held_out_share),)),
     Rule("tolerances", "areas, volumes and pin distances are taken as the rig file states them",
-         ((engine, "geometry_for_smaller_set", lambda *_: None),)),
+         ((one_bandwidth, "geometry_for_smaller_set", lambda *_: None),)),
     Rule("repeats that differ", "channels of repeats are averaged, however their motions differ",
          ((DATA, "averaging_error", math.inf),), refits=True),
     Rule("oil of another day", "viscous friction and bulk modulus are the same on any day",
          (setting("viscosity_change", 0.0), setting("bulk_change", 0.0))),
     Rule("unstated noise", "where nothing repeats, noise is at most that above the rows",
-         ((engine, "unstated_noise", lambda *_: {}),)),
+         ((preparation, "unstated_noise", lambda *_: {}),)),
     Rule("steady noise", "more than 2.5 floors that no effect explains are never noise",
          ((unmeasured_noise, "_follows_motion", lambda *_: True),)),
     Rule("unphysical companion", "all effects of a set with an unphysical one are refused",
@@ -248,11 +249,11 @@ RULES: Final = (
     Rule("loud slow rows", "a clean result is never traced again in rows of lower frequencies",
          (setting("loud_ratio", math.inf),)),
     Rule("ties in slow rows", "tied sets are not compared in rows of lower frequencies",
-         ((engine, "_sets_that_may_hold", lambda *_: [[]]),)),
+         ((other_bandwidths, "_sets_that_may_hold", lambda *_: [[]]),)),
     Rule("narrower rows", "what rows of all frequencies leave unexplained stays so",
-         ((engine, "_traced_in_narrower_rows", lambda *_: (None, ())),)),
+         ((engine, "traced_in_narrower_rows", lambda *_: (None, ())),)),
     Rule("wider rows", "what rows for the motion show clean is clean",
-         ((engine, "_traced_in_wider_rows", lambda *_: None),)),
+         ((engine, "traced_in_wider_rows", lambda *_: None),)),
     Rule("filtered path", "friction reverses along the path as it is measured, noise included",
          ((SIGNALS, "path_noise", math.inf),), refits=True),
     Rule("noise above the rows", "where nothing repeats, the floor is the stated noise",
@@ -273,7 +274,7 @@ RULES: Final = (
          ((noise_floor, "_largest_line", lambda *_: 0.0),)),
     Rule("noise beside effects",
          "noise by neighbouring states is that of the residual without effects",
-         ((engine, "noise_beside_effects", lambda *_: {}),)),
+         ((preparation, "noise_beside_effects", lambda *_: {}),)),
     Rule("other starts", "a search that explains nothing does not begin with another effect",
          ((forward_search, "_begun_with_another", lambda _, current, _singles: current),)),
     Rule("exchanges", "no effect is exchanged for another one",
@@ -302,7 +303,7 @@ RULES: Final = (
          ((Friction, "other_form_starts", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
          ((in_motion, "searched_in_motion", lambda *given: given[-1]),
-          (engine, "joints_with_friction", lambda *_: set()))),
+          (conclusion, "joints_with_friction", lambda *_: set()))),
     Rule("force at standstill", "rows in motion alone decide whether a breakaway acts",
          ((in_motion, "_hides_breakaway", lambda *_: False),)),
     Rule("free form beside", "a free form beside an unknown cause in other equations is not named",
@@ -347,7 +348,7 @@ FAULTS: Final = (
          ((finding, "remainders", lambda *_: ()), (judging, "remainders", lambda *_: ()),
           (gates, "held_out_above_band", lambda *_: []))),
     Rule("judging rows unread", "nobody asks what the judging rows keep",
-         ((engine, "judging_rows_above_band", lambda *_: (set(), [])),)),
+         ((conclusion, "judging_rows_above_band", lambda *_: (set(), [])),)),
 )  # fmt: skip
 
 

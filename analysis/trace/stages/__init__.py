@@ -1,0 +1,1 @@
+"""Stages of a trace: preparation, search, conclusion, rows of other bandwidths."""
