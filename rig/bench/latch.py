@@ -2,8 +2,9 @@
 
 A bench is identified by its endpoint, not by the rig's name. Each has a folder in `state_folder`:
 `trip.json` while a trip is latched, `resets.jsonl` with every cleared trip, `session.json` while a
-process of this computer uses the bench, `lock`, which that process has locked, and `rig.yaml`, the
-rig of the last session. A bench with two addresses has two folders; the trip latched in the device
+process of this computer uses the bench, `lock`, which that process has locked, `rig.yaml`, the rig
+of the last session, and `stopped`, written by each `bramah stop` of it. One of all benches is in
+`state_folder` itself. A bench with two addresses has two folders; the trip latched in the device
 itself covers that case.
 """
 
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 
 STATE_VARIABLE: Final = "BRAMAH_STATE"
 _TRIP, _RESETS, _SESSION, _LOCK = "trip.json", "resets.jsonl", "session.json", "lock"
+_STOPPED: Final = "stopped"
 _RIG: Final = "rig.yaml"
 _THIS_COMPUTER = frozenset({"localhost", "[::1]"})
 _LOOPBACK = 127  # first number of the addresses of this computer
@@ -123,6 +125,29 @@ def rigs_to_stop() -> list[Path]:
     held = (path for path in known_rigs() if path.with_name(_SESSION).exists())
     own = os.getpid()
     return [path for path in held if (holder := _holder(path.parent)) is None or holder.pid != own]
+
+
+def note_stop(endpoint: str = "") -> None:
+    """Store that a person stops the bench at an endpoint now, or all benches; never raises."""
+    path = _stop_file(endpoint)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        path.touch()  # its time is all that is read, and the outputs wait for it
+    except OSError as error:
+        log.warning("%s: cannot be written: %s; a queue may start its next item", path, error)
+
+
+def stop_time(endpoint: str = "") -> int:
+    """Return the time [ns since 1970] of the last `note_stop` of an endpoint, 0 without one."""
+    try:
+        return _stop_file(endpoint).stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def _stop_file(endpoint: str) -> Path:
+    folder = state_folder()
+    return (folder / bench_name(endpoint) if endpoint else folder) / _STOPPED
 
 
 def holder_at(wire: Wire) -> Holder | None:

@@ -22,6 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
+from rig.bench import latch
 from rig.bench.outputs import UNSURE
 from rig.bench.stops import StopFlag
 from rig.model.parse import InputError
@@ -34,6 +35,7 @@ from rig.queue.outcome import ItemOutcome, outcome_of, outcome_of_folder
 from rig.queue.processes import LockFile, held, holder
 from rig.queue.store import QueueStore
 from rig.runs import runstate, store
+from rig.runs.rigs import load_rig
 
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
@@ -134,6 +136,8 @@ class Runner:
         self._stop = StopFlag()
         self._lock: LockFile | None = None
         self._ended: list[Item] = []
+        self._stops_seen = 0  # [ns] time of the start, or of the last stop that is the runner's
+        self._endpoints: dict[tuple[str, str], str] = {}  # of the benches of items begun
         self._lost = 0  # consecutive losses of the device
         self._in_use: dict[tuple[str, str], tuple[float, str]] = {}
         self._readings: dict[tuple[str, str], tuple[float, dict[str, float] | str]] = {}
@@ -151,6 +155,7 @@ class Runner:
                 f"{self._queue.path}: process {holder(path)} runs this queue already; "
                 "`bramah queue pause` stops it after the present item"
             )
+        self._stops_seen = path.stat().st_mtime_ns  # by the clock of the files of stops
         if stale is not None:
             self._say(f"the previous runner, process {stale}, was killed")
         self._stop.install()
@@ -199,13 +204,28 @@ class Runner:
                 return ENDED
             self._pause(self._settings.wait_poll)
 
-    def _obey_stop(self) -> None:
+    def _stop_reason(self) -> str | None:
+        """Return why a person stopped this runner or a bench of its items, None if nobody did."""
         if self._stop.reason is not None:
-            raise OperatorStop(self._stop.reason)
+            return self._stop.reason
+        for endpoint in ("", *self._endpoints.values()):
+            if latch.stop_time(endpoint) > self._stops_seen:
+                return f"`bramah stop` of {endpoint or 'every bench'}"
+        return None
+
+    def _heed_stops_of(self, job: QueueJob) -> None:
+        """Let a `bramah stop` of a job's bench stop the queue from now on."""
+        with contextlib.suppress(InputError):  # the check states what is wrong with the rig file
+            endpoint = job.endpoint or load_rig(job.rig).wire.endpoint
+            self._endpoints[job.rig, job.endpoint] = endpoint
+
+    def _obey_stop(self) -> None:
+        if (reason := self._stop_reason()) is not None:
+            raise OperatorStop(reason)
 
     def _pause(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline and self._stop.reason is None:
+        while time.monotonic() < deadline and self._stop_reason() is None:
             time.sleep(min(self._settings.poll, seconds))
 
     # Which item
@@ -248,15 +268,17 @@ class Runner:
         return cached[1]
 
     def _call_verb(self, words: Sequence[str], seconds: float) -> processes.ProcessResult:
-        return processes.call(self._program, words, seconds, lambda: self._stop.reason)
+        return processes.call(self._program, words, seconds, self._stop_reason)
 
     # One item
 
     def _start(self, item: Item) -> None:
         """Check a claimed item against the present limits, then run it to its end."""
         self._say(f"item {item.id} {item.job.name}: checking")
+        self._heed_stops_of(item.job)
         try:
             proof = self._call_verb(item.job.check_words(), self._settings.check_seconds)
+            self._obey_stop()
         except OperatorStop:
             self._queue.release(item.id, "the runner was stopped during its check")
             raise
@@ -297,7 +319,7 @@ class Runner:
         """Wait until a process has ended; return the state for which it was asked to end, or ''."""
         requested, requested_at = "", 0.0
         while not ended():
-            end_state = it.STOPPED if self._stop.reason else ""
+            end_state = it.STOPPED if self._stop_reason() else ""
             if not end_state and self._queue.item(item.id).cancel:
                 end_state = it.CANCELLED
             process = pid()
@@ -339,11 +361,18 @@ class Runner:
         if self._lost >= self._settings.lost_in_a_row:
             raise _Ending(4, f"the device was lost {self._lost} times in a row: {outcome.reason}")
         self._obey_stop()
+        if outcome.state == it.STOPPED:
+            raise _Ending(130, f"item {item.id} was stopped: {outcome.reason}")
 
     def _make_safe(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
         """Zero the outputs of a bench whose process died; the watchdog has probably done so."""
         words = ["stop", *item.job.bench_words]
+        self._heed_stops_of(item.job)
+        by_person = self._stop_reason() is not None
         answer = processes.call(self._program, words, self._settings.probe_seconds)
+        if not by_person:  # the stop that was just stored is the runner's
+            stops = map(latch.stop_time, self._endpoints.values())
+            self._stops_seen = max([self._stops_seen, *stops])
         if answer.code == 0:
             return outcome.adding("outputs confirmed at zero")
         # Without the phrase that stops the queue: the next item tests whether the bench answers.
@@ -410,7 +439,7 @@ class Runner:
 
     def _why(self, request: str) -> str:
         """Return why a process was asked to end, for the state that was requested."""
-        return "cancelled by a person" if request == it.CANCELLED else self._stop.reason or ""
+        return "cancelled by a person" if request == it.CANCELLED else self._stop_reason() or ""
 
     def _notify(self, event: str, item: Item | None, reason: str) -> None:
         counts = Counter(other.state for other in self._queue.items())

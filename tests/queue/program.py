@@ -1,7 +1,8 @@
 """The verbs that a queue starts, on a bench of this process: real runs, real folders, real deaths.
 
 Usage: program.py VERB ... as `bramah` has them. What happens is the protocol's name, a mode with a
-number: "done", "fail", "refuse", "trip-20", "lost-20", "die-20", "endless", "die-early", "odd".
+number: "done", "fail", "refuse", "trip-20", "lost-20", "die-20", "endless", "die-early", "odd",
+"stopped" and "all-stopped" by `bramah stop` during the check.
 Every run that gets as far as its bench appends a line to OUT.starts.
 """
 
@@ -89,6 +90,11 @@ def work() -> int:
         if mode == "refuse":
             sys.stderr.write("bramah: step 'step1', joint 2: the piston reaches 80 mm\n")
             return 2
+        if mode in ("stopped", "all-stopped"):
+            from rig.bench.latch import note_stop
+            from rig.runs.rigs import load_rig
+
+            note_stop(load_rig("shinshu-2dof").wire.endpoint if mode == "stopped" else "")
         write_line(json.dumps({"ok": True, "seconds": 1.0}))
     elif verb == "run":
         from rig.cli.errors import guarded
@@ -104,6 +110,10 @@ def work() -> int:
         oil.write_text("\n".join(readings[1:] or readings))
         write_line(json.dumps([{"channel": "oil_temperature", "mean": degrees}]))
     elif verb == "stop":
+        from rig.bench.latch import note_stop
+        from rig.runs.rigs import load_rig
+
+        note_stop(load_rig("shinshu-2dof").wire.endpoint)
         write_line("outputs at zero, confirmed by the device")
     elif verb == "recover":
         from rig.cli.main import command_line

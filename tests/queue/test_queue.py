@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sqlite3
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.bench.latch import BenchState
+from rig.bench.latch import BenchState, note_stop
 from rig.model.parameters import parameter_names
 from rig.model.parse import InputError
 from rig.queue.items import channel_condition, check_wanted, parse_time, result_condition
@@ -256,6 +257,37 @@ def test_a_signal_at_the_runner_ends_the_item_safely(
     assert night.states() == ["stopped", "queued"]
     assert night.item(1).reason == f"{reason}; stopped by SIGTERM"
     assert Path(night.item(1).run).with_suffix(".device").read_text().split()[-3] == "zero"
+
+
+def test_a_stop_of_the_running_item_keeps_the_next_one_from_the_bench(night: Night) -> None:
+    """As after `bramah stop`, which signals the run, or the space bar on the screen."""
+    night.add("endless")
+    night.add("done")
+    child = night.process()
+    until(lambda: night.starts(1) == 1, "the item runs")
+    process = night.item(1).pid
+    assert process is not None
+    os.kill(process, signal.SIGTERM)
+    assert child.wait(LONG) == 130
+    assert night.states() == ["stopped", "queued"]
+    assert night.starts(2) == 0
+
+
+@pytest.mark.parametrize("stop", ["stopped", "all-stopped"])
+def test_a_bench_that_is_stopped_during_a_check_is_not_driven(night: Night, stop: str) -> None:
+    night.add(stop)
+    night.add("done")
+    report = night.run()
+    assert report.code == 130
+    assert "`bramah stop` of " in report.reason
+    assert night.states() == ["queued", "queued"]
+    assert night.starts(1) == night.starts(2) == 0
+
+
+def test_a_stop_of_another_bench_ends_no_night(night: Night) -> None:
+    night.add("done")
+    note_stop("modbus-tcp://127.0.0.1:9")
+    assert night.run().code == 0
 
 
 def test_a_retried_item_keeps_its_place_and_its_first_run(night: Night) -> None:

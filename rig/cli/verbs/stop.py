@@ -41,22 +41,25 @@ def stop(rig: KnownRigOption = None, endpoint: EndpointOption = None) -> None:
     """Set all outputs to zero now, whoever is in control, and end the run that drives them.
 
     Without --rig it stops every bench that this computer drives, or has left without confirming
-    that its outputs are at zero, all at once.
+    that its outputs are at zero, all at once. A queue starts no further item.
 
     Example: bramah stop --rig shinshu-2dof
     """
     from rig.bench import probe  # noqa: F401 - before the threads, which all need it
-    from rig.bench.latch import rigs_to_stop
+    from rig.bench.latch import note_stop, rigs_to_stop
     from rig.model.parse import InputError
 
     refuse_endpoint_alone(rig, endpoint)
     rigs = [rig] if rig is not None else [str(path) for path in rigs_to_stop()]
     if not rigs:
+        note_stop()
         raise InputError(f"{NOT_IN_USE}; name the bench: --rig RIG")
     news: News = SimpleQueue()
     stops = [BenchStop(name, endpoint, news) for name in rigs]
     for one in stops:
         one.start()
+    if rig is None:
+        note_stop()
     _warn_of_silence(stops)
     errors = _printed_news(news, len(stops))
     if errors and len(stops) == 1:
@@ -97,12 +100,13 @@ class BenchStop(threading.Thread):
         """
         from drivers.base import DeviceError, zeroed_without_host
         from rig.bench import probe as bench
-        from rig.bench.latch import BenchState
+        from rig.bench.latch import BenchState, note_stop
         from rig.bench.outputs import UNSURE
 
         bench_rig, driver = device_of(self._rig, self._endpoint)
         self.place = _place(bench_rig)
         holder = _signalled_holder(bench_rig.wire)
+        note_stop(bench_rig.wire.endpoint)
         try:
             self._zero(driver, bench_rig.wire, holder)
         except DeviceError as error:
