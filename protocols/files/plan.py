@@ -31,6 +31,7 @@ LOCK_SHARE = 0.25  # of the stroke: a joint that may stand anywhere in it is not
 LOCK_DEVIATIONS = 6.0  # of the noise of a position: one sample of 10^9 is farther off
 LONGEST_RECORD = 86400.0  # [s]
 BISECTIONS = 20  # of a gain: to a millionth
+OIL_DAMPING = 0.2  # usual damping ratio of a load on its oil (Merritt 1967, chapter 8)
 
 
 @dataclass(frozen=True)
@@ -179,6 +180,26 @@ def largest_position_gain(rig: Rig, joint: int) -> float:
         gain = 0.5 * (low + high)
         low, high = (gain, high) if settles(gain) else (low, gain)
     return low
+
+
+def largest_centring_gain(rig: Rig, joint: int) -> float:
+    """Return the position gain [V/m] up to which a joint (0-based) settles with its oil and load.
+
+    The load on the oil has the frequency w, w^2 = b (A_c^2 / V_c + A_r^2 / V_r) G^2 / M in the
+    middle of the stroke, and the damping ratio d of `OIL_DAMPING`: the loop settles below a speed
+    per displacement of 2 d w (Merritt 1967, chapter 8). Without nominal b or M, and at most,
+    `largest_position_gain`.
+    """
+    most = largest_position_gain(rig, joint)
+    b, M = (rig.nominal.get(name, 0.0) for name in ("b", f"M{joint + 1}"))
+    if math.isinf(most) or not (b > 0.0 and M > 0.0):
+        return most
+    part = rig.joints[joint]
+    cylinder, lever = part.cylinder, abs(float(part.geometry(0.0)[1]))
+    cap, rod = map(float, rig.chamber_volumes(joint, np.array(0.0)))
+    stiffness = b * (cylinder.cap_area**2 / cap + cylinder.rod_area**2 / rod)
+    frequency = lever * math.sqrt(stiffness / M)
+    return min(most, 2.0 * OIL_DAMPING * frequency / piston_gain(rig, joint))
 
 
 def override(protocol: Protocol, overrides: Overrides) -> Protocol:
@@ -431,5 +452,11 @@ def _excite(part: Excite, step: str, wave: Waveform, rig: Rig) -> ExcitePlan:
         raise InputError(
             f"{where}: centre {1e3 * part.centre:g} mm is outside limits.piston, "
             f"{1e3 * low:g} to {1e3 * high:g} mm"
+        )
+    gain, most = part.centring.position_gain, largest_centring_gain(rig, part.joint - 1)
+    if gain > most:
+        raise InputError(
+            f"{where}: centring.position_gain {gain:g} V/m makes the piston oscillate: with its "
+            f"valve, oil and load expected at most {plain(most, 3)} V/m"
         )
     return ExcitePlan(part.joint - 1, wave, part)

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from protocols.files.library import load, read_protocol, shipped_names
-from protocols.files.plan import Overrides, largest_position_gain, piston_gain, resolve
+from protocols.files.plan import (
+    OIL_DAMPING,
+    Overrides,
+    largest_centring_gain,
+    largest_position_gain,
+    piston_gain,
+    resolve,
+)
 from protocols.files.schema import Protocol
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
@@ -129,6 +136,11 @@ REFUSED = [
         "joints: 2\nplace: {position_gain: 100000 V/m}\n",
         "place.position_gain 100000 V/m makes joint 'boom' oscillate.*at most 393\\d V/m",
     ),
+    (
+        "centre: 3 mm}",
+        "centre: 3 mm, centring: {position_gain: 2 V/mm}}",
+        "position_gain 2000 V/m makes the piston oscillate.*at most 30\\d V/m",
+    ),
 ]
 
 
@@ -143,6 +155,21 @@ def test_what_the_place_cannot_do_is_refused_with_file_and_line(rig: Rig) -> Non
     line = 1 + text.splitlines().index("place: {limit: 5 V}")
     with pytest.raises(InputError, match=rf"^mine\.yaml:{line}: protocol 'mine': place.limit 5 V"):
         resolve(read_protocol(text, "mine.yaml"), rig)
+
+
+def test_a_centring_loop_settles_up_to_its_largest_gain_with_oil_and_load(rig: Rig) -> None:
+    """The poles of s^3 + 2 d w s^2 + w^2 s + w^2 k cross to the right there, w of a simulation."""
+    b, joint, speed = rig.nominal["b"], rig.joints[1], piston_gain(rig, 1)
+    cylinder, lever = joint.cylinder, float(joint.geometry(0.0)[1])
+    # The piston moved by a micrometre with both ports closed: pressures, force, frequency.
+    step = 1e-6
+    cap, rod = (-b * (v[1] - v[0]) / v[0] for v in rig.chamber_volumes(1, np.array([0.0, step])))
+    force = cylinder.cap_area * cap - cylinder.rod_area * rod
+    w = math.sqrt(-force / step * lever**2 / rig.nominal["M2"])
+    gain = largest_centring_gain(rig, 1)
+    for share, side in ((0.99, -1.0), (1.01, 1.0)):
+        poles = np.roots([1.0, 2 * OIL_DAMPING * w, w**2, w**2 * share * gain * speed])
+        assert side * max(poles.real) > 0.0
 
 
 def with_valve(rig: Rig, rate: float, hertz: float, damping: float) -> Rig:
