@@ -196,9 +196,10 @@ class CanPort:
             frames.append(reader.frames.get(timeout=max(timeout, 0.0)))
             while True:
                 frames.append(reader.frames.get_nowait())
+        frames = [frame for frame in frames if frame[0] >= 0]
         if not frames and reader.fault is not None:
             raise self._loss(reader.fault) from reader.fault
-        return [frame for frame in frames if frame[0] >= 0]
+        return frames
 
     def close(self) -> None:
         """Close the bus; never raises."""
@@ -388,4 +389,5 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    words = str(error).partition("Traceback")[0]  # which python-can appends
+    return " ".join(words.split())[:200] or type(error).__name__

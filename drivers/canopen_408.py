@@ -47,6 +47,7 @@ logger = logging.getLogger(__name__)
 PACKAGE: Final = "canopen"
 _COMMON: Final = frozenset({ch.SUPPLY, ch.TEMPERATURE})
 _PRE_OPERATIONAL: Final = 0x80  # NMT command
+_NODES: Final = range(1, 128)
 
 
 class ValveBusSettings(BusSettings):
@@ -86,7 +87,9 @@ class CanOpenValves:
         self._nodes: list[Any] = []
         self._mappings = self._find_sensors()
         keys = {0x580 + n for n in self._numbers} | self._tpdo_ids
-        keys |= {cia408.HEARTBEAT_ID + n for n in (*self._numbers, settings.host)}
+        # Of every node: which of them is another host, the valves say.
+        keys |= {cia408.HEARTBEAT_ID + n for n in _NODES}
+        keys |= {cia408.EMERGENCY_ID + n for n in self._numbers}
         place = BusPlace.of(settings.bus)
         self._port = CanPort(place, settings.bitrate, None, frozenset(keys), deliver=self._deliver)
         self._beat = threading.Lock()  # one heartbeat at a time
@@ -98,8 +101,10 @@ class CanOpenValves:
         self._idle_ended = threading.Event()
         self._idle_loss: str | None = None  # why the bus was lost between two calls
         self._in_control = False  # whether the valves supervise this host's heartbeat
-        self._other_host = False  # whether another host's heartbeat was heard
+        self._heard: set[int] = set()  # numbers of the nodes whose heartbeats were heard
         self._states: list[int] = [ValveState.INIT] * len(rig.joints)
+        self._operational: set[int] = set()  # numbers of the nodes that said so since the start
+        self._node_fault: str | None = None  # which valve has left operation since then
 
     @property
     def watchdog(self) -> float | None:
@@ -125,8 +130,7 @@ class CanOpenValves:
         threading.Thread(
             target=self._beat_at_zero, args=(self._idle_ended,), name="bramah-valves", daemon=True
         ).start()
-        for number in self._numbers:
-            self._network.send_message(0, bytes([1, number]))  # NMT: operational
+        self._start_nodes()
         self._send(np.zeros(len(self._nodes)), Control.DISABLED)
         self.read()
         self._send(np.zeros(len(self._nodes)), Control.DISABLED | Control.HOLD)
@@ -148,11 +152,12 @@ class CanOpenValves:
                 self._received.wait(min(remaining, 0.05))
             missing = sorted({1 + (cob - 1) % 0x80 for cob in self._awaited_ids})
         if missing:
+            self._usable()  # a bus that has gone is the cause
             # A late answer would be mistaken for the next one.
             self._port.close()
-            nodes = " ".join(str(number) for number in missing)
+            nodes = " and ".join(f"node {number}" for number in missing)
             raise DeviceLost(
-                f"node {nodes} at {self._port.where} did not answer SYNC for "
+                f"{nodes} at {self._port.where} did not answer SYNC for "
                 f"{self._wire.timeout:g} s; check wiring, node numbers and that the bus runs at "
                 f"{self._settings.bitrate} bit/s"
             )
@@ -179,7 +184,9 @@ class CanOpenValves:
             with suppress(DeviceError, *self._sdo_errors):
                 self._send(np.zeros(len(self._nodes)), Control.DISABLED)
                 for node in self._nodes:
-                    node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
+                    supervised = node.sdo[cia408.CONSUMER_HEARTBEAT][1]
+                    if supervised.raw >> 16 == self._settings.host:
+                        supervised.raw = 0
         self._in_control = False
         self._port.close()
 
@@ -203,7 +210,7 @@ class CanOpenValves:
             self._port.close()
 
     def fault(self) -> str | None:
-        """Return which valves are in a fault, None if there are none."""
+        """Return which valve is in a fault or out of operation, None if none is."""
         for number, state in zip(self._numbers, self._states, strict=True):
             if not state & 0b1000:
                 name = ValveState(state).name if state in set(ValveState) else f"{state:04b}"
@@ -211,11 +218,12 @@ class CanOpenValves:
                     f"valve {number} is in {name}: it missed the host's heartbeat or has found a "
                     "fault of its own"
                 )
-        return None
+        return self._node_fault
 
     def reset(self) -> None:
         """Clear the faults by a rising reset bit, the outputs at zero."""
         zero = np.zeros(len(self._nodes))
+        self._start_nodes()
         self._heartbeat(force=True)
         for word in (Control.DISABLED, Control.DISABLED | Control.RESET, Control.DISABLED):
             self._send(zero, word)
@@ -285,23 +293,30 @@ class CanOpenValves:
             node.sdo.RESPONSE_TIMEOUT = self._wire.timeout
             node.tpdo.subscribe()
 
+    def _start_nodes(self) -> None:
+        """Bring the nodes into operation (NMT)."""
+        self._operational, self._node_fault = set(), None
+        for number in self._numbers:
+            self._network.send_message(0, bytes([1, number]))
+
     def _refuse_other_host(self) -> None:
         """Raise DeviceBusy if the heartbeat of another host that the valves supervise is received.
 
-        Two hosts of one number would overwrite each other's set points, and the end of one would
-        switch the supervision of the other off.
+        Two hosts would overwrite each other's set points, and the end of one would switch the
+        supervision of the other off.
         """
-        self._other_host = False
+        self._heard = set()
         try:
             watched = [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in self._nodes]
         except self._sdo_errors:
             return  # `_configure` reports the cause
+        hosts = {entry >> 16 & 0x7F for entry in watched if entry}
         end = time.monotonic() + self._wire.watchdog
-        while any(watched) and time.monotonic() < end:
-            if self._other_host:
+        while hosts and time.monotonic() < end:
+            if others := hosts & self._heard:
                 self._port.close()
                 raise DeviceBusy(
-                    f"another host with the number {self._settings.host} drives the valves at "
+                    f"another host with the number {min(others)} drives the valves at "
                     f"{self._port.where}: its heartbeat is heard; end its run, or stop it"
                 )
             time.sleep(DRIVER.can_full)
@@ -327,8 +342,14 @@ class CanOpenValves:
             ) from error
 
     def _deliver(self, key: int, data: bytes) -> None:
-        if key == cia408.HEARTBEAT_ID + self._settings.host:
-            self._other_host = True
+        kind, number = key & ~0x7F, key & 0x7F
+        if kind == cia408.HEARTBEAT_ID:
+            self._heard.add(number)
+            self._note_state(number, data[0] if data else cia408.BOOT_UP)
+            return
+        if kind == cia408.EMERGENCY_ID:
+            code, register = int.from_bytes(data[:2], "little"), data[2:3].hex()
+            logger.warning("valve %d: emergency 0x%04X, register 0x%s", number, code, register)
             return
         network = self._network
         if network is None:
@@ -338,6 +359,14 @@ class CanOpenValves:
             self._awaited_ids.discard(key)
             if not self._awaited_ids:
                 self._received.notify_all()
+
+    def _note_state(self, number: int, state: int) -> None:
+        """Keep the state in a node's heartbeat: leaving operation is a fault, as is a restart."""
+        if state == cia408.OPERATIONAL:
+            self._operational.add(number)
+        elif number in self._numbers and (state == cia408.BOOT_UP or number in self._operational):
+            what = "has restarted" if state == cia408.BOOT_UP else f"is in NMT state {state}"
+            self._node_fault = f"valve {number} {what}: look at its supply and its plug"
 
     def _heartbeat(self, *, force: bool = False) -> None:
         with self._beat:
@@ -406,6 +435,16 @@ class CanOpen408Driver(PolledDriver):
         self._make_safe()
         self._valves.close(tripped=True)
         self.close()
+
+    def _reopened_at_zero(self) -> None:
+        """Take the valves out of operation, whoever drives them, before anything is configured."""
+        self._safely(self._valves.zero_beside_host)
+
+    def _read_sample(self) -> tuple[Array, float]:
+        """Read one sample; a valve's own fault is a trip at once."""
+        sample = super()._read_sample()
+        self._latch_fault()
+        return sample
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; refused while a valve is in a fault."""

@@ -230,6 +230,10 @@ class PolledDriver:
                 return
         self._streaming = False
         self._close_device()
+        self._reopened_at_zero()
+
+    def _reopened_at_zero(self) -> None:
+        """Open the device and put its outputs to zero; beside another host without opening it."""
         try:
             self._safely(self._device.open)
         except DeviceError as error:

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +18,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base import DeviceBusy, DeviceError, DeviceLost, OutputLaw
-from drivers.canopen_408 import CanOpen408Driver
+from drivers.canopen_408 import CanOpen408Driver, CanOpenValves
 from drivers.registry import wire_at
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.model.wire import cia408
+from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.cia408 import Control, ValveState, next_state
+from tests.drivers.can_bench import drop_all
+from tests.drivers.valve_bus import HeldValves
 from tests.drivers.wires import ROOT, device_at
-from tests.hil_sim.integrator import seed_rig
+from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 PATIENCE = 30.0
 DRIVING = [OutputLaw(bias=1.0, limit=2.0), OutputLaw(bias=-0.5, limit=2.0)]
@@ -41,9 +45,9 @@ def at() -> Iterator[str]:
         yield endpoint
 
 
-def host(endpoint: str, watchdog: float = 5.0) -> CanOpen408Driver:
+def host(endpoint: str, watchdog: float = 5.0, number: int = 127) -> CanOpen408Driver:
     rig = slow_rig()
-    wire = wire_at(endpoint, rig.wire)
+    wire = wire_at(f"{endpoint}?host={number}", rig.wire)
     return CanOpen408Driver(wire.model_copy(update={"watchdog": watchdog, "timeout": 5.0}), rig)
 
 
@@ -68,15 +72,139 @@ def test_valves_follow_their_set_points_and_return_to_zero(at: str) -> None:
     driver.close()
 
 
-def watched(endpoint: str) -> list[int]:
-    """The heartbeats that the valves watch, read as by a tool beside the host."""
+@contextmanager
+def tool(endpoint: str) -> Iterator[CanOpenValves]:
+    """Nodes and bus of a tool beside the host."""
     reader = host(endpoint)._valves
     reader._port.open()
     reader._make_network()
     try:
-        return [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in reader._nodes]
+        yield reader
     finally:
         reader._port.close()
+
+
+def watched(endpoint: str) -> list[int]:
+    """The heartbeats that the valves watch."""
+    with tool(endpoint) as reader:
+        return [node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw for node in reader._nodes]
+
+
+@contextmanager
+def driving(endpoint: str) -> Iterator[CanOpen408Driver]:
+    """A host that drives the valves; they are without a fault at the end."""
+    driver = host(endpoint)
+    driver.connect()
+    driver.start()
+    driver.apply(DRIVING)
+    while driver.read_block().data[-1, 0] < 0.09:
+        pass
+    yield driver
+    driver.reset()
+    driver.close()
+
+
+def trip_of(driver: CanOpen408Driver) -> str:
+    """The cause of a trip that a block reports, with the outputs of its last sample at zero."""
+    blocks = [driver.read_block()]
+    while not blocks[-1].tripped:
+        assert len(blocks) < 100
+        blocks.append(driver.read_block())
+    assert np.all(driver.read_block().data[-1, 10:] == 0.0)
+    return driver.trip_cause() or ""
+
+
+def test_a_valve_s_own_fault_trips_the_run_that_drives_it(at: str) -> None:
+    with driving(at) as driver, tool(at) as other:
+        # A watch of 20 ms on a heartbeat that comes every second.
+        other._nodes[0].sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 127 << 16 | 20
+        assert "valve 1 is in FAULT_DISABLED" in trip_of(driver)
+
+
+def test_a_valve_that_restarts_or_leaves_operation_trips_the_run(at: str) -> None:
+    for states, cause in ((b"\0", "valve 2 has restarted"), (b"\5\4", "is in NMT state 4")):
+        with driving(at) as driver, tool(at) as other:
+            for state in states:
+                other._port.send(CanFrame(cia408.HEARTBEAT_ID + 2, bytes([state])))
+            assert cause in trip_of(driver)
+
+
+def test_an_emergency_of_a_valve_is_in_the_log(at: str, caplog: pytest.LogCaptureFixture) -> None:
+    with driving(at) as driver, tool(at) as other:
+        other._port.send(CanFrame(cia408.EMERGENCY_ID + 1, bytes([0x10, 0x23, 1, 0, 0, 0, 0, 0])))
+        while "valve 1: emergency 0x2310, register 0x01" not in caplog.text:
+            assert not driver.read_block().tripped
+
+
+def test_a_stop_takes_the_valves_out_of_operation_before_anything_else(at: str) -> None:
+    """Listening for another host and configuring the valves take half a second."""
+    driver = host(at)
+    with driving(at) as first:
+        frames: list[CanFrame] = []
+        send = driver._valves._port.send
+
+        def noted(frame: CanFrame) -> None:
+            frames.append(frame)
+            send(frame)
+
+        driver._valves._port.send = noted  # type: ignore[method-assign]
+        driver.zero_outputs()
+        assert [(f.identifier, f.data) for f in frames[:2]] == [(0, b"\x80\x01"), (0, b"\x80\x02")]
+        assert watched(at) == [0, 0]
+        first.connect()
+
+
+def test_valves_that_a_host_of_another_number_drives_are_refused(at: str) -> None:
+    """Its own end would switch off the watch that the valves have on the first."""
+    with driving(at) as first:
+        watch = watched(at)
+        second = host(at, number=126)
+        ended = threading.Event()
+        beating = threading.Thread(target=_served, args=(first, ended))
+        beating.start()
+        with pytest.raises(DeviceBusy, match="another host with the number 127 drives the valves"):
+            second.connect()
+        second.close()
+        ended.set()
+        beating.join(PATIENCE)
+        assert watched(at) == watch == [127 << 16 | 5000] * 2
+
+
+def test_a_host_that_ends_leaves_the_watch_that_the_valves_have_on_another(at: str) -> None:
+    first = host(at)
+    first.connect()
+    with tool(at) as other:
+        for node in other._nodes:
+            node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 126 << 16 | 5000
+    first.close()
+    assert watched(at) == [126 << 16 | 5000] * 2
+
+
+def test_a_bus_that_has_gone_is_named_as_the_cause() -> None:
+    rig = seed_rig()
+    with HeldValves(rig, IntegratorPlant(rig)) as valves:
+        driver = valves.driver(rig)
+        driver.connect()
+        driver.start()
+        driver.read_block()
+        server, send = valves._server, driver._valves._port.send
+
+        def cut(frame: CanFrame) -> None:
+            if frame.identifier == cia408.SYNC_ID:
+                valves.adapter.inside(lambda: drop_all(server))
+            else:
+                send(frame)
+
+        driver._valves._port.send = cut  # type: ignore[method-assign]
+        with pytest.raises(DeviceLost, match="has gone: ") as lost:
+            driver.read_block()
+        assert "Traceback" not in str(lost.value)
+        driver.close()
+
+
+def _served(driver: CanOpen408Driver, ended: threading.Event) -> None:
+    while not ended.is_set():
+        driver.read_block()
 
 
 def test_valves_that_another_host_drives_are_refused_but_for_a_stop(at: str) -> None:

@@ -25,8 +25,10 @@ BY_BUS: Final = 1  # device mode: the set point comes by the bus
 POSITION_OPEN_LOOP: Final = 1  # control mode: the spool follows the set point
 
 SYNC_ID: Final = 0x080
+EMERGENCY_ID: Final = 0x080  # and the node's number
 HEARTBEAT_ID: Final = 0x700
 OPERATIONAL: Final = 5  # state in a heartbeat
+BOOT_UP: Final = 0  # the same, once after a node has started
 
 
 class Control(IntFlag):
