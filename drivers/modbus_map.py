@@ -289,6 +289,7 @@ class MappedModule:
         self._map = registers
         self._reads = spans(registers.inputs)
         self._writes = spans(registers.outputs, MAX_WRITE)
+        self._unread = False  # whether the module has refused to read its outputs back
 
     @property
     def watchdog(self) -> float | None:
@@ -351,6 +352,32 @@ class MappedModule:
         """End the connection."""
         self._link.close()
 
+    def confirm_zero(self) -> None:
+        """Read the outputs back by function 3; raises DeviceError where one is not at zero.
+
+        A module may answer a write and keep its output. One that does not read its outputs back
+        is named in a warning, once.
+        """
+        for span in self._writes:
+            try:
+                data = self._link.read(span.address, span.words)
+            except DeviceRefused as refused:
+                if not self._unread:
+                    logger.warning(
+                        "the %s acknowledges zero and does not read its outputs back (%s: %s): "
+                        "zero is not confirmed; look at the spools", self._identity, span, refused,
+                    )  # fmt: skip
+                self._unread = True
+                continue
+            for _, point in span.points:
+                first = 2 * (point.address - span.address)
+                volts = point.value(data[first : first + 2 * point.words])
+                if not abs(volts) <= DRIVER.zero_volts:
+                    raise DeviceError(
+                        f"output {point.name} of the {self._identity} holds {volts:.3g} V after "
+                        f"0 V was written to {span}: it does not obey; use the emergency stop"
+                    )
+
     def zero_beside_host(self) -> None:
         """Put every output to zero without setting the watchdog; closes the connection."""
         self._link.open()
@@ -361,6 +388,7 @@ class MappedModule:
 
     def _write_zeros(self) -> None:
         self.write(np.zeros(len(self._map.outputs)))
+        self.confirm_zero()
 
     @contextmanager
     def _naming_registers(self, registers: str) -> Iterator[None]:
@@ -415,6 +443,12 @@ class ModbusMapDriver(PolledDriver):
             accept_no_watchdog=settings.accept_no_watchdog,
             **pacing,
         )
+
+    def zero_outputs(self) -> None:
+        """Put every output to zero now and read it back; reopens the module if need be."""
+        super().zero_outputs()
+        if self._open:
+            self._safely(self._module.confirm_zero)
 
     def doubts(self) -> Mapping[str, str]:
         """Return the channels whose registers may be read in the wrong order, with reasons."""

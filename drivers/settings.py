@@ -20,6 +20,7 @@ class DriverSettings:
     quiet: float = 0.05  # [s] without a byte, after which a late answer on a line is over
     babble: float = 1.0  # [s] of bytes without a pause, after which the line counts as lost
     busy_pause: float = 0.01  # [s] before a request is sent again to a module that was busy
+    zero_volts: float = 0.02  # [V] that an output read back may hold at zero: coarse steps
     resolved: float = 1e-7  # of a sensor's range: a smaller value is read in the wrong word order
 
     # Messages over serial lines and CAN.

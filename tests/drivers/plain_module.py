@@ -6,10 +6,12 @@ as one in real time. Its map, which only a rig file tells a host:
 
 holding registers (functions 3, 6, 16)
     0 piston_1 int16 10 um    1 spool_1 int16 1 mV    2 cap_1, 4 rod_1 float32 low word first, bar
-    100 valve 1, 101 valve 2 int16 5 mV
+    100 valve 1, 101 valve 2 int16 5 mV, read back as put out
     200 watchdog [ms], 0 is off       210, 211 the voltages put out, int16 mV; ignores writes
     300 a write of n lets the next read of register 0 wait for n ms
     301 a write of n lets the next n requests be refused as busy (exception 6)
+    302 after a write of 1 the valves keep their voltage, whatever is written and acknowledged
+    303 after a write of 1 the valves' registers cannot be read (exception 1)
 input registers (function 4)
     10 piston_2 int32 um      12 spool_2 int16 1 mV
     13 cap_2 uint32 1 Pa above -1 bar                 15 rod_2 uint16 1 kPa above -1 bar
@@ -74,6 +76,8 @@ class Module:
         self.watchdog = 0
         self.wait = 0.0
         self.busy = 0
+        self.keeps = False
+        self.unread = False
         self._written = time.monotonic()
 
     async def access(
@@ -93,6 +97,8 @@ class Module:
             self.volts = [0.0, 0.0]
         if values is not None:
             return self._write(address, list(values))
+        if self.unread and address in (100, 101):
+            return ExcCodes.ILLEGAL_FUNCTION
         if address == 0:
             wait, self.wait = self.wait, 0.0
             await asyncio.sleep(wait)
@@ -102,6 +108,8 @@ class Module:
         return None
 
     def _write(self, address: int, words: list[int]) -> ExcCodes | None:
+        if self.keeps and address in (100, 101):
+            return None
         if address in (100, 101):
             for i, word in enumerate(words):
                 signed = struct.unpack(">h", struct.pack(">H", word))[0]
@@ -115,6 +123,10 @@ class Module:
             self.wait = words[0] * 1e-3
         elif address == 301:
             self.busy = words[0]
+        elif address == 302:
+            self.keeps = bool(words[0])
+        elif address == 303:
+            self.unread = bool(words[0])
         elif address not in (210, 211):
             return ExcCodes.ILLEGAL_ADDRESS
         return None
@@ -125,6 +137,7 @@ class Module:
         return {
             0: struct.pack(">hh", piston, spool),
             2: cap[2:] + cap[:2] + rod[2:] + rod[:2],
+            100: struct.pack(">hh", *(round(volts / 0.005) for volts in self.volts)),
             200: struct.pack(">H", self.watchdog),
             210: struct.pack(">hh", *(round(1e3 * volts) for volts in self.volts)),
         }
@@ -142,7 +155,7 @@ async def serve(parent: int) -> None:
     """Serve until the parent process is gone."""
     module = Module()
     bits = [SimData(0, values=[False] * 16, datatype=DataType.BITS)]
-    holding = [plain(0, 6), plain(100, 102), plain(200, 201), plain(210, 212), plain(300, 302)]
+    holding = [plain(0, 6), plain(100, 102), plain(200, 201), plain(210, 212), plain(300, 304)]
     device = SimDevice(7, simdata=(bits, bits, holding, [plain(10, 19)]), action=module.access)
     server = ModbusTcpServer(device, address=("127.0.0.1", 0))
     await server.serve_forever(background=True)

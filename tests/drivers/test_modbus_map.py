@@ -205,6 +205,41 @@ def test_outputs_are_zeroed_although_the_watchdog_cannot_be_set(
     assert put_out(port) == [0.0, 0.0]
 
 
+def test_an_output_that_is_acknowledged_and_kept_is_not_confirmed_at_zero(
+    port: int, tmp_path: Path
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(rig_text(WIRE.format(port=port)))
+    for register, value in ((200, 0), (100, 500), (302, 1)):  # the watchdog would zero it
+        put_into(port, register, value)
+    try:
+        with pytest.raises(DeviceError, match=r"output 1 .* holds 2.5 V after 0 V was written"):
+            in_fake_time(rig_of(port)).connect()
+        stopped = bramah_here("stop", "--rig", rig)
+    finally:
+        put_into(port, 302, 0)
+    assert stopped.returncode == 4
+    assert stopped.stderr.startswith("bramah: outputs not confirmed at zero")
+    assert "output 1 of the I/O module" in stopped.stderr
+    assert "confirmed by the device" not in stopped.stdout
+    assert bramah_here("stop", "--rig", rig).returncode == 0
+    assert put_out(port) == [0.0, 0.0]
+
+
+def test_a_module_that_does_not_read_its_outputs_back_is_named_once(
+    driver: ModbusMapDriver, port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    put_into(port, 303, 1)
+    try:
+        for _ in range(2):
+            driver.zero_outputs()
+    finally:
+        put_into(port, 303, 0)
+    said = [r.message for r in caplog.records if "does not read its outputs back" in r.message]
+    assert len(said) == 1
+    assert "registers 100 to 101 (output 1 output 2)" in said[0]
+
+
 def test_a_module_that_is_busy_for_a_moment_is_asked_again(
     driver: ModbusMapDriver, port: int
 ) -> None:
