@@ -14,11 +14,11 @@ from contextlib import suppress
 from drivers.base import DeviceError, DeviceLost
 from protocols.engine.plan_runner import OnPhase, PlanRunner
 from protocols.engine.run_inputs import RunInputs
-from protocols.engine.session import BenchSession
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded
 from protocols.files.plan import Plan
 from protocols.files.schema import Retry
 from protocols.steps.base import PlannedStep
+from rig.bench.session import Bench
 from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed, SafetyTrip
 
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 def run(
     plan: Plan,
     rig: Rig,
-    bench: BenchSession,
+    bench: Bench,
     on_phase: OnPhase | None = None,
     inputs: RunInputs | None = None,
 ) -> None:

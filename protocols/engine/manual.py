@@ -19,11 +19,11 @@ import numpy as np
 
 from drivers.base import OFF, OutputLaw
 from protocols.engine.locking import position_law
-from protocols.engine.session import BenchSession
 from protocols.engine.settings import ENGINE
 from protocols.steps.parts import Place
 from rig.bench.guard import FREE, JOGGED, JointRole
 from rig.bench.screens.commands import Command
+from rig.bench.session import Bench
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -37,7 +37,7 @@ class Manual:
 
     def __init__(
         self,
-        bench: BenchSession,
+        bench: Bench,
         rig: Rig,
         clock: Callable[[], float] = time.monotonic,
         *,

@@ -12,7 +12,7 @@ import numpy as np
 from protocols.engine.excitation import ExcitationRun
 from protocols.engine.locking import Hold, lock, move, placement
 from protocols.engine.run_inputs import RunInputs
-from protocols.engine.session import BenchSession, Session
+from protocols.engine.session import Session
 from protocols.engine.settings import ENGINE
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded, StateMachine
 from protocols.files.plan import Plan
@@ -21,6 +21,7 @@ from protocols.steps.base import PlannedStep, Question
 from protocols.steps.excite import Step
 from protocols.steps.plans import LockPlan
 from rig.bench.guard import FREE
+from rig.bench.session import Bench
 from rig.model.rig import Rig
 from rig.model.trips import OperatorStop
 from rig.runs.recorder import RecordMeta
@@ -35,7 +36,7 @@ class PlanRunner:
     """One run of a plan: its session, its state, steps done and remaining."""
 
     def __init__(
-        self, plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase, inputs: RunInputs
+        self, plan: Plan, rig: Rig, bench: Bench, on_phase: OnPhase, inputs: RunInputs
     ) -> None:
         self.bench = bench
         self.inputs = inputs

@@ -2,97 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
-from typing import Any, Protocol, Self
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import OFF, DeviceInfo, OutputLaw, SampleBlock
+from drivers.base import OFF, OutputLaw
 from protocols.engine.states import StateMachine
-from rig.bench.guard import JointRole
-from rig.bench.screens.commands import Judge
+from rig.bench.session import Bench
 from rig.model import channels as ch
 from rig.model.rig import Rig
-from rig.runs.recorder import RecordMeta
 
 Array = NDArray[np.float64]
 Watch = Callable[[], None]
-
-
-class OpenRecord(Protocol):
-    """A record in progress: complete at the end of its `with` block, partial if left early."""
-
-    def __enter__(self) -> Self:
-        """Begin the record."""
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End the record."""
-
-    def note(self, **attributes: str | float | int) -> None:
-        """Add attributes that are known only now."""
-
-    def discard(self, reason: str) -> None:
-        """Discard the record; its samples stay in the run."""
-
-
-class BenchSession(Protocol):
-    """The engine's interface of `rig.bench.session.Bench`."""
-
-    info: DeviceInfo
-
-    @property
-    def tick(self) -> int:
-        """The tick after the last sample read."""
-
-    def zero_outputs(self) -> bool:
-        """Put the outputs to zero now; False if the device does not answer."""
-
-    def reconnect(self, wait: float) -> None:
-        """Reconnect to a device that was lost."""
-
-    def listen(self, judge: Judge) -> None:
-        """Let `judge` accept or refuse the commands of screens."""
-
-    def status(self, **changes: Any) -> None:
-        """Publish the state of the protocol."""
-
-    def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
-        """Note one event in the run's log."""
-
-    def upload(self, joint: int, wave: Array) -> None:
-        """Store one period of a joint's (0-based) waveform [V]."""
-
-    def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
-        """Set all laws; returns the tick from which they hold."""
-
-    def exchange(self, more: bool = False) -> SampleBlock:
-        """Read one block, checked and journalled; raises what ends a run, outputs zeroed.
-
-        `more` states that another exchange follows without a command between them.
-        """
-
-    def guard(self, roles: Sequence[JointRole]) -> None:
-        """Set the role of each joint, and thereby its limits."""
-
-    def record(
-        self, meta: RecordMeta | None = None, *, start_tick: int | None = None,
-        ticks: int | None = None,
-    ) -> OpenRecord:  # fmt: skip
-        """Begin a record of `ticks` samples from `start_tick`, used in a `with` block."""
 
 
 class Session:
     """Holds the laws in force and the recent samples; every wait is in device time."""
 
     def __init__(
-        self, bench: BenchSession, rig: Rig, keep: int, machine: StateMachine, before_block: Watch
+        self, bench: Bench, rig: Rig, keep: int, machine: StateMachine, before_block: Watch
     ) -> None:
         """Keep the last `keep` samples; `before_block` is called before each block."""
         self.bench = bench

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from protocols.files.plan import Overrides, resolve
 from protocols.files.schema import Protocol
 from rig.bench.guard import JointRole
 from rig.bench.screens.commands import Judge
+from rig.bench.session import Bench
 from rig.model import channels as ch
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -64,7 +65,7 @@ class _Handle:
 
 
 class DirectBench:
-    """A `protocols.engine.session.Bench` on a plant of this process."""
+    """A `rig.bench.session.Bench`, as far as the engine uses it, on a plant of this process."""
 
     def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
         self.rig = rig
@@ -173,5 +174,5 @@ def simulated_run(
     one = library.load(protocol) if isinstance(protocol, str) else protocol
     plan = resolve(one, rig, overrides or Overrides())
     bench = DirectBench(rig, scenario or Scenario(), seed)
-    engine.run(plan, rig, bench)
+    engine.run(plan, rig, cast("Bench", bench))
     return Run(rig, tuple(bench.records), f"{one.name}, seed {seed}"), bench.plant.truth()
