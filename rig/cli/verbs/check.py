@@ -4,35 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rig.cli.options import (
-    DurationOption,
-    JsonOption,
-    ModelOption,
-    NominalOption,
-    ProtocolArgument,
-    RepeatsOption,
-    RigOption,
-    ScaleOption,
-    SetOption,
-    StepOption,
-    WaveSeedOption,
-    overridden,
-)
+from rig.cli import options as opt
 from rig.cli.text.output import Countdown, print_result, progress
 
 
 def check(
-    protocol: ProtocolArgument,
-    rig: RigOption,
-    repeats: RepeatsOption = None,
-    duration: DurationOption = None,
-    amplitude_scale: ScaleOption = 1.0,
-    wave_seed: WaveSeedOption = None,
-    step: StepOption = None,
-    set_: SetOption = None,
-    model: ModelOption = None,
-    nominal: NominalOption = False,
-    json: JsonOption = None,
+    protocol: opt.ProtocolArgument,
+    rig: opt.RigOption,
+    repeats: opt.RepeatsOption = None,
+    duration: opt.DurationOption = None,
+    amplitude_scale: opt.ScaleOption = 1.0,
+    wave_seed: opt.WaveSeedOption = None,
+    step: opt.StepOption = None,
+    set_: opt.SetOption = None,
+    model: opt.ModelOption = None,
+    nominal: opt.NominalOption = False,
+    json: opt.JsonOption = None,
 ) -> None:
     """Prove a protocol against the limits on the twin and predict its errors; nothing moves.
 
@@ -45,7 +32,7 @@ def check(
     from rig.cli.proof.twin_choice import twin_source
     from rig.cli.text.sheets import check_text
 
-    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
+    changes = opt.overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
     bench = bench_at(rig, None, on_twin=True)
     warn_of_limits(bench)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)

@@ -6,20 +6,13 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import (
-    JsonOption,
-    ModelOption,
-    NominalOption,
-    ProtocolArgument,
-    ProtocolFileOption,
-    RigOption,
-)
+from rig.cli import options as opt
 
 
 def design(
-    protocol: ProtocolArgument,
-    rig: RigOption,
-    out: ProtocolFileOption = None,
+    protocol: opt.ProtocolArgument,
+    rig: opt.RigOption,
+    out: opt.ProtocolFileOption = None,
     criterion: Annotated[
         str, typer.Option(help="D, E, or the name of the parameter to improve.")
     ] = "E",
@@ -29,9 +22,9 @@ def design(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the search; the same seed gives the same result.")
     ] = 0,
-    model: ModelOption = None,
-    nominal: NominalOption = False,
-    json: JsonOption = None,
+    model: opt.ModelOption = None,
+    nominal: opt.NominalOption = False,
+    json: opt.JsonOption = None,
 ) -> None:
     """Improve a protocol's multisines for better estimates, within the rig's limits.
 

@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli import options as opt
 from rig.cli.errors import code_and_message
-from rig.cli.options import (
-    EndpointOption,
-    JsonOption,
-    RepeatsOption,
-    RigOption,
-    ScaleOption,
-    writable_file,
-)
 from rig.cli.text.output import is_terminal, printed_at_end, progress, write_json
 
 if TYPE_CHECKING:
@@ -26,11 +19,11 @@ if TYPE_CHECKING:
 
 
 def loop(
-    rig: RigOption,
+    rig: opt.RigOption,
     out: Annotated[
         Path, typer.Option(help="A folder for the runs and the report, made if needed.")
     ],
-    endpoint: EndpointOption = None,
+    endpoint: opt.EndpointOption = None,
     unattended: Annotated[
         bool, typer.Option("--unattended", help="Run designed experiments without asking.")
     ] = False,
@@ -38,8 +31,8 @@ def loop(
     protocol: Annotated[
         str, typer.Option(help="Protocol of the first run: a shipped one or a file.")
     ] = "lock-and-excite-multisine",
-    repeats: RepeatsOption = None,
-    amplitude_scale: ScaleOption = 1.0,
+    repeats: opt.RepeatsOption = None,
+    amplitude_scale: opt.ScaleOption = 1.0,
     until_visible: Annotated[
         bool,
         typer.Option(
@@ -54,11 +47,11 @@ def loop(
     scenario: Annotated[
         str | None, typer.Option(help="Scenario of --simulate, as for sim, such as random.")
     ] = None,
-    json: JsonOption = None,
+    json: opt.JsonOption = None,
     report: Annotated[
         Path | None,
         typer.Option(
-            help="The report of all rounds.  [default: OUT/loop.html]", callback=writable_file
+            help="The report of all rounds.  [default: OUT/loop.html]", callback=opt.writable_file
         ),
     ] = None,
     operator: Annotated[

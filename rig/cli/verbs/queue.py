@@ -8,22 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import (
-    DurationOption,
-    EndpointOption,
-    JsonOption,
-    ModelOption,
-    NominalOption,
-    ProtocolArgument,
-    RepeatsOption,
-    RigOption,
-    ScaleOption,
-    StepOption,
-    WaveSeedOption,
-    one_line,
-    time_since,
-    writable_file,
-)
+from rig.cli import options as opt
 from rig.cli.text.output import print_result, progress, table
 
 if TYPE_CHECKING:
@@ -81,17 +66,17 @@ def queue_group() -> None:
 
 def add(
     context: typer.Context,
-    protocol: ProtocolArgument,
-    rig: RigOption,
+    protocol: opt.ProtocolArgument,
+    rig: opt.RigOption,
     out: Annotated[
         Path | None, typer.Option(help="The run folder.  [default: runs/NUMBER-PROTOCOL here]")
     ] = None,
-    endpoint: EndpointOption = None,
-    repeats: RepeatsOption = None,
-    duration: DurationOption = None,
-    amplitude_scale: ScaleOption = 1.0,
-    wave_seed: WaveSeedOption = None,
-    step: StepOption = None,
+    endpoint: opt.EndpointOption = None,
+    repeats: opt.RepeatsOption = None,
+    duration: opt.DurationOption = None,
+    amplitude_scale: opt.ScaleOption = 1.0,
+    wave_seed: opt.WaveSeedOption = None,
+    step: opt.StepOption = None,
     priority: Annotated[
         int, typer.Option(min=-100, max=100, help="Items of higher priority start first.")
     ] = 0,
@@ -120,16 +105,16 @@ def add(
         typer.Option(help="Wait for a measured condition, such as 'oil_temperature > 40 degC'."),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the item in lists.", callback=one_line)
+        str | None, typer.Option(help="Name of the item in lists.", callback=opt.one_line)
     ] = None,
     operator: Annotated[
-        str | None, typer.Option(help="Name written into the run.", callback=one_line)
+        str | None, typer.Option(help="Name written into the run.", callback=opt.one_line)
     ] = None,
-    model: ModelOption = None,
-    nominal: NominalOption = False,
+    model: opt.ModelOption = None,
+    nominal: opt.NominalOption = False,
     identify: Annotated[bool, typer.Option(help="Identify from the run when it is done.")] = True,
     queue: QueueOption = None,
-    json: JsonOption = None,
+    json: opt.JsonOption = None,
 ) -> None:
     """Prove an item on the twin and queue it; further options of `bramah check` follow after `--`.
 
@@ -265,7 +250,7 @@ def list_items(
         list[str] | None, typer.Option("--state", help="Only items in this state; repeatable.")
     ] = None,
     queue: QueueOption = None,
-    json: JsonOption = None,
+    json: opt.JsonOption = None,
 ) -> None:
     """List the items in the order in which they start.
 
@@ -297,7 +282,7 @@ def list_items(
     print_result(json, document, "\n".join(lines))
 
 
-def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
+def show(item: ItemArgument, queue: QueueOption = None, json: opt.JsonOption = None) -> None:
     """Show one item with its history and the end of its log.
 
     Example: bramah queue show 3
@@ -346,11 +331,11 @@ def run(
     page: Annotated[
         Path | None,
         typer.Option(
-            help="Write the page of the night here when the queue ends.", callback=writable_file
+            help="Write the page of the night here when the queue ends.", callback=opt.writable_file
         ),
     ] = None,
     queue: QueueOption = None,
-    json: JsonOption = None,
+    json: opt.JsonOption = None,
 ) -> None:
     """Run the queue, one item at a time; Ctrl-C zeroes the outputs, then ends the current item.
 
@@ -393,7 +378,7 @@ def run(
 
 def write_night_page(
     out: Annotated[
-        Path, typer.Option(help="The HTML file to write.", callback=writable_file)
+        Path, typer.Option(help="The HTML file to write.", callback=opt.writable_file)
     ] = Path("night.html"),
     since: Annotated[
         str | None, typer.Option(help="Only since 2026-03-01T22:00, or 12h ago.")
@@ -406,7 +391,7 @@ def write_night_page(
     """
     from rig.cli.text.night import write_page
 
-    begin = time_since(since)
+    begin = opt.time_since(since)
     with _open_queue(queue) as store:
         write_page(out, store, begin)
     typer.echo(str(out))
@@ -415,7 +400,7 @@ def write_night_page(
 def pause(
     off: Annotated[bool, typer.Option("--off", help="Continue the queue.")] = False,
     queue: QueueOption = None,
-    json: JsonOption = None,
+    json: opt.JsonOption = None,
 ) -> None:
     """Start no further item; the current one runs to its end. --off continues the queue.
 
@@ -432,7 +417,7 @@ def pause(
     print_result(json, {"paused": not off, "active": active}, text)
 
 
-def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
+def cancel(item: ItemArgument, queue: QueueOption = None, json: opt.JsonOption = None) -> None:
     """Cancel an item; a running one is ended safely, its outputs zeroed first.
 
     Example: bramah queue cancel 3
@@ -455,7 +440,7 @@ def move(
         int | None, typer.Option(min=-100, max=100, help="Change its priority to this.")
     ] = None,
     queue: QueueOption = None,
-    json: JsonOption = None,
+    json: opt.JsonOption = None,
 ) -> None:
     """Move a queued item: before another, or first (or --last) of its priority.
 
@@ -472,7 +457,7 @@ def move(
     _print_item(moved, json, f"priority {moved.priority}, place {moved.place:g}")
 
 
-def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None) -> None:
+def retry(item: ItemArgument, queue: QueueOption = None, json: opt.JsonOption = None) -> None:
     """Queue an ended item again; it keeps its place and runs into a new folder.
 
     Example: bramah queue retry 3

@@ -7,21 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import (
-    DurationOption,
-    EndpointOption,
-    ModelOption,
-    NominalOption,
-    ProtocolArgument,
-    RepeatsOption,
-    RigOption,
-    ScaleOption,
-    SetOption,
-    StepOption,
-    WaveSeedOption,
-    one_line,
-    overridden,
-)
+from rig.cli import options as opt
 from rig.cli.text.output import progress
 
 
@@ -34,22 +20,22 @@ def _above_zero(param: typer.CallbackParam, value: float) -> float:
 
 
 def run(
-    protocol: ProtocolArgument,
-    rig: RigOption,
+    protocol: opt.ProtocolArgument,
+    rig: opt.RigOption,
     out: Annotated[Path, typer.Option(help="The run folder to make.")],
-    endpoint: EndpointOption = None,
-    repeats: RepeatsOption = None,
-    duration: DurationOption = None,
-    amplitude_scale: ScaleOption = 1.0,
-    wave_seed: WaveSeedOption = None,
-    step: StepOption = None,
-    set_: SetOption = None,
+    endpoint: opt.EndpointOption = None,
+    repeats: opt.RepeatsOption = None,
+    duration: opt.DurationOption = None,
+    amplitude_scale: opt.ScaleOption = 1.0,
+    wave_seed: opt.WaveSeedOption = None,
+    step: opt.StepOption = None,
+    set_: opt.SetOption = None,
     operator: Annotated[
         str | None,
-        typer.Option(help="Name written into the run.  [default: the user]", callback=one_line),
+        typer.Option(help="Name written into the run.  [default: the user]", callback=opt.one_line),
     ] = None,
-    model: ModelOption = None,
-    nominal: NominalOption = False,
+    model: opt.ModelOption = None,
+    nominal: opt.NominalOption = False,
     track: Annotated[
         bool, typer.Option("--track", help="Estimate b and the flow gains during the run.")
     ] = False,
@@ -71,7 +57,7 @@ def run(
     """
     from rig.cli.execution.protocol_run import ProtocolJob, run_protocol
 
-    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
+    changes = opt.overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
     job = ProtocolJob(
         protocol, rig, out, endpoint, changes, operator, track, memory, attended, model, nominal
     )
