@@ -60,11 +60,7 @@ class MessageStreamDriver:
     host_timed: ClassVar[bool] = False
 
     def __init__(
-        self,
-        wire: Wire,
-        rig: Rig,
-        line: MessageLine,
-        clock: Callable[[], float] = time.monotonic,
+        self, wire: Wire, rig: Rig, line: MessageLine, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._wire = wire
         self._rig = rig

@@ -437,11 +437,7 @@ class ModbusMapDriver(PolledDriver):
         ranges = [sensor.range for sensor in sensors]
         self._module = MappedModule(settings, register_map(settings, rig), ranges, wire.timeout)
         super().__init__(
-            wire,
-            rig,
-            self._module,
-            accept_no_watchdog=settings.accept_no_watchdog,
-            **pacing,
+            wire, rig, self._module, accept_no_watchdog=settings.accept_no_watchdog, **pacing
         )
 
     def zero_outputs(self) -> None:

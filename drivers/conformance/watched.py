@@ -147,8 +147,5 @@ def rows_of(block: SampleBlock, first: int, end: int | None = None) -> SampleBlo
     """Return the rows [first, end) of a block."""
     rows = slice(first, end)
     return replace(
-        block,
-        tick=block.tick + first,
-        data=block.data[rows],
-        saturated=block.saturated[rows],
+        block, tick=block.tick + first, data=block.data[rows], saturated=block.saturated[rows]
     )

@@ -26,10 +26,7 @@ def jit(function: Callable[P, R]) -> Callable[P, R]:
     Its arrays' references are not counted: counting views of rows took half of the plant's time.
     """
     compiled: Callable[P, R] = numba.njit(
-        cache=True,
-        _nrt=False,
-        error_model="numpy",
-        fastmath={"contract", "reassoc", "arcp", "nsz"},
+        cache=True, _nrt=False, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"}
     )(function)
     return compiled
 

@@ -18,13 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from protocols.design.check_report import (
-    CheckReport,
-    Moment,
-    MotionPrediction,
-    StepCheck,
-    widened,
-)
+from protocols.design.check_report import CheckReport, Moment, MotionPrediction, StepCheck, widened
 from protocols.design.settings import DESIGN
 from protocols.engine.centring import Array, follow, under_loop
 from protocols.files.plan import Plan

@@ -42,9 +42,7 @@ class AmplitudeSignal(SignalKind):
     """A signal with one amplitude: volts of command, or millimetres of piston to either side."""
 
     amplitude: Voltage = Field(
-        default=0.0,
-        gt=0,
-        description="peak of the command [V], or of the piston's motion: '20 mm'",
+        default=0.0, gt=0, description="peak of the command [V], or of the piston's motion: '20 mm'"
     )
     travel: Length | None = Field(
         default=None, gt=0, description="peak of the piston's motion [m], instead of volts"

@@ -8,13 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from protocols.language.signal import AmplitudeSignal
-from protocols.language.waveforms import (
-    SMOOTH,
-    Waveform,
-    seconds_to_samples,
-    shaped,
-    smooth_edge,
-)
+from protocols.language.waveforms import SMOOTH, Waveform, seconds_to_samples, shaped, smooth_edge
 from rig.model.quantity import Time
 
 

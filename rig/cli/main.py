@@ -41,12 +41,7 @@ nothing, `bramah check` proves a protocol, `bramah run` runs it; then come `bram
 
 def command_line(verbs: Sequence[str]) -> typer.Typer:
     """Return the command line with `verbs` complete and all others by name and summary only."""
-    app = typer.Typer(
-        name=NAME,
-        help=GUIDE,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-    )
+    app = typer.Typer(name=NAME, help=GUIDE, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_bramah)
     for verb in VERBS:
         name = f"{verb}_" if iskeyword(verb) else verb

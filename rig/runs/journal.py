@@ -215,11 +215,7 @@ class Journal:
 
     @classmethod
     def create(
-        cls,
-        path: Path,
-        columns: Sequence[str],
-        measured: int,
-        sample_rate: float,
+        cls, path: Path, columns: Sequence[str], measured: int, sample_rate: float
     ) -> Journal:
         """Start the journal of `columns` (the first `measured` are sensors); RecordingFailed."""
         # Created under another name and renamed: a kill leaves no journal or a usable one.

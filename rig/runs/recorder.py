@@ -136,10 +136,7 @@ class Recorder:
         self._events = EventLog(self.folder)
         self.event("start", device=info.identity, virtual_time=info.virtual_time)
         self._journal = Journal.create(
-            self.folder / JOURNAL,
-            self.rig.recorded,
-            len(self.rig.channels),
-            info.sample_rate,
+            self.folder / JOURNAL, self.rig.recorded, len(self.rig.channels), info.sample_rate
         )
 
     def _open_journal(self) -> Journal:
@@ -203,12 +200,7 @@ class Recorder:
         return number
 
     def end_record(
-        self,
-        number: int,
-        meta: RecordMeta,
-        ticks: int,
-        state: str,
-        more: Mapping[str, Attribute],
+        self, number: int, meta: RecordMeta, ticks: int, state: str, more: Mapping[str, Attribute]
     ) -> None:
         """Close a record after `ticks` samples: `state` is complete, partial or discarded."""
         self._open_journal().end_mark(number, ticks, state, meta.as_dict(more))

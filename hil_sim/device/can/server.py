@@ -6,13 +6,7 @@ from hil_sim.device.device import Device
 from hil_sim.device.message_session import MessageSession
 from rig.model.rig import Rig
 from rig.model.wire.can_database import database_text
-from rig.model.wire.can_frames import (
-    CanFrame,
-    PartCollector,
-    block_frames,
-    part_frames,
-    read_alive,
-)
+from rig.model.wire.can_frames import CanFrame, PartCollector, block_frames, part_frames, read_alive
 from rig.model.wire.can_layout import EXTENDED, CanLayout, read_layout
 
 

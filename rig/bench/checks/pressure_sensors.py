@@ -48,11 +48,7 @@ def swing_ratio(rig: Rig, joint: int, piston: float) -> float:
 
 
 def swapped(
-    rig: Rig,
-    settings: GuardSettings,
-    closed: Sequence[int],
-    rows: Array,
-    noise: Sequence[float],
+    rig: Rig, settings: GuardSettings, closed: Sequence[int], rows: Array, noise: Sequence[float]
 ) -> Iterator[PressureFinding]:
     """Find sensors of closed cylinders that are exchanged with sensors of another joint.
 

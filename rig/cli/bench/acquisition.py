@@ -69,10 +69,7 @@ def acquisition_figures(say: Say, minutes: float) -> list[Figure]:
 
 
 def measure_acquisition(
-    driver: Driver,
-    info: DeviceInfo,
-    seconds: float,
-    clock: Callable[[], float] = time.perf_counter,
+    driver: Driver, info: DeviceInfo, seconds: float, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, float | int]:
     """Stream for `seconds` of device time, outputs unchanged; count lost samples and time blocks.
 

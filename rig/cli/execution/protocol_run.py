@@ -89,13 +89,7 @@ class _PhaseReport:
         self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{suffix}")
         self._message = message
         self._bench.event("phase", self._bench.tick, step=step, phase=phase, message=message)
-        self._bench.status(
-            step=step,
-            phase=phase,
-            repeat=repeat,
-            repeats=repeats,
-            message=message,
-        )
+        self._bench.status(step=step, phase=phase, repeat=repeat, repeats=repeats, message=message)
 
     def tracked(self, tracking: Tracking, estimate: str) -> None:
         """Publish an estimate, all estimates with their intervals, and the residuals."""

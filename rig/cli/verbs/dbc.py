@@ -10,8 +10,7 @@ from rig.cli.options import RigOption
 
 
 def dbc(
-    rig: RigOption,
-    fd: Annotated[bool, typer.Option("--fd", help="Use CAN FD frames.")] = False,
+    rig: RigOption, fd: Annotated[bool, typer.Option("--fd", help="Use CAN FD frames.")] = False
 ) -> None:
     """Print the DBC file of a rig: the messages of its bench on a CAN bus.
 

@@ -150,8 +150,7 @@ def identify(
     bootstrap: Annotated[
         int,
         typer.Option(
-            min=0,
-            help="Bootstrap draws of whole repeats for the intervals; 0: from their scatter.",
+            min=0, help="Bootstrap draws of whole repeats for the intervals; 0: from their scatter."
         ),
     ] = 0,
     filtering: Annotated[

@@ -33,8 +33,7 @@ def monitor(
         typer.Option(help="Port of --web; 0 takes a free one.  [default: 0]", min=0, max=65535),
     ] = None,
     runs: Annotated[
-        Path,
-        typer.Option("--runs", help="Folder of the listed runs and of new ones."),
+        Path, typer.Option("--runs", help="Folder of the listed runs and of new ones.")
     ] = Path(),
     endpoint: EndpointOption = None,
 ) -> None:

@@ -40,8 +40,7 @@ def run(
         bool, typer.Option("--track", help="Estimate b and the flow gains during the run.")
     ] = False,
     memory: Annotated[
-        float,
-        typer.Option(help="Forgetting time constant of --track [s].", callback=_above_zero),
+        float, typer.Option(help="Forgetting time constant of --track [s].", callback=_above_zero)
     ] = float("inf"),
     attended: Annotated[
         bool | None,

@@ -33,8 +33,7 @@ def trace(
         typer.Option(help="Write the model file with the effects here.", callback=writable_file),
     ] = None,
     like: Annotated[
-        Path | None,
-        typer.Option(help="Start from this model file and take its effects as known."),
+        Path | None, typer.Option(help="Start from this model file and take its effects as known.")
     ] = None,
     report: ReportOption = None,
     equations: Annotated[

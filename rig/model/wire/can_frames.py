@@ -170,11 +170,7 @@ def block_frames(layout: CanLayout, block: BlockLayout, message: WireFrame) -> l
             }
             frames.append(frame_of(part, part.pack(values)))
     (checksum,) = _CHECK.unpack(encode_body(message)[-_CHECK.size :])
-    check = {
-        "check_sum": checksum,
-        "check_oldest": pushed.oldest,
-        "check_backlog": header.backlog,
-    }
+    check = {"check_sum": checksum, "check_oldest": pushed.oldest, "check_backlog": header.backlog}
     frames.append(frame_of(layout.check, layout.check.pack(check)))
     return frames
 

@@ -382,10 +382,7 @@ def _write(
     source: _Source, records: list[_Imported], folder: Path, warnings: tuple[str, ...]
 ) -> None:
     about = f"imported from {source.path.name}"
-    with (
-        store.whole_run(folder, source.rig, about) as fresh,
-        closing(EventLog(fresh)) as events,
-    ):
+    with store.whole_run(folder, source.rig, about) as fresh, closing(EventLog(fresh)) as events:
         events.append("import", None, {"manifest": str(source.path), "warnings": warnings})
         _write_archive(source, records, fresh)
         for r in records:

@@ -218,9 +218,7 @@ def _readable(db: sqlite3.Connection, sql: str, first: int, last: int) -> list[t
 
 
 def _account(
-    folder: Path,
-    places: dict[tuple[int, int], tuple[int, int]],
-    chosen: Sequence[Mark],
+    folder: Path, places: dict[tuple[int, int], tuple[int, int]], chosen: Sequence[Mark]
 ) -> Salvage:
     """Count the samples present and those known to be missing."""
     events = read_events(folder)
@@ -246,11 +244,7 @@ def _account(
     known += [m.start + m.ticks for m in chosen if m.state == "complete" and m.ticks is not None]
     lost += max(0, max(known, default=0) - int(ends[-1]))
     return Salvage(
-        len(places),
-        int((ends - ticks).sum()),
-        lost,
-        lost_blocks,
-        tuple(sorted(begun - names)),
+        len(places), int((ends - ticks).sum()), lost, lost_blocks, tuple(sorted(begun - names))
     )
 
 

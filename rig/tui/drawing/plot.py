@@ -138,12 +138,7 @@ def _beyond(low: Array, high: Array, limits: Band) -> NDArray[np.int_]:
 
 @lru_cache(maxsize=64)
 def _axis(
-    limits: Band,
-    warnings: Band,
-    zoomed: bool,
-    display: Format,
-    scale: braille.Scale,
-    height: int,
+    limits: Band, warnings: Band, zoomed: bool, display: Format, scale: braille.Scale, height: int
 ) -> tuple[tuple[Part, ...], ...]:
     """Return the axis labels, line by line: limits on the scale, else the scale's ends."""
     labels: dict[int, Part] = {}

@@ -128,9 +128,7 @@ class PageServer(Server):
 
     @web.middleware
     async def _checked(
-        self,
-        request: web.Request,
-        handler: Callable[[web.Request], Awaitable[web.StreamResponse]],
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         origins = request.headers.getall("Origin", [])
         if request.path == "/ws" and not origins:  # every browser names one

@@ -106,11 +106,7 @@ class _Child:
         plant = FaultyPlant(rig, scenario, seed)
         self._rate, self._plant = rig.sample_rate, plant
         device = Device(
-            rig,
-            plant,
-            realtime=realtime,
-            virtual_silence=SILENCE,
-            faults=scenario.device_faults,
+            rig, plant, realtime=realtime, virtual_silence=SILENCE, faults=scenario.device_faults
         )
         self._served = ServedDevice(device, wire, seed=seed, seconds=self._seconds)
         return self._served.link.endpoint

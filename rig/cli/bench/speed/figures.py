@@ -36,11 +36,7 @@ CANDIDATES: Final = 4
 
 
 def ratio_figures(
-    group: str,
-    name: str,
-    measured: ProcessorTime,
-    anchor: tuple[str, ProcessorTime],
-    limit: float,
+    group: str, name: str, measured: ProcessorTime, anchor: tuple[str, ProcessorTime], limit: float
 ) -> list[Figure]:
     """Return a time, its reference, and their ratio with its limit."""
     other, reference = anchor
