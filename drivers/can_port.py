@@ -108,17 +108,13 @@ class CanPort:
         deliver: Callable[[int, bytes], object] | None = None,
     ) -> None:
         self._place, self._bitrate, self._data_bitrate = place, bitrate, data_bitrate
+        self.where = place.text
         self._deliver = deliver
         self._keys = keys
         self._make = make
         self._shared = False
         self._sending = threading.Lock()  # adapters write a frame in parts
         self._reader: _Reader | None = None
-
-    @property
-    def where(self) -> str:
-        """The bus's name."""
-        return self._place.text
 
     @property
     def is_open(self) -> bool:
@@ -173,7 +169,7 @@ class CanPort:
                 with self._sending:
                     reader.bus.send(message, timeout=DRIVER.can_send)
             except _ERRORS as error:
-                if not _is_full(error):
+                if _errno(error) != errno.ENOBUFS and "buffer full" not in str(error):
                     raise self._loss(error) from error
                 if time.monotonic() > end:
                     self.close()
@@ -372,10 +368,6 @@ class _Reader:
                 self.frames.put((key, bytes(message.data)))
             else:
                 self._deliver(key, bytes(message.data))
-
-
-def _is_full(error: BaseException) -> bool:
-    return _errno(error) == errno.ENOBUFS or "buffer full" in str(error)
 
 
 def _errno(error: BaseException | None) -> int | None:

@@ -60,15 +60,11 @@ class CanLine:
 
     def __init__(self, port: CanPort, layout: CanLayout, block: BlockLayout, bitrate: int) -> None:
         self._port, self._layout, self._bitrate = port, layout, bitrate
+        self.where = port.where
         self._answers = PartCollector()
         self._blocks = BlockCollector(layout, block)
         self._damaged = 0  # when the bus was opened
         self._stream = (0, 0)  # the request that started it, its session
-
-    @property
-    def where(self) -> str:
-        """The bus's name."""
-        return self._port.where
 
     @property
     def is_open(self) -> bool:

@@ -82,8 +82,8 @@ class MessageLink:
     def __init__(
         self, line: MessageLine, timeout: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._line = line
-        self._timeout = self._answer_timeout = timeout
+        self._line, self.where = line, line.where
+        self._timeout = self.answer_timeout = timeout  # [s] of an answer
         self._clock = clock
         self._session = 0
         self._number = 0
@@ -93,32 +93,22 @@ class MessageLink:
         self.late = 0  # answers and blocks of earlier requests, streams and sessions
 
     @property
-    def where(self) -> str:
-        """The line's name."""
-        return self._line.where
-
-    @property
     def is_open(self) -> bool:
         """Whether a request may be sent."""
         return self._line.is_open
-
-    @property
-    def answer_timeout(self) -> float:
-        """Time limit for an answer [s]."""
-        return self._answer_timeout
 
     def open(self, *, shared: bool = False) -> None:
         """Open the line for a new session; raises as `MessageLine.open`."""
         self._line.open(shared=shared)
         self._received = 0
         self._session = secrets.randbits(32)
-        self._answer_timeout = self._timeout
+        self.answer_timeout = self._timeout
         self._answers.clear()
         self.blocks.clear()
 
     def extend_timeout(self, factor: float) -> None:
         """Multiply the time limit of answers by `factor` until the line is reopened."""
-        self._answer_timeout = factor * self._timeout
+        self.answer_timeout = factor * self._timeout
 
     def close(self) -> None:
         """Close the line if it is open; never raises."""
@@ -137,7 +127,7 @@ class MessageLink:
         self._number = self.next_number()
         self._answers.clear()
         message = WireFrame(kind, self._number, self._session, payload)
-        end = self._clock() + self._answer_timeout
+        end = self._clock() + self.answer_timeout
         while (now := self._clock()) < end:
             self._line.send(message)
             answer = self._wait_for_answer(min(end, now + self._timeout / DRIVER.tries))
@@ -215,6 +205,6 @@ class MessageLink:
         return self._line.complaint(self._received)
 
     def _silence_text(self) -> str:
-        text = f"the device at {self.where} has not answered for {self._answer_timeout:g} s"
+        text = f"the device at {self.where} has not answered for {self.answer_timeout:g} s"
         complaint = self.complaint()
         return f"{text}; {complaint}" if complaint else text

@@ -31,14 +31,9 @@ class SerialLine:
     """`drivers.message_link.MessageLine` over a `Transport`; see there for each call."""
 
     def __init__(self, transport: Transport) -> None:
-        self.transport = transport
+        self.transport, self.where = transport, transport.where
         self._decoder = FrameDecoder()
         self._damaged = self._received = 0  # when the line was opened
-
-    @property
-    def where(self) -> str:
-        """The port's name."""
-        return self.transport.where
 
     @property
     def is_open(self) -> bool:

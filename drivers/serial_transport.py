@@ -100,14 +100,9 @@ class PySerialTransport:
     """`Transport` over pyserial: 8 data bits, 1 stop bit, no flow control."""
 
     def __init__(self, device: str, baud: int, parity: str = "N") -> None:
-        self._device, self._baud, self._parity = device, baud, parity
+        self.where, self._baud, self._parity = device, baud, parity
         self._port: serial.Serial | None = None
         self._file: int | None = None
-
-    @property
-    def where(self) -> str:
-        """The port's name."""
-        return self._device
 
     @property
     def is_open(self) -> bool:
@@ -119,7 +114,7 @@ class PySerialTransport:
         self.close()
         try:
             self._port = serial.Serial(
-                self._device,
+                self.where,
                 self._baud,
                 parity=self._parity,
                 timeout=DRIVER.serial_wait,
@@ -127,7 +122,7 @@ class PySerialTransport:
                 exclusive=None if shared else True,
             )
         except OPENING_ERRORS as error:
-            raise opening_error(self._device, self._baud, error) from error
+            raise opening_error(self.where, self._baud, error) from error
         self._file = self._port.fileno() if os.name == "posix" else None
 
     def write(self, data: bytes) -> None:
@@ -138,7 +133,7 @@ class PySerialTransport:
             if sent < len(data):  # pyserial waits until there is room
                 port.write(data[sent:])
         except serial.SerialTimeoutException as error:
-            raise DeviceLost(f"the device at {self._device} takes no more bytes") from error
+            raise DeviceLost(f"the device at {self.where} takes no more bytes") from error
         except _ERRORS as error:
             raise self._loss() from error
 
@@ -194,9 +189,9 @@ class PySerialTransport:
 
     def _usable(self) -> serial.Serial:
         if self._port is None:
-            raise DeviceLost(f"the port {self._device} is closed")
+            raise DeviceLost(f"the port {self.where} is closed")
         return self._port
 
     def _loss(self) -> DeviceLost:
         self.close()
-        return DeviceLost(f"the port {self._device} has gone: device unplugged or ended")
+        return DeviceLost(f"the port {self.where} has gone: device unplugged or ended")

@@ -104,7 +104,7 @@ class Recorder:
         self._unfinished: tuple[int, RecordMeta, int] | None = None  # the last record that ended
         self._stream = 0
         self._clock: StreamClock | None = None  # of the current stream, from its first block on
-        self._newest = 0.0  # [s] since the run began, of the newest sample
+        self.elapsed = 0.0  # [s] since the run began, of the newest sample, across restarts
         self._began = 0.0  # [s] by the host's clock, at the arrival of the first block
         store.refuse_occupied(self.folder)
 
@@ -112,11 +112,6 @@ class Recorder:
     def is_open(self) -> bool:
         """Whether the journal is open, so that blocks can be recorded."""
         return self._journal is not None
-
-    @property
-    def elapsed(self) -> float:
-        """Time [s] of the newest sample since the run began, across restarts of the device."""
-        return self._newest
 
     def open(self, info: DeviceInfo) -> None:
         """Create the folder and its journal; the state of the run is then `running`."""
@@ -163,7 +158,7 @@ class Recorder:
         if self._clock is None:
             self._begin_clock(block, virtual=late is None)
         else:
-            self._newest = self._clock.at(block.tick + len(block.data), self.rig.sample_rate)
+            self.elapsed = self._clock.at(block.tick + len(block.data), self.rig.sample_rate)
 
     def _begin_clock(self, block: SampleBlock, *, virtual: bool) -> None:
         """Set the time since the run's begin of a stream's first tick."""
@@ -172,11 +167,11 @@ class Recorder:
         first = not self._began
         self._began = self._began or arrived
         # In virtual time the clocks are unrelated: streams follow without a gap.
-        began = 0.0 if first else self._newest if virtual else arrived - self._began
-        self._newest = began
+        began = 0.0 if first else self.elapsed if virtual else arrived - self._began
+        self.elapsed = began
         self._clock = StreamClock(block.tick, began, utc_now())
         self.event(STREAM, block.tick, stream=self._stream)
-        self._newest = began + length
+        self.elapsed = began + length
 
     def time_of(self, tick: int) -> float | None:
         """Return the time [s] since the run began of a device tick; None before a first block."""
@@ -187,7 +182,7 @@ class Recorder:
         if self._events is None:
             raise RecordingFailed(f"{self.folder}: the run is not open for recording")
         timed = None if tick is None else self.time_of(tick)
-        seconds = self._newest if timed is None else timed
+        seconds = self.elapsed if timed is None else timed
         self._events.append(event, tick, {"t": round(seconds, 6), **fields})
 
     def begin_record(self, meta: RecordMeta, start: int) -> int:
