@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -250,9 +249,3 @@ def loss_raised_by(call: Callable[[], object]) -> DeviceLost | None:
         except DeviceError:
             continue
     return None
-
-
-def quietly(call: Callable[[], object]) -> None:
-    """Make a call and ignore a DeviceError."""
-    with suppress(DeviceError):
-        call()

@@ -135,10 +135,6 @@ class CheckReport:
             data["twin"],
         )  # fmt: skip
 
-    def with_remedies(self, scales: Mapping[str, float | None]) -> Self:
-        """Return the report with the factor of amplitudes by which each refused step would pass."""
-        return replace(self, scales=dict(scales))
-
     def _start(self, step: str) -> str:
         """Return the start of a step as text for a refusal."""
         moments = [moment for moment in self.timeline if moment.name == step]

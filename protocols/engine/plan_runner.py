@@ -44,7 +44,7 @@ class PlanRunner:
         keep = max((s.record + 2 * s.period for s in plan.excitations), default=0)
         keep += round(ENGINE.spare_seconds * rig.sample_rate)
         self.session = Session(bench, rig, keep, inputs.machine, self._obey_requests)
-        self._place = plan.place
+        self._place = plan.protocol.place
         self._parts = len(plan.sequence)
         self._on_phase = on_phase
         self._complete: dict[str, int] = {}  # complete records by step

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import OFF, OutputLaw
-from protocols.engine.states import StateMachine
+from protocols.engine.states import ENERGISED, StateMachine
 from rig.bench.session import Bench
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -41,7 +41,8 @@ class Session:
 
         Raises RuntimeError for any law but zero while the engine is at rest.
         """
-        if not self._machine.energised and any(law.limit > 0.0 for law in changes.values()):
+        drives = any(law.limit > 0.0 for law in changes.values())
+        if drives and self._machine.state not in ENERGISED:
             raise RuntimeError(f"an output law was requested in state {self._machine.state}")
         for joint, law in changes.items():
             self.laws[joint] = law

@@ -74,11 +74,6 @@ class StateMachine:
         """The present state."""
         return self._state
 
-    @property
-    def energised(self) -> bool:
-        """Whether outputs other than zero are allowed."""
-        return self._state in ENERGISED
-
     def to(self, state: EngineState, why: str = "") -> None:
         """Change the state; raises RuntimeError for an invalid transition."""
         if state is self._state:

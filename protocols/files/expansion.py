@@ -119,7 +119,9 @@ class Expander:
         return _REFERENCE.sub(lambda match: str(value_of(match)), data)
 
     def _step(self, item: Any, kind: str | None, where: Path, scope: Scope) -> RawStep:
-        lines = {(): self._line(where), **self._below(where)}
+        depth = len(where)
+        below = {p[depth:]: n for p, n in self.lines.items() if p[:depth] == where}
+        lines = {(): self._line(where), **below}
         nested = isinstance(item, dict) and kind is not None and STEPS[kind].nests
         fields = {k: v for k, v in item.items() if k != "steps"} if nested else item
         data = self.substituted(fields, where, scope)
@@ -147,7 +149,7 @@ class Expander:
             total = len(rows) * len(inner)
             if total > MOST_STEPS:
                 self._too_many(where, total)
-            repeated += [_numbered(step, number) for step in inner]
+            repeated += [replace(s, data=_renamed(s.data, f"_{number}")) for s in inner]
         return repeated
 
     def _rows(self, over: Any, where: Path, scope: Scope) -> list[dict[str, Any]]:
@@ -213,10 +215,6 @@ class Expander:
             if name not in scope.values:
                 self._note((*where, name), unknown_parameter(name, scope.values))
 
-    def _below(self, where: Path) -> dict[Path, int]:
-        depth = len(where)
-        return {p[depth:]: n for p, n in self.lines.items() if p[:depth] == where}
-
     def _line(self, where: Path) -> int:
         while where and where not in self.lines:
             where = where[:-1]
@@ -239,11 +237,6 @@ def unknown_parameter(name: str, known: Mapping[str, Any]) -> str:
     """Return the error of a parameter that the file does not declare."""
     has = " ".join(known) if known else "none; declare them under 'parameters'"
     return f"no parameter {name!r}; the file has: {has}"
-
-
-def _numbered(step: RawStep, number: int) -> RawStep:
-    """Return a step with a number appended to its name and those nested in it."""
-    return replace(step, data=_renamed(step.data, f"_{number}"))
 
 
 def _renamed(data: Any, ending: str) -> Any:

@@ -164,14 +164,11 @@ class _Includes:
             text, shown, folder = _text(name, self._folder)
         except InputError as error:
             raise InputError(f"{self._source}:{line}: include: {error}") from error
-        repeated = [seen for seen in self._chain if _same_file(seen, shown)]
+        file = Path(shown).resolve()
+        repeated = [seen for seen in self._chain if seen == shown or Path(seen).resolve() == file]
         if repeated:
             circle = " -> ".join((*self._chain[self._chain.index(repeated[0]) :], shown))
             raise InputError(f"{self._source}:{line}: include: circular: {circle}")
         protocol, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
         places = (dict(_places(step)) for step in protocol.steps)
         return list(zip(steps, places, strict=True))
-
-
-def _same_file(path: str, other: str) -> bool:
-    return path == other or Path(path).resolve() == Path(other).resolve()

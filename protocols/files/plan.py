@@ -60,11 +60,6 @@ class Plan:
     sequence: tuple[PlannedStep, ...]
 
     @property
-    def place(self) -> Place:
-        """Settings for positioning pistons."""
-        return self.protocol.place
-
-    @property
     def steps(self) -> tuple[StepPlan, ...]:
         """The excitations with records."""
         return tuple(
@@ -263,20 +258,15 @@ class _RigPlanner:
     """Resolves steps on one rig; keeps the locks in force (`protocols.steps.base.Planner`)."""
 
     def __init__(self, rig: Rig) -> None:
-        self._rig = rig
+        self.rig = rig
         self._in_force: dict[int, Lock] = {}
         self._waves: dict[tuple[str, int], Waveform] = {}
-
-    @property
-    def rig(self) -> Rig:
-        """The rig."""
-        return self._rig
 
     def condition(self, text: str) -> Condition:
         """Read a condition; InputError where the rig cannot judge it."""
         try:
             parsed = parse_condition(text)
-            require_known(parsed, self._rig)
+            require_known(parsed, self.rig)
         except ValueError as error:
             raise InputError(f"condition: {error}") from error
         return parsed
@@ -302,7 +292,7 @@ class _RigPlanner:
 
     def locks(self, step: StepKind, locks: Sequence[Lock]) -> tuple[LockPlan, ...]:
         """Resolve locks; InputError naming step, joint and stroke."""
-        return tuple(_lock(part, step.name or step.key, self._rig) for part in locks)
+        return tuple(_lock(part, step.name or step.key, self.rig) for part in locks)
 
     def excitation(self, step: StepKind) -> StepPlan:
         """Resolve what a step locks and excites."""
@@ -311,7 +301,7 @@ class _RigPlanner:
         excite = tuple(self._excite(part, step.name) for part in parts)
         named = {part.joint for part in parts} | {part.joint for part in step.lock}
         inherited = tuple(lock for joint, lock in self._in_force.items() if joint not in named)
-        rate = self._rig.sample_rate
+        rate = self.rig.sample_rate
         period = math.lcm(*(e.wave.period for e in excite))
         if period > LONGEST_PERIOD * rate:
             raise InputError(
@@ -340,8 +330,8 @@ class _RigPlanner:
         # Steps of a sweep often share a waveform, and a multisine of low crest factor takes long.
         name = (part.signal.model_dump_json(), part.joint)
         if name not in self._waves:
-            self._waves[name] = _waveform(part, step, self._rig)
-        return _excite(part, step, self._waves[name], self._rig)
+            self._waves[name] = _waveform(part, step, self.rig)
+        return _excite(part, step, self._waves[name], self.rig)
 
 
 def _located(problem: str, step: StepKind) -> str:

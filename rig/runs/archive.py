@@ -173,7 +173,9 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
                 attributes = _attributes(section, rate, assembled, clocks.get(section.stream))
                 channels = {name: assembled.data[:, i] for i, name in enumerate(columns)}
                 write_group(file, section.group, channels, attributes)
-                _note_saturation(file[section.group], columns, assembled)
+                # Commands have no saturation flags.
+                for name, count in zip(columns, assembled.saturated, strict=False):
+                    file[section.group][name].attrs["saturated_samples"] = int(count)
                 lost += assembled.lost if section.meta else 0
         damaged = verify(journal, fresh, sections)
         put_in_place(fresh, folder / store.ARCHIVE)
@@ -188,12 +190,6 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
     samples = sum(section.ticks for section in records) - lost
     outside = sum(section.ticks for section in sections if not section.meta)
     return Written(len(records), partial, samples, lost, damaged, outside)
-
-
-def _note_saturation(group: h5py.Group, columns: Sequence[str], assembled: Assembled) -> None:
-    # Commands have no saturation flags.
-    for name, count in zip(columns, assembled.saturated, strict=False):
-        group[name].attrs["saturated_samples"] = int(count)
 
 
 def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:

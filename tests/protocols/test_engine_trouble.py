@@ -120,7 +120,7 @@ def test_a_loop_with_too_much_gain_is_named_by_its_gain(rig: Rig) -> None:
     """The machine is twice as fast as the rig file says, so that the check let it pass."""
     slow = rig.model_copy(update={"sample_rate": 50.0})
     plan = plan_of(slow)
-    place = plan.place.model_copy(update={"position_gain": 500.0})
+    place = plan.protocol.place.model_copy(update={"position_gain": 500.0})
     assert largest_position_gain(slow, 1) > place.position_gain
     plan = replace(plan, protocol=plan.protocol.model_copy(update={"place": place}))
     fast = Cylinder(extend=0.32, retract=0.32, piston=0.01)

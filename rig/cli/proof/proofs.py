@@ -112,7 +112,7 @@ def proved(
             for step in plan.excitations
             if step.name in refused_steps
         }
-        report = report.with_remedies(scales)
+        report = replace(report, scales=scales)
     report = replace(report, twin=parameters.text)
     proof = PlanProof(key, report, prediction, text, source, parameters.warning)
     _to_cache(proof)

@@ -111,13 +111,8 @@ def sheet(rig: Rig, record: Record, more: Mapping[str, Array], began: datetime) 
         "period": record.period,
         "lines": list(record.lines),
     }
-    return Sheet(columns, units, {name: _json_value(value) for name, value in about.items()})
-
-
-def _json_value(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return value
+    arrays = {k: v.tolist() for k, v in about.items() if isinstance(v, np.ndarray | np.generic)}
+    return Sheet(columns, units, about | arrays)
 
 
 def _write_csv(path: Path, sheet: Sheet) -> None:

@@ -115,7 +115,7 @@ def _read(db: sqlite3.Connection, folders: list[Path]) -> list[RunSummary]:
         summaries.append(summary)
         # The writer of a running one may die without changing a file, and what cannot be read may
         # become readable: rights and a restored copy change neither size nor time.
-        if summary.state != RUNNING and summary.is_counted:
+        if summary.state != RUNNING and summary.records >= 0:
             changed.append((signature, summary))
     removed = set(stored) - {folder.name for folder in folders}
     if changed or removed:

@@ -42,11 +42,6 @@ class RunSummary:
     recovered: bool = False
     operator: str = ""
 
-    @property
-    def is_counted(self) -> bool:
-        """Whether its contents could be read."""
-        return self.records >= 0
-
 
 def summarise(folder: Path) -> RunSummary:
     """Summarise one run; never raises: the summary's message states what cannot be read."""

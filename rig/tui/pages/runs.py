@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from rig.queue.items import Item
 from rig.runs.listing.summary import RunSummary
 from rig.tui.browse import TABS
 from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, row, window, wrapped
@@ -48,7 +47,8 @@ def _lines(view: PlotView) -> list[Row]:
         return [row(f" {name}") for name in browsed.protocols]
     if browsed.name == "runs":
         return columns([_run(_as_reported(view, run)) for run in browsed.runs])
-    return columns([_item(item) for item in browsed.queue])
+    queued = browsed.queue
+    return columns([[f" {i.id}", (i.state, STRONG), i.job.name, i.reason] for i in queued])
 
 
 def _as_reported(view: PlotView, run: RunSummary) -> RunSummary:
@@ -65,10 +65,6 @@ def _run(run: RunSummary) -> list[str | Part]:
     message = run.message if run.state != "done" else ""
     state = (f"{STATES.get(run.state, '□')} {run.state}", style)
     return [f" {run.path.name}", state, run.protocol, count, (run.created[:16], DIM), message]
-
-
-def _item(item: Item) -> list[str | Part]:
-    return [f" {item.id}", (item.state, STRONG), item.job.name, item.reason]
 
 
 def _job(view: PlotView, width: int, height: int) -> list[Row]:

@@ -15,7 +15,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir, nullcontext
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -197,11 +196,6 @@ def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-unt
                 out[k, i], p[16 + 9 * i], p[17 + 9 * i], p[18 + 9 * i], p[19 + 9 * i]
             )
             out[k, 8 + i], out[k, 10 + i] = place, slope * out[k, 2 + i]
-
-
-def cvodes_available() -> bool:
-    """Return whether the packages of the extra `bench` are installed."""
-    return find_spec("casadi") is not None and find_spec("ziglang") is not None
 
 
 def cvodes_solver(
